@@ -1,4 +1,4 @@
-"""Steps of a size that a tolerance asks for, in both forms of C: one text over a form's sweep."""
+"""Adaptive steps in both forms of C: the shared code, given a form's iteration over the stages."""
 
 from __future__ import annotations
 
@@ -24,40 +24,55 @@ from eomc.scene.schema import LOOSEST
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
-MOST = 14  # sweeps of a step
-ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two sweeps
-LONGEST = 1e4  # times of the motion at the start: by no longer a time the least step is measured
-OF_MOST = 1e-4  # of the largest coordinate and velocity, in the measures of all
-OF_MOST_COARSE = 0.01  # where rounding counts, and in single precision, whose rounding is larger
-SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
-ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
-SMALL = 300  # operations of accelerations, up to which many instances go side by side
-LATELY = 4  # steps, in which one may be halved for its events without being counted
-BUSY = 32  # events in one step, without those that happen at once
+MAX_ITERATIONS = 14  # over the stages, per step
+REJECT_AFTER_TWO = 2 * 0.8**-8  # error over sqrt(tol/2) for which two iterations suffice to reject
+MAX_TIME_SCALES = 1e4  # the minimal step is relative to at most this many initial time scales
+SCALE_FLOOR = 1e-4  # least scale of a coordinate or velocity, relative to the largest
+COARSE_SCALE_FLOOR = 0.01  # the same for rounding errors, and in single precision
+KINK_SHARE = 0.1  # of the tolerance, for the error of a step with a discontinuity
+RETRY_AFTER = 32  # steps by Newton's method before fixed-point iteration is tried again
+MAX_BATCH_OPERATIONS = 300  # of the accelerations, up to which instances are stepped in parallel
+RECENT_STEPS = 4  # steps in which one may be halved for its events without being counted
+EVENTS_PER_STEP = 32  # without events at the same time
 
 
 def memory(functions: Functions) -> str:
-    """The type of what a run hands on from call to call."""
+    """Return the C type of the workspace of a run."""
     return f"{functions.prefix}_{METHOD.name}_adaptive_memory"
 
 
-def kept(system: System, width: int) -> int:
-    """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 26) if steep(system) else (6, 22)
+def workspace_size(system: System, width: int) -> int:
+    """Return the length of the workspace. width: of a vector of coordinates."""
+    vectors, scalars = (8, 26) if steep(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
-    more = 11 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
+    event_numbers = 11 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
     vectors += 2 * any(e.begins is not None for e in system.events)
-    return vectors * width + stages + few + more
+    return vectors * width + stages + scalars + event_numbers
 
 
 @dataclass(frozen=True)
-class Form:
-    """What a form of C brings: a sweep's arguments q, qd, t, h and so on, and calls.
+class SweepInterface:
+    """What portable and optimised C supply to the shared code of adaptive steps.
 
-    sweep: of a sweep from *a to b. start: of the accelerations f at q, qd. extent: of vectors of
-    coordinates. constants: whether what parameters decide is a struct c; compute_constants: its
-    call, which fails where there are none. lanes: a macro before loops over stages. project: the
-    call that ends a step on constraints, if there are: of what it adds, or of its `whole` end.
+    Attributes
+    ----------
+    around
+        Arguments of an iteration over the stages: q, qd, t, h and so on.
+    sweep
+        Call of an iteration from *a to *b.
+    start
+        Call of the accelerations f at q, qd.
+    extent
+        Size of vectors of coordinates.
+    constants
+        Whether precomputed expressions of the parameters are a struct c.
+    compute_constants
+        The call that computes it; its failure is a status.
+    lanes
+        Macro before loops over stages.
+    project, whole
+        The call that projects the end of a step, and whether it takes the state rather than the
+        increment.
     """
 
     around: tuple[CArgument, ...]
@@ -73,24 +88,24 @@ class Form:
 
 @dataclass(frozen=True)
 class Stepping:
-    """The functions of adaptive steps over the sweeps of a form."""
+    """The functions of adaptive steps for one form of C."""
 
     functions: Functions
-    form: Form
+    form: SweepInterface
 
     @property
     def method(self) -> str:
-        """What their C names begin with."""
+        """The prefix of their C names."""
         return f"{self.functions.prefix}_{METHOD.name}"
 
     @property
     def rest(self) -> Sequence[CArgument]:
-        """The arguments that are the same all along a run."""
+        """The arguments that are constant along a run."""
         return [a for a in self.form.around if a.name in "ucp"]
 
     @property
     def held(self) -> CArgument:
-        """What a run hands on."""
+        """The workspace of a run."""
         return c.filled(memory(self.functions), "memory")
 
     @property
@@ -99,120 +114,122 @@ class Stepping:
         return c.filled(f"{self.method}_adaptive_state", "x")
 
     def number(self, name: str) -> CArgument:
-        """An argument that is a number."""
+        """Return an argument that is a number."""
         return CArgument(self.functions.real, name)
 
     @cached_property
     def settle(self) -> CFunction:
-        """The accelerations over a step."""
+        """The function that solves for the accelerations at the stages of a step."""
         real = self.functions.real
         out = c.filled(f"{self.method}_stages", "a")
-        measured = (c.filled(real, name) for name in ("scale", "coarse", "rough", "beyond"))
-        by = c.given(f"{self.method}_newton", "m")
+        measures = (c.filled(real, name) for name in ("scale", "coarse", "rough", "beyond"))
+        newton = c.given(f"{self.method}_newton", "m")
         limits = (self.number("tol"), self.number("most"))
-        given = (*self.form.around, *self.functions.moves_stages, *limits, by)
-        told = (*measured, c.filled("int", "sweeps"))
-        cap = [c.given(real, "cap")] if self.held_at_rest else []
-        return c.static(f"{self.method}_settled", "int", out, *given, *cap, *told)
+        arguments = (*self.form.around, *self.functions.moves_stages, *limits, newton)
+        results = (*measures, c.filled("int", "sweeps"))
+        cap = [c.given(real, "cap")] if self.may_rest else []
+        return c.static(f"{self.method}_settled", "int", out, *arguments, *cap, *results)
 
     @property
-    def held_at_rest(self) -> bool:
-        """Whether forces that change in time may hold all at rest, so that rounding is left."""
+    def may_rest(self) -> bool:
+        """Whether time-dependent forces may hold all bodies at rest, so that only rounding errors
+        move them.
+        """
         target = self.functions.target
         return bool(target.system.modes) and target.driven
 
     @cached_property
     def capped(self) -> CFunction:
-        """What rounding makes of the accelerations over a step."""
+        """The function for the effect of rounding errors on the accelerations of a step."""
         real = self.functions.real
-        given = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
-        around = (*self.form.around, *self.functions.moves_stages)
-        arguments = (c.filled(real, "cap"), *given, *around, self.number("tol"))
+        values = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
+        others = (*self.form.around, *self.functions.moves_stages)
+        arguments = (c.filled(real, "cap"), *values, *others, self.number("tol"))
         return c.static(f"{self.method}_capped", "int", *arguments)
 
     @cached_property
     def forces(self) -> CFunction:
-        """The accelerations at a state."""
+        """The function for the accelerations at a state."""
         out = c.filled(self.functions.real, "f")
-        given = (a for a in self.form.around if a.name != "h")
-        return c.static(f"{self.method}_forces", "int", out, *given)
+        arguments = (a for a in self.form.around if a.name != "h")
+        return c.static(f"{self.method}_forces", "int", out, *arguments)
 
     @cached_property
     def slopes(self) -> CFunction:
-        """Their derivatives."""
+        """The function for the derivatives of the accelerations."""
         out = c.filled(f"{self.method}_newton", "m")
         return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
-        """The next step."""
-        given = (*map(self.number, ("t_end", "tol", "h_most")), *self.rest)
+        """The function for the next step."""
+        arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.rest)
         status = self.functions.status
-        return c.static(f"{self.method}_adapted", status, self.state, *given, self.held)
+        return c.static(f"{self.method}_adapted", status, self.state, *arguments, self.held)
 
     @cached_property
     def within(self) -> CFunction:
-        """The state within the last step."""
+        """The function for the state within the last step."""
         out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.given(f"{self.method}_adaptive_state", "x")
-        given = (state, self.number("z"), self.number("tol"), *self.rest)
-        return c.static(f"{self.method}_inside", "void", *out, *given, self.held)
+        arguments = (state, self.number("z"), self.number("tol"), *self.rest)
+        return c.static(f"{self.method}_inside", "void", *out, *arguments, self.held)
 
     @property
     def taken(self) -> Sequence[CArgument]:
-        """The rest, and what the public functions of steps take."""
+        """The constant arguments, and those that the public functions of steps take."""
         rest = self.rest
-        there = {a.name for a in rest}
-        return [*rest, *(a for a in self.functions.usual("u", "p") if a.name not in there)]
+        present = {a.name for a in rest}
+        return [*rest, *(a for a in self.functions.usual("u", "p") if a.name not in present)]
 
     @cached_property
     def fixed(self) -> CFunction:
-        """The next step of fixed size."""
+        """The function for the next step of fixed size."""
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
         return c.static(f"{self.method}_fixed", status, self.state, *limits, *self.taken, self.held)
 
     @cached_property
     def at(self) -> CFunction:
-        """The state within the last step, where that may be of fixed size."""
+        """The function for the state within the last step, which may be of fixed size."""
         if not self.functions.target.system.events:
             return self.within
         own = self.within.arguments[: -len(self.rest) - 1]
         return c.static(f"{self.method}_at", "void", *own, *self.taken, self.held)
 
 
-def tableau(made: Stepping) -> dict[str, Any]:
-    """The numbers that both texts of adaptive steps have, by the names of their views."""
-    m, target = METHOD, made.functions.target
+def tableau(stepping: Stepping) -> dict[str, Any]:
+    """Return the coefficients and constants that all views of adaptive steps share."""
+    m, target = METHOD, stepping.functions.target
     real = target.real
     return {
-        **made.functions.names,
-        "method": made.method,
-        "extent": made.form.extent,
+        **stepping.functions.names,
+        "method": stepping.method,
+        "extent": stepping.form.extent,
         "stages": m.stages,
         "f": real.suffix,
         "sqrt": f"sqrt{real.function_suffix}",
         "eps": target.literal(real.epsilon),
         "tiny": target.literal(1e-30),
-        "of_most": target.literal(OF_MOST if real.epsilon < 1e-10 else OF_MOST_COARSE),
-        "of_most_coarse": target.literal(OF_MOST_COARSE),
-        "most": MOST,
+        "of_most": target.literal(SCALE_FLOOR if real.epsilon < 1e-10 else COARSE_SCALE_FLOOR),
+        "of_most_coarse": target.literal(COARSE_SCALE_FLOOR),
+        "most": MAX_ITERATIONS,
         "c": numbers(m.c, real),
         "powers": matrix(list(zip(*m.powers, strict=True)), real),
-        "anew": ANEW,
+        "anew": RETRY_AFTER,
         "still": len(target.system.modes) + len(target.system.discrete),
     }
 
 
-def steps(made: Stepping) -> Adaptive:
-    """A step, and the state within it."""
-    functions, m, form = made.functions, METHOD, made.form
+def steps(stepping: Stepping) -> Adaptive:
+    """Return the view of a step and of dense output."""
+    functions, m, form = stepping.functions, METHOD, stepping.form
     target, real = functions.target, functions.target.real
-    known = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
-    known["m"] = "newton ? &m : 0"
+    references = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
+    references["m"] = "newton ? &m : 0"
     eigenvalues, to_parts, from_parts = m.eigen
     last, b = [m.legendre(n) for n in range(m.stages - 4, m.stages)], rounded(m.b, real)
     return Adaptive(
-        **tableau(made),
+        **tableau(stepping),
         title=TITLE,
         fabs=f"fabs{real.function_suffix}",
         lanes=form.lanes and f"{form.lanes} ",
@@ -220,50 +237,50 @@ def steps(made: Stepping) -> Adaptive:
         top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),
         weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
         timed=target.driven,
-        held=made.held_at_rest,
-        capped=made.capped,
-        capped_now=made.capped.call(a="&a"),
+        held=stepping.may_rest,
+        capped=stepping.capped,
+        capped_now=stepping.capped.call(a="&a"),
         events=bool(target.system.events),
         begins="begins" in target.program,
         project=form.project,
         whole=form.whole,
-        settle=made.settle,
+        settle=stepping.settle,
         sweep=form.sweep,
-        step=made.step,
+        step=stepping.step,
         start=form.start,
-        settled=made.settle.call(
-            most=f"{target.literal(ROUGHEST)}*aim", cap="capped ? cap : 0", **known
+        settled=stepping.settle.call(
+            most=f"{target.literal(REJECT_AFTER_TWO)}*aim", cap="capped ? cap : 0", **references
         ),
-        within=made.within,
+        within=stepping.within,
         corners=steep(target.system),
-        longest=target.literal(LONGEST),
+        longest=target.literal(MAX_TIME_SCALES),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
-        share=target.literal(SHARE),
+        share=target.literal(KINK_SHARE),
         ends=c.in_braces(numbers(row, real) for row in _ends()),
-        forces=made.forces,
-        forces_here=made.forces.call(f="here", q="at_q", qd="at_qd"),
-        forces_near=made.forces.call(f="near", q="at_q", qd="at_qd"),
-        slopes=made.slopes,
-        slopes_now=made.slopes.call(m="&m"),
+        forces=stepping.forces,
+        forces_here=stepping.forces.call(f="here", q="at_q", qd="at_qd"),
+        forces_near=stepping.forces.call(f="near", q="at_q", qd="at_qd"),
+        slopes=stepping.slopes,
+        slopes_now=stepping.slopes.call(m="&m"),
         nudge=target.literal(math.sqrt(real.epsilon)),
         eigenvalues=c.in_braces(numbers(row, real) for row in eigenvalues),
         to_parts=c.in_braces(numbers(row, real) for row in to_parts),
         from_parts=c.in_braces(numbers(row, real) for row in from_parts),
-        forces_there=made.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
-        settled_within=made.settle.call(most=target.literal(1e30), cap="0", **known),
+        forces_there=stepping.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
+        settled_within=stepping.settle.call(most=target.literal(1e30), cap="0", **references),
     )
 
 
-def fixed(made: Stepping) -> FixedSteps:
-    """Steps of fixed size in which events are seen."""
-    functions = made.functions
+def fixed(stepping: Stepping) -> FixedSteps:
+    """Return the view of fixed steps with event detection."""
+    functions = stepping.functions
     target, real = functions.target, functions.target.real
     at = {"q": "q_at", "qd": "qd_at"}
-    state = {name: c.member(made.state.name, name) for name in ("q", "qd")}
+    state = {name: c.member(stepping.state.name, name) for name in ("q", "qd")}
     return FixedSteps(
         **functions.names,
-        method=made.method,
-        extent=made.form.extent,
+        method=stepping.method,
+        extent=stepping.form.extent,
         stages=METHOD.stages,
         f=real.suffix,
         eps=target.literal(real.epsilon),
@@ -271,44 +288,51 @@ def fixed(made: Stepping) -> FixedSteps:
         timed=target.driven,
         jumps="jumps" in target.program,
         above="begins" in target.program,
-        fixed=made.fixed,
-        at=made.at,
-        inside=made.within.call(),
+        fixed=stepping.fixed,
+        at=stepping.at,
+        inside=stepping.within.call(),
         step=functions.public.fixed_step.call(**at),
-        forces_before=made.forces.call(f="before", **state),
-        forces_halfway=made.forces.call(f="halfway", t="t + h/2", **at),
-        forces_behind=made.forces.call(f="behind", t="t + h", **at),
+        forces_before=stepping.forces.call(f="before", **state),
+        forces_halfway=stepping.forces.call(f="halfway", t="t + h/2", **at),
+        forces_behind=stepping.forces.call(f="behind", t="t + h", **at),
     )
 
 
 def busy(system: System) -> int:
-    """Events in one step, from which on it ends there."""
-    return BUSY + sum(e.begins is not None for e in system.events)
+    """Return the number of events after which a step ends."""
+    return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
-def keep(made: Stepping) -> CFunction:
-    """A state into a row."""
-    arguments = (c.filled(made.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
-    return CFunction(f"{made.method}_kept", "void", tuple(arguments))
+def keep(stepping: Stepping) -> CFunction:
+    """Return the function that stores a state in a row."""
+    arguments = (c.filled(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
+    return CFunction(f"{stepping.method}_kept", "void", tuple(arguments))
 
 
 def tightest(real: Real) -> float:
-    """The least tolerance that numbers have digits for."""
+    """Return the smallest tolerance that the precision of numbers allows."""
     return 1e-15 if real.epsilon < 1e-10 else 5e-7
 
 
 def run(
-    made: Stepping, happen: str = "", restart: str = "", begun: str = "", changed: str = "",
+    stepping: Stepping, happen: str = "", restart: str = "", begun: str = "", changed: str = "",
     values: str = "",
 ) -> AdaptiveRun:  # fmt: skip
-    """The loop. happen, restart, begun: the calls that find events, and go on behind them; changed,
-    values: that which tells whether inputs have changed them, and their values."""
-    functions, form = made.functions, made.form
+    """Return the view of the loop over steps.
+
+    Parameters
+    ----------
+    happen, restart, begun
+        Calls that detect events, continue after them, and handle events at the start.
+    changed, values
+        Calls that report whether inputs have changed the event functions, and evaluate them.
+    """
+    functions, form = stepping.functions, stepping.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
-    kept = keep(made)
-    to = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
-    takes_p = "p" in {a.name for a in made.rest} or bool(
+    store_row = keep(stepping)
+    row_arguments = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
+    takes_p = "p" in {a.name for a in stepping.rest} or bool(
         form.compute_constants or happen or form.project
     )
 
@@ -317,7 +341,7 @@ def run(
 
     return AdaptiveRun(
         **functions.names,
-        method=made.method,
+        method=stepping.method,
         constants=form.constants,
         unread_p=target.needs_p and not takes_p,
         compute_constants=form.compute_constants,
@@ -327,38 +351,43 @@ def run(
         f=target.real.suffix,
         eps=target.literal(target.real.epsilon),
         fabs=f"fabs{target.real.function_suffix}",
-        lately=LATELY,
+        lately=RECENT_STEPS,
         begun=begun,
         changed=changed,
         values=values,
         huge=target.literal(1e30),
         busy=busy(target.system),
-        anew=ANEW,
+        anew=RETRY_AFTER,
         run=functions.public.adaptive(METHOD.name),
-        advance=made.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
-        fixed=made.fixed.call(x="&x") if happen else "",
+        advance=stepping.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
+        fixed=stepping.fixed.call(x="&x") if happen else "",
         happen=happen,
         restart=restart,
-        row=kept.call(q="x.q", qd="x.qd", **to),
-        row_before=kept.call(q="q_at", qd="qd_at", **to),
-        look=made.at.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
+        row=store_row.call(q="x.q", qd="x.qd", **row_arguments),
+        row_before=store_row.call(q="q_at", qd="qd_at", **row_arguments),
+        look=stepping.at.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
         project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
         project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )
 
 
 def together(target: Target) -> bool:
-    """Whether the fast form has the steps of many side by side: of small systems without corners.
+    """Return True if optimised C steps many instances in parallel: small systems with smooth
+    forces.
 
-    Large ones have enough to do in one sweep.
+    Large systems occupy the vector registers with one instance.
     """
     s = target.system
     plain = not (s.events or s.constraints or steep(s))
-    return plain and s.run.batch and outline.weight(target.program["acceleration"]) <= SMALL
+    return (
+        plain
+        and s.run.batch
+        and outline.weight(target.program["acceleration"]) <= MAX_BATCH_OPERATIONS
+    )
 
 
 def alone(functions: Functions) -> str:
-    """The call for instance k of a batch."""
+    """Return the call for instance k of a batch."""
     NQ = functions.NQ
     rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
     return functions.public.adaptive(METHOD.name).call(
@@ -371,7 +400,7 @@ def alone(functions: Functions) -> str:
 
 
 def batch(functions: Functions) -> AdaptiveBatch:
-    """Many, one after the other."""
+    """Return the view of a batch that steps one instance after the other."""
     return AdaptiveBatch(
         prefix=functions.prefix,
         batch=functions.public.adaptive_batch(METHOD.name),
@@ -381,7 +410,7 @@ def batch(functions: Functions) -> AdaptiveBatch:
 
 
 def _ends() -> tuple[Row, Row]:
-    """To the values at both ends of a step of the polynomial through those at its stages."""
+    """Return weights for the values at both ends of a step of the polynomial through the stages."""
     parts = [METHOD.legendre(n) for n in range(METHOD.stages)]
     columns = list(zip(*parts, strict=True))
     start = tuple(sum(column[::2], Fraction(0)) - sum(column[1::2]) for column in columns)
@@ -389,7 +418,7 @@ def _ends() -> tuple[Row, Row]:
 
 
 def _total(terms: list[str]) -> str:
-    """Their sum by halves, which waits for three additions in place of seven, of eight."""
+    """Return the sum of terms as a balanced tree, which shortens the dependency chain."""
     half = len(terms) // 2
     if not half:
         return terms[0]

@@ -1,4 +1,4 @@
-"""Programs as C99 text: numbers, expressions and blocks of assignments."""
+"""C99 text of programs: numbers, expressions and blocks of assignments."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from eomc.derive.tape import Stage
 from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.program.trig import names_of_pair
 
-MOST_INLINE = 5  # operations; longer expressions get a name of their own
-SEVERAL = 3  # angles from which on sines are taken side by side
-FOUR = 4  # numbers that are taken or stored at once
+MAX_INLINE_OPERATIONS = 5  # longer expressions get a name of their own
+MIN_SIMD_ANGLES = 3  # angles from which on sines are computed in vector registers
+FOUR = 4  # numbers in a vector register
 
-# what C calls the functions of a program
+# C names of the functions of a program
 C_NAMES = {
     "abs": "fabs",
     **{n: n for n in ("tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")},
@@ -29,7 +29,7 @@ C_NAMES = {
     "min": "fmin",
     "max": "fmax",
 }
-PIVOT = "pivot_inverse"  # a function of ours
+PIVOT = "pivot_inverse"  # defined in the generated code
 
 _STAGE_COMMENTS = {
     Stage.TIME: "time and inputs",
@@ -40,10 +40,10 @@ _STAGE_COMMENTS = {
 
 @dataclass(frozen=True)
 class Real:
-    """A floating-point type: its name in C and Python, the suffix of its literals and functions.
+    """A floating-point type: its C and NumPy names, and the suffixes of literals and functions.
 
-    reach: the largest angle that the sincos of csrc/ takes; 0 where there is none for the type.
-    lane: where it is a vector of numbers, what its functions' names end in.
+    reach: the largest angle for which the sincos of csrc/ is valid; 0 where there is none for the
+    type. lane: for vectors of numbers, the suffix of function names.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Real:
 DOUBLE = Real("double", "", "", "float64", 2.0**-52, 2.0**20)
 FLOAT = Real("float", "f", "f", "float32", 2.0**-23, 2.0**13)
 REALS = {r.name: r for r in (DOUBLE, FLOAT)}
-# gcc's, with libquadmath; for references only, since NumPy and most compilers don't know it
+# gcc with libquadmath; for reference solutions only, since NumPy and most compilers lack it
 QUAD = Real("__float128", "q", "q", "", 2.0**-112, 0.0)
 
 
@@ -90,7 +90,7 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
 
 
 def _nearest(value: Expr) -> float:
-    """The nearest double. Raises EomcError where there is none."""
+    """Return the nearest double. Raises EomcError on overflow."""
     try:
         nearest = float(value)
     except OverflowError:
@@ -104,7 +104,7 @@ def _nearest(value: Expr) -> float:
 
 
 def _quad(value: Expr) -> str:
-    """A literal of 40 digits, or a quotient of numbers that 113 bits hold."""
+    """Return a literal with 40 digits, or a quotient of numbers of at most 113 bits."""
     if value.is_Rational and max(abs(value.p), value.q) < 2**113:
         return f"{value.p}.0q" if value.q == 1 else f"({value.p}.0q/{value.q}.0q)"
     text = str(value.evalf(40))
@@ -112,12 +112,13 @@ def _quad(value: Expr) -> str:
 
 
 def _decimal(value: float) -> str:
+    """Return a decimal literal."""
     text = repr(value)
     return text if "." in text or "e" in text else text + ".0"
 
 
 class Printer:
-    """Prints one function's values; `where` says how a name from outside is written in C."""
+    """Prints values of one function. `where`: the C expression of each name from outside."""
 
     def __init__(
         self, prefix: str, real: Real, where: Mapping[str, str], in_order: bool = False
@@ -129,14 +130,14 @@ class Printer:
         self.inline: dict[str, tuple[str, int]] = {}
 
     def name(self, name: str, binding: int = 4) -> str:
-        """A name as it is written, in parentheses where it binds less than `binding`."""
+        """Return the text of a name, in parentheses where it binds less strongly than `binding`."""
         if name in self.inline:
             text, strength = self.inline[name]
             return text if strength >= binding else f"({text})"
         return self.where.get(name, name)
 
     def operand(self, o: Operand, binding: int = 1) -> str:
-        """A number times a name."""
+        """Return the text of a number times a name."""
         if not o.name:
             return number(o.coefficient, self.real)
         if o.coefficient == 1:
@@ -144,7 +145,9 @@ class Printer:
         return self.value(Product(o.coefficient, (o.name,)), binding)[0]
 
     def value(self, value: Value, binding: int = 1) -> tuple[str, int]:
-        """The text of a right-hand side and how strongly it binds: 1 sums, 2 products, 4 names."""
+        """Return the text of a right-hand side and its binding strength: 1 sums, 2 products, 4
+        names.
+        """
         if isinstance(value, Sum):
             text, strength = self._sum(value), 1
         elif isinstance(value, Product):
@@ -154,7 +157,8 @@ class Printer:
         return (text, strength) if strength >= binding else (f"({text})", 4)
 
     def _sum(self, value: Sum) -> str:
-        # a positive term first, where there is one and their order is free
+        # A positive term comes first, if there is one and the order is free.
+        """Return the text of a sum."""
         terms = sorted(value.terms, key=lambda p: not self.in_order and is_negative(p[0]))
         text = ""
         if value.constant is not S.Zero and not is_negative(value.constant):
@@ -171,6 +175,7 @@ class Printer:
         return text
 
     def _product(self, value: Product) -> tuple[str, int]:
+        """Return the text of a product and its binding strength."""
         factors = [self.name(f, 4) for f in value.factors]
         c = value.coefficient
         sign = "-" if is_negative(c) else ""
@@ -181,6 +186,7 @@ class Printer:
         return sign + "*".join(factors), 2
 
     def _call(self, value: Call) -> tuple[str, int]:
+        """Return the text of a call and its binding strength."""
         one = "1.0" + self.real.suffix
         if value.function == "reciprocal":
             return f"{one}/{self.operand(value.args[0], 4)}", 2
@@ -205,13 +211,16 @@ class Printer:
         return text, 4
 
     def _sign(self, argument: Operand) -> str:
+        """Return the text of the sign of an operand."""
         if self.real.lane:
             return f"{self.prefix}_sign_{self.real.lane}({self.in_lane(argument)})"
         x = self.operand(argument, 4)
         return f"({self.real.name})(({x} > 0) - ({x} < 0))"
 
     def in_lane(self, o: Operand) -> str:
-        """An operand; a number alone in every lane."""
+        """Return the text of an operand; a number alone is broadcast to all elements of a
+        vector.
+        """
         text = self.operand(o, 1)
         if self.real.lane and not o.name:
             return f"{self.prefix}_same_{self.real.lane}({text})"
@@ -220,17 +229,17 @@ class Printer:
 
 @dataclass(frozen=True)
 class Body:
-    """A function's statements in blocks, and its results and checks as C expressions."""
+    """Statements of a function in blocks, with its results and checks as C expressions."""
 
     early: tuple[Block, ...]
     blocks: tuple[Block, ...]
     results: tuple[str, ...]
-    failures: tuple[str, ...]  # conditions under which D can't be inverted
-    sincos: bool  # whether some angle is reduced by our own code
+    failures: tuple[str, ...]  # conditions under which D is singular
+    sincos: bool  # whether sines are computed by the generated code
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Every statement, comments left out."""
+        """All statements without comments."""
         return tuple(line for block in (*self.early, *self.blocks) for line in block.lines)
 
 
@@ -245,25 +254,36 @@ def body(
     reserved: frozenset[str] = frozenset(),
     together: bool = False,
 ) -> Body:
-    """The statements of a function.
+    """Return the statements of a function.
 
-    where: how each name from outside is written (`m_c` -> `p->m_c`).
-    stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
-    in_order: terms of sums stay in their order. reserved: names that no value gets. together: the
-    sines of several angles are computed side by side.
+    Parameters
+    ----------
+    where
+        The C expression of each name from outside (`m_c` -> `p->m_c`).
+    stored
+        Where values are stored that are not local variables.
+    pivots
+        The number of pivots of the whole function, if this is a part of it.
+    in_order
+        Keep the order of the terms of sums.
+    reserved
+        Names that no value may have.
+    together
+        Compute the sines of several angles in vector registers.
     """
     stored = stored or {}
     inline = _inlined(function)
     new = _numbered(function, inline, reserved)
     function = rename(function, new)
     inline = frozenset(new[n] for n in inline)
-    # a value may bear the name of something outside that is not read here
+    # A value may have the same name as an argument that is not read here.
     uses = function.uses
     outside = {n: text for n, text in where.items() if n in uses}
     printer = Printer(prefix, real, outside | dict(stored), in_order)
     tolerance = 8 * real.epsilon * max(1, pivots, len(function.checks))
 
     def set_to(name: str, text: str) -> str:
+        """Return the assignment of a value."""
         return f"{stored.get(name, f'const {real.name} {name}')} = {text};"
 
     early_lines = []
@@ -306,15 +326,16 @@ def body(
 def _failures(
     printer: Printer, pairs: Iterable[tuple[Operand, Operand]], tolerance: float
 ) -> tuple[str, ...]:
-    """Conditions under which a pivot fails, each once; a positive number always is."""
-    asked = [(p, d) for p, d in pairs if p.name or not (p == d and p.coefficient > 0)]
-    return tuple(dict.fromkeys(_fails(printer, pair, tolerance) for pair in asked))
+    """Return the distinct conditions under which a pivot fails. Positive constants cannot fail."""
+    candidates = [(p, d) for p, d in pairs if p.name or not (p == d and p.coefficient > 0)]
+    return tuple(dict.fromkeys(_fails(printer, pair, tolerance) for pair in candidates))
 
 
 def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) -> str:
-    """Whether a pivot is not positive, or no more than what rounding leaves of a diagonal entry.
+    """Return the condition that a pivot is not positive, or below the rounding error of the
+    diagonal entry.
 
-    Not a number passes: the state behind it is reported as not finite.
+    NaN passes: the resulting state is reported as not finite.
     """
     pivot, diagonal = pair
     limit = _decimal(float(f"{tolerance:.1e}")) + printer.real.suffix
@@ -333,15 +354,16 @@ def _sincos(
     names: Mapping[str, str],
     stored: Mapping[str, str],
 ) -> list[str]:
+    """Return the statements for sine and cosine of one angle."""
     real = printer.real
     argument = printer.operand(angle)
     suffix = real.function_suffix
     if not real.reach:
-        made = {n: stored.get(n, f"const {real.name} {n}") for n in names.values()}
-        return [f"{made[n]} = {f}{suffix}({argument});" for f, n in names.items()]
-    one, other = names_of_pair(names)
-    local = [n for n in (one, other) if n not in stored]
-    both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
+        targets = {n: stored.get(n, f"const {real.name} {n}") for n in names.values()}
+        return [f"{targets[n]} = {f}{suffix}({argument});" for f, n in names.items()]
+    sine, cosine = names_of_pair(names)
+    local = [n for n in (sine, cosine) if n not in stored]
+    both = ", ".join(f"&{stored.get(n, n)}" for n in (sine, cosine))
     return [
         *([f"{real.name} {', '.join(local)};"] if local else []),
         f"{printer.prefix}_sincos_{real.lane}({argument}, {both}, &failed);"
@@ -351,15 +373,15 @@ def _sincos(
 
 
 def several(function: Function) -> Mapping[Operand, Sequence[Operand]]:
-    """Angles that come from outside, each with those of its stage, where they are SEVERAL."""
-    made = {a.name for a in (*function.early, *function.body)}
+    """Group the angles that come from outside by stage, in groups of at least MIN_SIMD_ANGLES."""
+    computed = {a.name for a in (*function.early, *function.body)}
     by_stage: dict[Stage, dict[Operand, None]] = {}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             (angle,) = a.value.args
-            if angle.name and angle.name not in made:
+            if angle.name and angle.name not in computed:
                 by_stage.setdefault(a.stage, {})[angle] = None
-    groups = [tuple(group) for group in by_stage.values() if len(group) >= SEVERAL]
+    groups = [tuple(group) for group in by_stage.values() if len(group) >= MIN_SIMD_ANGLES]
     return {angle: group for group in groups for angle in group}
 
 
@@ -369,18 +391,20 @@ def _sincos_several(
     set_to: Callable[[str, str], str],
     numbers: Iterator[int],
 ) -> list[str]:
-    """Their statements; numbers: of what is still to be named in this function."""
+    """Return the statements for sines of several angles. numbers: numbers for names of
+    variables.
+    """
     lane, lines, groups = f"{printer.prefix}_four", list[str](), list(angles.items())
     for first in range(0, len(groups), FOUR):
-        some, j = groups[first : first + FOUR], next(numbers)
-        x, s, c = (f"{what}{j}_" for what in ("angles", "sines", "cosines"))
-        arguments = ", ".join(printer.operand(angle) for angle, _ in some)
+        group, j = groups[first : first + FOUR], next(numbers)
+        x, s, c = (f"{quantity}{j}_" for quantity in ("angles", "sines", "cosines"))
+        arguments = ", ".join(printer.operand(angle) for angle, _ in group)
         lines += [
             f"{lane} {x} = {{ {arguments} }}, {s}, {c};",
             f"{printer.prefix}_sincos_each_four(&{x}, &{s}, &{c});",
             *(
                 set_to(name, f"{ {'sin': s, 'cos': c}[f] }[{k}]")
-                for k, (_, names) in enumerate(some)
+                for k, (_, names) in enumerate(group)
                 for f, name in names.items()
             ),
         ]
@@ -388,16 +412,18 @@ def _sincos_several(
 
 
 def _inlined(function: Function) -> frozenset[str]:
-    """Short values that are read once, at their own stage, and whose name says nothing."""
+    """Return values to inline: short, read once in their own stage, and without a meaningful
+    name.
+    """
     uses: Counter[str] = Counter()
     stage_of_reader: dict[str, Stage] = {}
-    everything = (*function.early, *function.body)
-    for a in everything:
+    assignments = (*function.early, *function.body)
+    for a in assignments:
         twice = isinstance(a.value, Call) and a.value.function in ("sign", "heaviside")
         for name in a.value.names:
             uses[name] += 2 if twice else 1
             stage_of_reader[name] = a.stage
-    last = max((a.stage for a in everything), default=Stage.NUMBER)
+    last = max((a.stage for a in assignments), default=Stage.NUMBER)
     for o in function.outputs:
         uses[o.name] += 1
         stage_of_reader.setdefault(o.name, last)
@@ -405,13 +431,13 @@ def _inlined(function: Function) -> frozenset[str]:
         uses.update(2 * [o.name for o in pair])  # read outside the statements
     inline: set[str] = set()
     weight: dict[str, int] = {}
-    for a in everything:
-        own = len(a.value.names) + (isinstance(a.value, Call))
-        weight[a.name] = own + sum(weight[n] for n in a.value.names if n in inline)
+    for a in assignments:
+        operations = len(a.value.names) + (isinstance(a.value, Call))
+        weight[a.name] = operations + sum(weight[n] for n in a.value.names if n in inline)
         sine = isinstance(a.value, Call) and a.value.function in ("sin", "cos", "reciprocal")
-        same = stage_of_reader.get(a.name) == a.stage
-        if uses[a.name] == 1 and same and not a.named and not sine:
-            if weight[a.name] <= MOST_INLINE:
+        same_stage = stage_of_reader.get(a.name) == a.stage
+        if uses[a.name] == 1 and same_stage and not a.named and not sine:
+            if weight[a.name] <= MAX_INLINE_OPERATIONS:
                 inline.add(a.name)
     return frozenset(inline)
 
@@ -419,29 +445,29 @@ def _inlined(function: Function) -> frozenset[str]:
 def _numbered(
     function: Function, inline: frozenset[str], reserved: frozenset[str]
 ) -> dict[str, str]:
-    """w1, w2, ... counted anew over the values that keep a name."""
-    everything = (*function.early, *function.body)
-    plain = [a.name for a in everything if not a.named and a.name not in inline]
-    taken = function.uses | reserved | {a.name for a in everything if a.named}
-    fresh = (w for k in count(1) if (w := f"w{k}") not in taken)
+    """Renumber the values without meaningful names as w1, w2, ..."""
+    assignments = (*function.early, *function.body)
+    plain = [a.name for a in assignments if not a.named and a.name not in inline]
+    used = function.uses | reserved | {a.name for a in assignments if a.named}
+    fresh = (w for k in count(1) if (w := f"w{k}") not in used)
     return dict(zip(plain, fresh, strict=False)) | {name: f"_{name}" for name in inline}
 
 
 def indent(lines: Iterable[str], width: int = 4) -> str:
-    """Lines of one block, indented; long ones broken after operators."""
-    whole = [line for text in lines for line in broken(text, 100 - width)]
-    return "\n".join((" " * width + line).rstrip() for line in whole)
+    """Indent the lines of a block and break long ones after operators."""
+    all_lines = [line for text in lines for line in broken(text, 100 - width)]
+    return "\n".join((" " * width + line).rstrip() for line in all_lines)
 
 
 def broken(text: str, width: int = 100) -> Sequence[str]:
-    """A statement or a prototype over several lines, each at most `width` long where it can be."""
+    """Break a statement or prototype into lines of at most `width` characters where possible."""
     lines = []
     while len(text) > width:
-        marks = (", ", " + ", " - ", " || ", "*", " | ", "; ", " = ", "(")
-        at = next((k for m in marks if (k := text.rfind(m, 12, width)) > 0), 0)
-        if not at:
+        separators = (", ", " + ", " - ", " || ", "*", " | ", "; ", " = ", "(")
+        position = next((k for m in separators if (k := text.rfind(m, 12, width)) > 0), 0)
+        if not position:
             break
-        at += 1 if text[at] in ",;(" else 0
-        lines.append(text[:at])
-        text = "    " + text[at:].lstrip()
+        position += 1 if text[position] in ",;(" else 0
+        lines.append(text[:position])
+        text = "    " + text[position:].lstrip()
     return [*lines, text]

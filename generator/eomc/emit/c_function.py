@@ -1,7 +1,7 @@
-"""C functions as values, and the few kinds of statement that a program becomes.
+"""C functions as values, and the kinds of statement that occur in them.
 
-A function prints its prototype, its definition and a call; which of its arguments it does not read
-it knows by itself. With c_expression.py the only Python that holds C syntax.
+A function prints its prototype, its definition and calls, and determines which arguments its body
+does not read. Together with c_expression.py, this is the only Python code with C syntax.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ WIDTH = 100  # of a line
 
 @dataclass(frozen=True)
 class CArgument:
-    """One argument, `const double q[CARTPOLE_NQ]`: its type, its name, its extent if it has one."""
+    """An argument such as `const double q[CARTPOLE_NQ]`: type, name and array size, if any."""
 
     type: str
     name: str
@@ -25,18 +25,18 @@ class CArgument:
 
     @property
     def declaration(self) -> str:
-        """As it stands in a prototype."""
+        """The declaration in a prototype."""
         gap = "" if self.type.endswith("*") else " "
         return f"{self.type}{gap}{self.name}" + (f"[{self.extent}]" if self.extent else "")
 
 
 def given(type: str, name: str, extent: str = "") -> CArgument:
-    """An array that a function reads; without an extent a pointer to it, which may be NULL."""
+    """Return an argument for an array that is read; without a size, a pointer that may be NULL."""
     return CArgument(f"const {type}" if extent else f"const {type} *", name, extent)
 
 
 def filled(type: str, name: str, extent: str = "") -> CArgument:
-    """An array that a function writes."""
+    """Return an argument for an array that is written."""
     return CArgument(type if extent else f"{type} *", name, extent)
 
 
@@ -44,8 +44,14 @@ def filled(type: str, name: str, extent: str = "") -> CArgument:
 class CFunction:
     """A C function.
 
-    body: its statements, a blank line between blocks; empty where a template has them. reads: the
-    names of the arguments that the body reads. doc: the comment above it, by paragraphs.
+    Attributes
+    ----------
+    body
+        Statements, with a blank line between blocks. Empty where a template contains them.
+    reads
+        Names of the arguments that the body reads.
+    doc
+        Paragraphs of the comment above the function.
     """
 
     name: str
@@ -58,14 +64,14 @@ class CFunction:
 
     @property
     def prototype(self) -> str:
-        """Result, name and arguments, in one line."""
+        """Result type, name and arguments in one line."""
         listed = ", ".join(a.declaration for a in self.arguments) or "void"
         words = (self.qualifier, self.result, f"{self.name}({listed})")
         return " ".join(w for w in words if w)
 
     @property
     def comment(self) -> str:
-        """The doc as a comment, in one line where it fits."""
+        """The comment above the function, in one line where it fits."""
         if len(whole := " ".join(self.doc)) <= WIDTH - 6:
             return f"/* {whole} */"
         lines = [line for part in self.doc for line in textwrap.wrap(part, WIDTH - 3)]
@@ -73,33 +79,33 @@ class CFunction:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """The arguments that the body does not read."""
+        """Arguments that the body does not read."""
         return tuple(a.name for a in self.arguments if a.name not in self.reads)
 
     @property
     def inside(self) -> str:
-        """The body, indented, behind the arguments that it does not read."""
+        """The indented body, after void casts of the unused arguments."""
         unread = Block("", tuple(f"(void){name};" for name in self.unused))
         return "\n\n".join(block_text(b) for b in (unread, *self.body) if b.lines)
 
     @property
     def definition(self) -> str:
-        """Prototype and body, the comment above it where it is static."""
+        """Prototype and body, with the comment above if the function is static."""
         head = [self.comment] if self.doc and self.qualifier else []
         return "\n".join([*head, self.prototype, "{", self.inside, "}"])
 
     def call(self, **passed: str) -> str:
-        """A call with other expressions in the place of some arguments; no semicolon."""
+        """Return a call in which some arguments are replaced by expressions; no semicolon."""
         return f"{self.name}({', '.join(passed.get(a.name, a.name) for a in self.arguments)})"
 
 
 def static(name: str, result: str, *arguments: CArgument) -> CFunction:
-    """A function of the file's own, whose body a template has."""
+    """Return a static function whose body a template contains."""
     return CFunction(name, result, arguments, qualifier="static")
 
 
 def block_text(block: Block) -> str:
-    """The statements of a block, indented, under its comment."""
+    """Return the indented statements of a block under its comment."""
     lines = [f"/* {block.comment} */"] if block.comment else []
     return "\n".join(f"    {line}" for line in (*lines, *block.lines))
 
@@ -108,125 +114,134 @@ def block_text(block: Block) -> str:
 
 
 def constant(type: str, name: str, value: str) -> str:
-    """A local that keeps its value."""
+    """Return the definition of a constant local variable."""
     return f"const {type} {name} = {value};"
 
 
 def local(type: str, name: str) -> str:
-    """A local without a value."""
+    """Return the declaration of a local variable."""
     return f"{type} {name};"
 
 
 def assign(place: str, value: str) -> str:
-    """place = value."""
+    """Return an assignment."""
     return f"{place} = {value};"
 
 
 def do(call: str) -> str:
-    """A call as a statement."""
+    """Return a call as a statement."""
     return f"{call};"
 
 
 def result(value: str) -> str:
-    """Return a value."""
+    """Return a return statement."""
     return f"return {value};"
 
 
 def note(conditions: Iterable[str]) -> tuple[str, ...]:
-    """Conditions into a mask."""
+    """Return statements that add conditions to the mask `failed`."""
     return tuple(f"failed |= {text};" for text in conditions)
 
 
 def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
-    """Return `value` where one of the conditions holds; nothing where there are none."""
+    """Return "return value" if one of the conditions holds; no statements without conditions."""
     text = " || ".join(conditions)
     return (f"if ({text})", f"    return {value};") if text else ()
 
 
 def otherwise_signal(array: str, call: str) -> tuple[str, ...]:
-    """u set to the scene's own signals where it is NULL."""
+    """Return statements that set u to the scene's signals where it is NULL."""
     return ("if (!u) {", f"    {call};", f"    u = {array};", "}")
 
 
 def listed(type: str, name: str, extent: str, values: Sequence[str]) -> str:
-    """An array of these values."""
+    """Return the definition of a constant array."""
     return f"const {type} {name}[{extent}] = {{ {', '.join(values)} }};"
 
 
 def member(of: str, name: str) -> str:
-    """A member behind a pointer."""
+    """Return a member of a struct behind a pointer."""
     return f"{of}->{name}"
 
 
 def cast(type: str, name: str) -> str:
-    """A pointer as one to another type, to be read."""
+    """Return a pointer cast to a pointer to another constant type."""
     return f"(const {type} *){name}"
 
 
 def struct(type: str, real: str, members: Sequence[str]) -> str:
-    """A struct of numbers."""
+    """Return the definition of a struct of numbers."""
     return f"typedef struct {{\n    {real} {', '.join(members)};\n}} {type};"
 
 
 def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
-    """Numbers of an array from `first` on into another, in a loop."""
-    place = f"{first} + k" if first else "k"
-    return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{place}];")
+    """Return a loop that copies elements of an array, from `first` on."""
+    index = f"{first} + k" if first else "k"
+    return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{index}];")
 
 
 def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:
-    """The rows of a matrix as initialisers."""
+    """Return the rows of a matrix as initialisers."""
     return tuple("{ " + ", ".join(row) + " }," for row in rows)
 
 
 def narrowed(text: str) -> str:
-    """The finished text with its long comments broken: one behind code goes above it."""
-    lines, out, inside = text.split("\n")[::-1], list[str](), False
+    """Break long comments of a finished text. A comment after code is moved above it."""
+    lines, result_lines, inside = text.split("\n")[::-1], list[str](), False
     while lines:
         line = lines.pop()
-        code, opened, said = line.partition("/*")
+        before_comment, mark_, comment_text = line.partition("/*")
         margin = " " * (len(line) - len(line.lstrip(" ")))
         if len(line) > WIDTH and "Generated by" not in line:
-            if not inside and code.strip() and said.endswith("*/") and _apart(code.lstrip()):
-                lines += [code.rstrip(), f"{margin}/*{said}"]
+            if (
+                not inside
+                and before_comment.strip()
+                and comment_text.endswith("*/")
+                and _may_move_above(before_comment.lstrip())
+            ):
+                lines += [before_comment.rstrip(), f"{margin}/*{comment_text}"]
                 continue
-            if inside or (opened and not code.strip()):
-                line, rest = _cut(line)
-                mark = f"{margin}* " if inside else f"{margin} * "
-                if lines and not rest.endswith((".", "*/")) and lines[-1].startswith(mark):
-                    rest += " " + lines.pop().removeprefix(mark)
-                lines += [mark + rest] if rest else []
+            if inside or (mark_ and not before_comment.strip()):
+                line, rest = _split_comment(line)
+                continuation = f"{margin}* " if inside else f"{margin} * "
+                if lines and not rest.endswith((".", "*/")) and lines[-1].startswith(continuation):
+                    rest += " " + lines.pop().removeprefix(continuation)
+                lines += [continuation + rest] if rest else []
         inside = line.rfind("/*") > line.rfind("*/") or (inside and "*/" not in line)
-        out.append(line)
-    return "\n".join(out)
+        result_lines.append(line)
+    return "\n".join(result_lines)
 
 
-def _apart(code: str) -> bool:
-    """Whether a comment may stand above this code."""
+def _may_move_above(code: str) -> bool:
+    """Return True if a comment may be moved above this code."""
     return not code.startswith(("#", "}", "else"))
 
 
-def _cut(line: str) -> tuple[str, str]:
-    """A line of a comment and what goes into the next, with its end."""
-    at = line.rfind(" ", 0, min(WIDTH + 1, len(line.removesuffix(" */"))))
-    begins = len(line) - len(line.lstrip(" /*"))
-    return (line[:at], line[at + 1 :]) if at >= begins else (line, "")
+def _split_comment(line: str) -> tuple[str, str]:
+    """Split a comment line into what fits and the rest."""
+    break_position = line.rfind(" ", 0, min(WIDTH + 1, len(line.removesuffix(" */"))))
+    text_start = len(line) - len(line.lstrip(" /*"))
+    return (
+        (line[:break_position], line[break_position + 1 :])
+        if break_position >= text_start
+        else (line, "")
+    )
 
 
 def laid_out(text: str) -> str:
-    """The finished text with its long lines broken; directives stay."""
-    out: list[str] = []
+    """Break all long lines of a finished text except directives."""
+    result_lines: list[str] = []
     for line in narrowed(text).split("\n"):
         inside = line.lstrip(" ")
         if len(line) <= WIDTH or inside.startswith(("* ", "/*", "#")) or line.endswith("*/"):
-            out.append(line)
+            result_lines.append(line)
             continue
         width = len(line) - len(inside)
-        head, opened, rest = inside.partition("(")
-        if opened and ", " not in inside[: WIDTH - width] and len(head) < WIDTH - width:
-            out.append(" " * width + head + opened)
+        head, parenthesis, rest = inside.partition("(")
+        if parenthesis and ", " not in inside[: WIDTH - width] and len(head) < WIDTH - width:
+            result_lines.append(" " * width + head + parenthesis)
             parts = [" " * 4 + part.lstrip() for part in broken(rest, WIDTH - width - 4)]
         else:
             parts = list(broken(inside, WIDTH - width))
-        out += [" " * width + part.rstrip() for part in parts]
-    return "\n".join(out)
+        result_lines += [" " * width + part.rstrip() for part in parts]
+    return "\n".join(result_lines)

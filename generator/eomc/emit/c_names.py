@@ -1,4 +1,4 @@
-"""How a program's names and functions are written in C: what all parts of the context share."""
+"""Names of a program in C, which all parts of the code generation share."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from eomc.model.system import System
 from eomc.program.ir import Call, Function, rename
 from eomc.program.program import TIME, Program
 
-# names that the templates use inside functions; a user's name that is one of them gets a "_"
-_OURS = frozenset(
+# Names that templates use inside functions; a scene's name among them gets a trailing "_".
+RESERVED_NAMES = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
@@ -27,8 +27,8 @@ _OURS = frozenset(
     "d far total singular A".split()
 )
 
-# macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
-# that is called so has another name in C
+# Macros and enumerators of the templates and csrc, without the scene's prefix. A coordinate or
+# input with such a name is renamed in C.
 OWN = frozenset(
     "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NE_ROOM NF "
     "NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS "
@@ -40,9 +40,9 @@ Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -
 
 @dataclass(frozen=True)
 class Target:
-    """A program that is to become C with numbers of one type.
+    """A program to be written as C with numbers of one type.
 
-    written: the author's names, where C has others.
+    written: the author's name by C name, where they differ.
     """
 
     program: Program
@@ -50,7 +50,7 @@ class Target:
     written: Mapping[str, str] = field(default_factory=dict)
 
     def as_written(self, name: str) -> str:
-        """The author's name of a coordinate, parameter or input."""
+        """Return the author's name of a coordinate, parameter or input."""
         return self.written.get(name, name)
 
     @property
@@ -60,44 +60,46 @@ class Target:
 
     @property
     def prefix(self) -> str:
-        """What every C name begins with."""
+        """The prefix of all C names."""
         return self.system.name
 
     @property
     def PREFIX(self) -> str:
-        """What every macro and enumerator begins with."""
+        """The prefix of all macros and enumerators."""
         return self.prefix.upper()
 
     @cached_property
     def enum(self) -> dict[str, str]:
-        """Enumerators of coordinates and inputs; of outputs as OUT_name, of frames FRAME_name."""
-        taken = {f"{self.PREFIX}_{w}" for w in OWN}
+        """Enumerators by name: coordinates, inputs, OUT_output, EVENT_event, CONSTRAINT_row,
+        FRAME_frame.
+        """
+        reserved = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
         outputs += [f"EVENT_{e.name}" for e in self.system.events]
         outputs += [f"CONSTRAINT_{c.name}" for c in self.system.constraints]
         names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.asked)]
-        wishes = [f"{self.PREFIX}_{name}" for name in names]
-        return dict(zip(names, _unique(wishes, taken), strict=True))
+        preferred = [f"{self.PREFIX}_{name}" for name in names]
+        return dict(zip(names, _unique(preferred, reserved), strict=True))
 
     @property
     def input_names(self) -> list[str]:
-        """The inputs in the order of u."""
+        """Names of the inputs in the order of u."""
         return [i.name for i in self.system.inputs]
 
     @property
     def names(self) -> list[str]:
-        """The coordinates in the order of q."""
+        """Names of the coordinates in the order of q."""
         return [c.name for c in self.system.coordinates]
 
     @cached_property
     def wrenches(self) -> list[Symbol]:
-        """The entries of forces and moments at the frames."""
+        """Symbols of the forces and moments at the frames."""
         return wrenches(self.system)
 
     @property
     def multipliers(self) -> list[str]:
-        """Those of constraints, as reactions read them."""
+        """Names of the Lagrange multipliers, which reactions read."""
         return [c.multiplier.name for c in self.system.constraints]
 
     @property
@@ -114,18 +116,20 @@ class Target:
 
     @cached_property
     def signal_t(self) -> bool:
-        """Whether the scene's signals depend on the time."""
+        """Whether the scene's signals depend on time."""
         return "signal" in self.program and TIME in self.program["signal"].uses
 
     @cached_property
     def driven(self) -> bool:
-        """Whether motion depends on the time, by itself or by the signals."""
-        moved = [f for n in ("acceleration", "projection") if (f := self.program.functions.get(n))]
-        return any(TIME in f.uses for f in moved) or self.signal_t
+        """Whether the motion depends on time, directly or through signals."""
+        functions = [
+            f for n in ("acceleration", "projection") if (f := self.program.functions.get(n))
+        ]
+        return any(TIME in f.uses for f in functions) or self.signal_t
 
     @cached_property
     def sincos(self) -> bool:
-        """Whether angles are reduced by our own code."""
+        """Whether sines and cosines are computed by the generated code."""
         return self.real.reach > 0 and any(
             isinstance(a.value, Call) and a.value.function in ("sin", "cos")
             for f in self.program.functions.values()
@@ -134,11 +138,11 @@ class Target:
 
     @property
     def zero(self) -> str:
-        """The number 0."""
+        """The literal 0."""
         return "0.0" + self.real.suffix
 
     def literal(self, value: float) -> str:
-        """A number as the element type."""
+        """Return a number as a literal of the element type."""
         text = repr(value)
         return (
             text if "." in text or "e" in text or "n" in text else text + ".0"
@@ -147,24 +151,28 @@ class Target:
     # bodies
 
     def where(self) -> dict[str, str]:
-        """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
+        """Return the C expression of each name: p->m_c for parameters, theta_ where theta is
+        reserved.
+        """
         s = self.system
-        out = {x.name: c_function.member("p", x.name) for x in s.parameters}
-        mine = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.reads_qdd else ()), *s.u)]
-        return out | {n: local(n) for n in mine}
+        expressions = {x.name: c_function.member("p", x.name) for x in s.parameters}
+        locals_ = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.reads_qdd else ()), *s.u)]
+        return expressions | {n: local(n) for n in locals_}
 
     def body(
         self, function: Function, where: Mapping[str, str] | None = None, **options: Any
     ) -> Body:
-        """The statements of a function; see c_expression.body for the options."""
+        """Return the statements of a function. Options: see `c_expression.body`."""
         known = self.where() | dict(where or {})
         reserved = self.system.names
         return c_expression.body(
-            unclashed(function), self.prefix, known, self.real, reserved=reserved, **options
+            rename_reserved(function), self.prefix, known, self.real, reserved=reserved, **options
         )
 
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:
-        """Locals for the coordinates, velocities, inputs and directions that are used."""
+        """Return definitions of locals for the coordinates, velocities, inputs and directions that
+        are read.
+        """
         s, real, uses = self.system, self.real.name, function.uses
         NQ = f"{self.PREFIX}_NQ"
         read = [(c.q.name, state("q", c.name)) for c in s.coordinates]
@@ -184,11 +192,13 @@ class Target:
         ]
 
     def element(self, array: str, name: str) -> str:
-        """q[CARTPOLE_THETA]."""
+        """Return an array element, such as q[CARTPOLE_THETA]."""
         return f"{array}[{self.enum[name]}]"
 
     def groups(self) -> dict[str, frozenset[str]]:
-        """The names that each argument brings: those of q, qd, qdd, t, u, p, along."""
+        """Return the names that each argument supplies: q, qd, qdd, wrenches, lambda, t, u, p,
+        along.
+        """
         s = self.system
         return {
             "q": frozenset(x.name for x in s.q),
@@ -203,32 +213,36 @@ class Target:
         }
 
 
-def unclashed(function: Function) -> Function:
-    """The function with other names for its values that are called like something of ours."""
-    clash = {a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in _OURS}
+def rename_reserved(function: Function) -> Function:
+    """Rename values of a function whose names are reserved."""
+    clash = {
+        a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in RESERVED_NAMES
+    }
     return rename(function, clash) if clash else function
 
 
 def local(name: str) -> str:
-    """A coordinate, velocity or input as a local variable."""
-    return name + "_" if name in _OURS else name
+    """Return the name of the local variable of a coordinate, velocity or input."""
+    return name + "_" if name in RESERVED_NAMES else name
 
 
 def sentence(function: Function) -> str:
-    """What one call costs."""
+    """Return a sentence with the operations of one call."""
     cost = str(function.cost)
     return cost[0].upper() + cost[1:] + "."
 
 
-def _unique(wishes: Iterable[str], taken: set[str]) -> list[str]:
-    """Upper-case enumerators, in the author's own case where that would clash."""
-    out = []
-    wishes = list(wishes)
-    uppers = [w.upper() for w in wishes]
-    for wish, upper in zip(wishes, uppers, strict=True):
-        used = upper if uppers.count(upper) == 1 else wish
-        while used in taken or may_be_enumerator_of_others(used):
-            used += "_"
-        taken.add(used)
-        out.append(used)
-    return out
+def _unique(preferred: Iterable[str], reserved: set[str]) -> list[str]:
+    """Return unique enumerators: upper case, or the author's case where that would not be
+    unique.
+    """
+    enumerators = []
+    preferred = list(preferred)
+    uppers = [w.upper() for w in preferred]
+    for name, upper in zip(preferred, uppers, strict=True):
+        enumerator = upper if uppers.count(upper) == 1 else name
+        while enumerator in reserved or may_be_enumerator_of_others(enumerator):
+            enumerator += "_"
+        reserved.add(enumerator)
+        enumerators.append(enumerator)
+    return enumerators

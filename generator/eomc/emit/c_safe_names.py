@@ -1,8 +1,8 @@
-"""Names of a scene that C can't bear as they stand: macros of headers, functions that are called.
+"""Renaming of scene names that C code cannot use: macros of headers, and functions that are called.
 
-A program's names reach C as struct members, enumerators and local variables, beside whatever the
-C library, Python.h or a user's own headers define. Those that may be macros there get a "_"
-behind, which no name of a scene has, and the header says so; Python keeps the author's names.
+Names of a program become struct members, enumerators and local variables next to the definitions of
+the C library, Python.h and users' headers. Names that may be macros get a trailing "_", which no
+scene name has, and the header lists them. Python keeps the author's names.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from eomc.model.symbols import ALONG
 from eomc.program.ir import rename
 from eomc.program.program import Program
 
-# macros are shouted: three capitals and no small letter. The rest of glibc's and Python's
+# Most macros have three capitals and no small letter. The others of glibc and Python follow.
 _SHOUTED = re.compile(r"[^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*")
 _OTHERS = re.compile(
     r"M_(\d_)?(E|PI|SQRT|LN|LOG)\w*|Py\w*|(PRI|SCN)[bdioux]\w*|L_(ctermid|cuserid|tmpnam)|P_tmpdir|"
@@ -25,7 +25,7 @@ _OTHERS = re.compile(
     r"B(0|[1-9]\d{1,6})|(BS|FF|NL|VT)[01]|CR[0-3]|CS[5-8]"  # <termios.h>
 )
 
-# words that macros begin with; an enumerator of a scene that is called so could be one of them
+# Prefixes of macros, with which an enumerator of a scene could coincide
 _FAMILY = re.compile(
     "(?:ADJ|AIO|ALIGNOF|ATOMIC|BC|CHAR|CHARCLASS|CLOCKS?|CLONE|CLOSE|COLL|CPU|DBL|DELAYTIMER|ENABLE|"
     "EXIT|EXPR|FD|FE|FILENAME|FLT|FOPEN|FP|FV[CS]|HAVE|HUGE|IOV|ITIMER|LC|LDBL|MATH|MAX|MB|METH|MOD|"
@@ -42,52 +42,54 @@ _CALLED = frozenset(name + suffix for name in MATHEMATICS for suffix in ("f", "l
 
 
 def may_be_macro(name: str) -> bool:
-    """Whether some header may define a macro of this name."""
+    """Return True if a header may define a macro of this name."""
     return bool(_SHOUTED.fullmatch(name) or _OTHERS.fullmatch(name))
 
 
 def may_be_enumerator_of_others(name: str) -> bool:
-    """The same of a name with the scene's in front, in capitals; no macro ends in a "_"."""
+    """Return True if a header may define a macro equal to this enumerator. No macro ends in "_"."""
     return not name.endswith("_") and bool(_FAMILY.fullmatch(name))
 
 
 def in_c(name: str, prefix: str) -> str:
-    """The name as C has it, in a scene of this prefix."""
+    """Return the C name of a name, in a scene with the given prefix."""
     ours = name.lower().startswith(prefix.lower() + "_")
     return name + "_" if ours or may_be_macro(name) or name in _CALLED else name
 
 
-def borne(program: Program) -> tuple[Program, Mapping[str, str]]:
-    """The program with names that C can bear, and the author's name of each coordinate,
-    parameter and input that is called otherwise there.
+def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
+    """Rename what C cannot use.
+
+    Returns the program, and the author's name by C name of each renamed coordinate, parameter and
+    input.
     """
     system = program.system
     declared = [c.name for c in system.coordinates]
     declared += [p.name for p in system.parameters] + [i.name for i in system.inputs]
-    wishes = {name: in_c(name, system.name) for name in declared}
-    other = {name: used for name, used in wishes.items() if used != name}
-    new = dict(_derived(other))
+    c_names = {name: in_c(name, system.name) for name in declared}
+    renamed_to = {name: c_name for name, c_name in c_names.items() if c_name != name}
+    new = dict(_derived(renamed_to))
     for function in program.functions.values():
         for a in (*function.early, *function.body):
-            if (used := in_c(a.name, system.name)) != a.name:
-                new.setdefault(a.name, used)
+            if (c_name := in_c(a.name, system.name)) != a.name:
+                new.setdefault(a.name, c_name)
     if not new:
         return program, {}
     renamed = replace(
         system,
-        coordinates=tuple(replace(c, name=wishes[c.name]) for c in system.coordinates),
-        parameters=tuple(replace(p, name=wishes[p.name]) for p in system.parameters),
-        inputs=tuple(replace(i, name=wishes[i.name]) for i in system.inputs),
-        renamed=(*system.renamed, *other.items()),
+        coordinates=tuple(replace(c, name=c_names[c.name]) for c in system.coordinates),
+        parameters=tuple(replace(p, name=c_names[p.name]) for p in system.parameters),
+        inputs=tuple(replace(i, name=c_names[i.name]) for i in system.inputs),
+        renamed=(*system.renamed, *renamed_to.items()),
     )
     functions = {name: rename(f, new) for name, f in program.functions.items()}
-    written = {used: name for name, used in other.items()}
+    written = {c_name: name for name, c_name in renamed_to.items()}
     return replace(program, system=renamed, functions=functions), written
 
 
-def _derived(other: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """The names, with those of rates and of directions along them."""
-    for name, used in other.items():
-        for behind in ("", "_dot", "_ddot"):
-            yield name + behind, used + behind
-            yield name + behind + ALONG, used + behind + ALONG
+def _derived(renamed_to: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the pairs of names, also for velocities, accelerations and directions."""
+    for name, c_name in renamed_to.items():
+        for ending in ("", "_dot", "_ddot"):
+            yield name + ending, c_name + ending
+            yield name + ending + ALONG, c_name + ending + ALONG

@@ -1,4 +1,4 @@
-"""Coefficients of methods of integration as they are written in C."""
+"""Coefficients of integration methods as C literals."""
 
 from __future__ import annotations
 
@@ -15,47 +15,49 @@ from eomc.integrators.tableaux import Method, Row
 
 
 def literal(x: Fraction, real: Real) -> str:
-    """A coefficient as it is written in C."""
+    """Return a coefficient as a C literal."""
     return c_expression.number(Rational(x.numerator, x.denominator), real)
 
 
 def _nearest(x: Fraction, real: Real) -> Fraction:
-    """The double nearest to x, or the float nearest to that."""
+    """Return the nearest double, or the float nearest to it."""
     form = {"float64": "d", "float32": "f"}[real.dtype]
     return Fraction(*struct.unpack(form, struct.pack(form, float(x))))
 
 
 def rounded(weights: Row, real: Real) -> Row:
-    """The weights as they are in C, with their sum as it is: what it lacks would add up over steps.
+    """Round weights such that their sum is exact, since an error of the sum would accumulate over
+    steps.
 
-    The smallest one takes what rounding left of the sum; of a symmetric method both of a pair.
+    The smallest weight takes the rounding error of the sum; for symmetric methods, two equal ones
+    share it.
     """
     if not real.dtype:  # 113 bits, for references
         return weights
-    rounded = [_nearest(x, real) for x in weights]
-    lack = Fraction(round(sum(weights, Fraction(0)))) - sum(rounded, Fraction(0))
+    values = [_nearest(x, real) for x in weights]
+    error = Fraction(round(sum(weights, Fraction(0)))) - sum(values, Fraction(0))
     symmetric = weights == weights[::-1] and len(weights) > 1
-    for k in sorted(range(len(rounded)), key=lambda k: abs(rounded[k])):
-        places = {k, len(rounded) - 1 - k} if symmetric else {k}
-        wished = rounded[k] + lack / len(places)
-        if rounded[k] and _nearest(wished, real) == wished:
-            return tuple(wished if n in places else x for n, x in enumerate(rounded))
-    return tuple(rounded)
+    for k in sorted(range(len(values)), key=lambda k: abs(values[k])):
+        indices = {k, len(values) - 1 - k} if symmetric else {k}
+        corrected = values[k] + error / len(indices)
+        if values[k] and _nearest(corrected, real) == corrected:
+            return tuple(corrected if n in indices else x for n, x in enumerate(values))
+    return tuple(values)
 
 
 def numbers(row: Row, real: Real) -> tuple[str, ...]:
-    """A row of coefficients."""
+    """Return a row of coefficients as literals."""
     return tuple(literal(x, real) for x in row)
 
 
 def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
-    """The rows of a square matrix, zeros where a triangle ends."""
-    whole = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
-    return c_function.in_braces(numbers(row, real) for row in whole)
+    """Return the rows of a square matrix as initialisers, a triangle padded with zeros."""
+    padded = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
+    return c_function.in_braces(numbers(row, real) for row in padded)
 
 
 class Tableau(TypedDict):
-    """Of a method for second-order equations: times, A and A A by row, b and b A."""
+    """Coefficients of a method for second-order equations: nodes, A and A A by rows, b and b A."""
 
     c: tuple[str, ...]
     A: tuple[str, ...]
@@ -65,7 +67,7 @@ class Tableau(TypedDict):
 
 
 def tableau(m: Method, real: Real) -> Tableau:
-    """The coefficients of a method as they are written in C."""
+    """Return the coefficients of a method as literals."""
     return Tableau(
         c=numbers(m.c, real),
         A=matrix(m.a, real),

@@ -1,4 +1,4 @@
-"""The derivatives of a step along q, qd and u, in both forms of C."""
+"""Functions for the derivatives of a step with respect to q, qd and u, in both forms of C."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from eomc.emit.c_function import CFunction
 from eomc.emit.coefficients import tableau
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Derivative
-from eomc.emit.projection import APART, near
+from eomc.emit.projection import ZERO_SQUARE, near
 from eomc.integrators.tableaux import METHODS
 
-TURNS = 50  # of Newton's method for the stages
+MAX_NEWTON_ITERATIONS = 50  # for the stages
 
 
 def derivatives(plain: Functions) -> Iterator[Derivative]:
-    """Those of each method, where the scene asks for them; what they share is in the first."""
+    """Yield the view for each method where the scene requests it. The first has the shared
+    functions.
+    """
     target, real = plain.target, plain.target.real
     run = target.system.run
     if not run.discretize:
         return
-    inputs, end = bool(target.system.inputs), real.function_suffix
+    inputs, suffix = bool(target.system.inputs), real.function_suffix
     state = plain.usual("q", "qd", *plain.state[2:], "u", "p")
     J = c.filled(plain.real, "J")
     rates = c.static(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
@@ -30,7 +32,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
     accelerate = plain.acceleration.function.call
     projection = plain.projection_along
-    moved = _moved(plain) if projection else None
+    projected = _moved(plain) if projection else None
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
@@ -43,11 +45,11 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             feedback=feedback,
             eliminate=m is first_implicit,
             projection=projection if m is methods[0] else None,
-            moved=moved,
+            moved=projected,
             projection_call=projection.function.call(q="r", qd="v") if projection else "",
-            move=moved.call(X="ends", t="t + h") if moved else "",
+            move=projected.call(X="ends", t="t + h") if projected else "",
             near=target.literal(near(target)),
-            apart=target.literal(APART),
+            apart=target.literal(ZERO_SQUARE),
             function=plain.public.derivative(m.name),
             implicit=m.implicit,
             stages=m.stages,
@@ -56,19 +58,24 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             start=accelerate(qdd="a"),
             stage=accelerate(qdd="f" if m.implicit else "a + NQ*i", q="r", qd="v", t="t + c[i]*h"),
             rates_call=rates.call(q="r", qd="v", t="t + c[i]*h"),
-            fabs=f"fabs{end}",
-            fmax=f"fmax{end}",
+            fabs=f"fabs{suffix}",
+            fmax=f"fmax{suffix}",
             tiny=target.literal(1e-30),
             settled=target.literal(16 * real.epsilon),
             loose=target.literal(real.epsilon**0.5),
             other=target.literal(real.epsilon**0.25),
-            most=TURNS,
+            most=MAX_NEWTON_ITERATIONS,
         )
 
 
 def _moved(plain: Functions) -> CFunction:
-    """A step's end and its derivatives, moved onto the constraints."""
+    """Return the static function that projects a step's end and its derivatives onto the
+    constraints.
+    """
     state = (c.filled(plain.real, "X"), *(c.filled(plain.real, n) for n in "rv"))
-    read = plain.read(plain.target.program["projection_along"])
-    more = (plain.argument("q"), *plain.usual(*(n for n in ("t", "p") if n in read)))
-    return c.static(f"{plain.prefix}_derivative_projected", plain.status, *state, *more)
+    arguments_read = plain.read(plain.target.program["projection_along"])
+    other_arguments = (
+        plain.argument("q"),
+        *plain.usual(*(n for n in ("t", "p") if n in arguments_read)),
+    )
+    return c.static(f"{plain.prefix}_derivative_projected", plain.status, *state, *other_arguments)

@@ -1,4 +1,4 @@
-"""What lies beside the C for those who embed it: CMake and pkg-config files, a table of costs."""
+"""Files for embedding the C code: CMake and pkg-config files, and a table of costs."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from eomc.integrators.tableaux import METHODS
 
 
 def cmake(target: Target) -> CMake:
-    """The view of CMakeLists.txt."""
+    """Return the view of CMakeLists.txt."""
     return CMake(tuple(stamp(target)), target.prefix, target.PREFIX, __version__)
 
 
 def pkg_config(target: Target) -> PkgConfig:
-    """The view of NAME.pc.in."""
+    """Return the view of NAME.pc.in."""
     return PkgConfig(tuple(stamp(target)), target.prefix, __version__)
 
 
 def costs(target: Target) -> Costs:
-    """The view of costs.txt: the functions of the header in its order, then the methods' steps."""
+    """Return the view of costs.txt: functions in the order of the header, then steps of the
+    methods.
+    """
     names = (*KINDS, "acceleration", "linearization")
     functions = tuple(Counted(f.name, f.cost) for name in names if (f := source(target, name)))
     steps = tuple(Stepped(f"{name}_step", _step(name)) for name in target.system.run.methods)
@@ -30,7 +32,7 @@ def costs(target: Target) -> Costs:
 
 
 def _step(name: str) -> str:
-    """What one step calls."""
+    """Return a description of the calls of one step."""
     m = METHODS[name]
     if m.implicit:
         return f"{m.stages} accelerations an iteration, until the stages settle"

@@ -1,4 +1,6 @@
-"""The evaluation functions that a program may have: D, C, g, bias, tau, energies, signals."""
+"""The evaluation functions that a program may have: D, C, g, bias, tau, energies, inputs and
+more.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,24 @@ from eomc.program.program import TIME
 
 @dataclass(frozen=True)
 class Kind:
-    """What is known of a function before it is looked at: results, arguments, meaning.
+    """Properties of an evaluation function that do not depend on the scene.
 
-    out: "" where it returns a number. shape: one that `extent` knows. takes: besides q and what it
-    reads of t: qd, u, qdd, wrenches, lambda; "qdd?" where it depends on the scene. refuses: whether
-    it returns a status in every scene, also of what is not finite.
+    Attributes
+    ----------
+    out
+        Name of the output array; "" for functions that return a number.
+    shape
+        Shape of the output, a key of `c_array_size`.
+    takes
+        Arguments besides q, t and p: qd, u, qdd, wrenches, lambda. "qdd?" where it depends on the
+        scene.
+    doc
+        The comment in the header.
+    symmetric
+        Whether the matrix is symmetric.
+    refuses
+        Whether the function returns a status in every scene, which also reports results that are
+        not finite.
     """
 
     out: str
@@ -28,12 +43,12 @@ class Kind:
 
     @property
     def takes_u(self) -> bool:
-        """Whether it may read inputs."""
+        """Whether the function may read inputs."""
         return "u" in self.takes.split()
 
     @property
     def given(self) -> str:
-        """What else it is given in any scene: qdd, wrenches or lambda."""
+        """The additional argument that the function has in every scene: qdd, wrenches or lambda."""
         return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
 
 
@@ -111,15 +126,15 @@ _SPACE = {
 
 
 def doc(target: Target, name: str) -> str:
-    """What a function gives, in the words of the plane or of space."""
-    found = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
+    """Return the comment of a function for a planar or a spatial system."""
+    text = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
     if name == "inverse_dynamics" and target.system.constraints:
-        found = found.replace("tau =", "tau + A^T lambda =")
-    return found
+        text = text.replace("tau =", "tau + A^T lambda =")
+    return text
 
 
-def extent(target: Target, shape: str) -> str:
-    """How many numbers that is, in C."""
+def c_array_size(target: Target, shape: str) -> str:
+    """Return the number of elements of a shape, as C text."""
     s, NQ, NU = target.system, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
     NY, NF, NE, NC = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE", "NC"))
     pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
@@ -145,26 +160,30 @@ def extent(target: Target, shape: str) -> str:
 
 
 def source(target: Target, name: str) -> Function | None:
-    """The function that `name` is computed by: its own, or one that gives a column at a time."""
-    of = target.program.functions
-    return of.get(name) or of.get(f"{name}_column")
+    """Return the function that computes `name`: the function itself, or one that gives one
+    column.
+    """
+    functions = target.program.functions
+    return functions.get(name) or functions.get(f"{name}_column")
 
 
 def refuses(target: Target, name: str) -> bool:
-    """Whether a function returns a status: it finds multipliers, which not every state has."""
+    """Return True if a function returns a status, since it factors a matrix that may be
+    singular.
+    """
     function = source(target, name)
     return KINDS[name].refuses or bool(function and function.checks)
 
 
 def takes_qdd(target: Target, name: str) -> bool:
-    """Whether a function reads accelerations."""
+    """Return True if a function reads accelerations."""
     function = source(target, name)
-    may = "qdd?" in KINDS[name].takes
-    return bool(may and function and function.uses & target.groups()["qdd"])
+    optional = "qdd?" in KINDS[name].takes
+    return bool(optional and function and function.uses & target.groups()["qdd"])
 
 
 def takes_t(target: Target, name: str) -> bool:
-    """Whether a function's result depends on time, by itself or by the signals."""
+    """Return True if a function depends on time, directly or through signals."""
     function = source(target, name)
     assert function is not None
     takes_u = KINDS[name].takes_u and target.system.inputs

@@ -1,4 +1,4 @@
-"""Events in adaptive steps, in both forms of C: what crosses zero, where, and what it does."""
+"""Event detection in adaptive steps, in both forms of C: event functions, roots and state jumps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from math import cos, pi, prod
 from typing import Any
 
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import BUSY, LATELY, METHOD, Form, Stepping, busy, fixed, run, steps
+from eomc.emit.adaptive import (
+    EVENTS_PER_STEP,
+    METHOD,
+    RECENT_STEPS,
+    Stepping,
+    SweepInterface,
+    busy,
+    fixed,
+    run,
+    steps,
+)
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
@@ -17,22 +27,24 @@ from eomc.integrators.tableaux import Row
 from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
 
-SAMPLES = 9  # values in a step
-TOLD = 0.02  # of the largest value: what the last coefficients of an event in a step may be
-HALVINGS = 10  # of steps in which they are more, beside one in LATELY
-APART = 1e-6  # parts of a step between values that make a slope
+SAMPLES = 9  # values of an event function in a step
+MAX_TAIL = 0.02  # last Chebyshev coefficients of a resolved event function, over its largest value
+MAX_EVENT_HALVINGS = 10  # of steps with unresolved events, besides one in RECENT_STEPS
+DIFFERENCE_STEP = 1e-6  # of finite differences, as a fraction of the step
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
 
 def nodes() -> Row:
-    """Where the extrema of Chebyshev's polynomial are over a step, 0 and 1 among them."""
+    """Return the extrema of Chebyshev's polynomial on [0, 1], with both ends."""
     last = SAMPLES - 1
     return tuple(Fraction((1 - cos(pi * j / last)) / 2).limit_denominator(10**12)
                  for j in range(SAMPLES))  # fmt: skip
 
 
 def slopes(x: Row) -> Sequence[Row]:
-    """From values at the nodes x to the slopes there of the polynomial through them."""
+    """Return the matrix from values at the nodes x to derivatives of the interpolating polynomial
+    there.
+    """
     weights = [1 / prod((a - b for b in x if b != a), start=Fraction(1)) for a in x]
     rows = [
         [w / v / (a - b) if a != b else Fraction(0) for b, w in zip(x, weights, strict=True)]
@@ -44,7 +56,7 @@ def slopes(x: Row) -> Sequence[Row]:
 
 
 def last(count: int) -> Sequence[Row]:
-    """From values at the nodes to the last two coefficients by Chebyshev's polynomials."""
+    """Return weights for the last two Chebyshev coefficients from values at the nodes."""
     top = count - 1
     ends = [Fraction(1, 2) if j in (0, top) else Fraction(1) for j in range(count)]
     return tuple(
@@ -58,7 +70,7 @@ def last(count: int) -> Sequence[Row]:
 
 
 def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
-    """Of (2 c - 1)^n, n below `count`, from 0 to each of x, once or twice."""
+    """Return integrals of (2 c - 1)^n, n < count, from 0 to each of x, taken once or twice."""
     signs = [Fraction((-1) ** n) for n in range(count + 3)]
 
     def once(n: int, at: Fraction) -> Fraction:
@@ -75,84 +87,96 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
 
 
 def views(
-    functions: Functions, form: Form
+    functions: Functions, form: SweepInterface
 ) -> Iterator[Adaptive | FixedSteps | Events | Begun | AdaptiveRun]:
-    """Adaptive steps, fixed ones and the events in them, and the loop over all."""
-    made = Stepping(functions, form)
-    yield steps(made)
+    """Yield the views of adaptive steps, fixed steps, events and the loop over them."""
+    stepping = Stepping(functions, form)
+    yield steps(stepping)
     if not functions.target.system.events:
-        yield run(made)
+        yield run(stepping)
         return
-    yield fixed(made)
-    found = _events(made)
-    yield found
-    here = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
-    again = here | {"reached": "reached"}
-    begun = _begun(made, found.restart) if "begins" in functions.target.program else None
-    if begun:
-        yield begun
-    begins = begun.function.call(x="&x") if begun else ""
-    ended = {"events": "x.seen", "t": "x.t", "q": "x.q", "qd": "x.qd"}
-    values = functions.public.evaluation("events").call(**ended)
-    changed = found.changed.call(x="&x")
+    yield fixed(stepping)
+    event_view = _events(stepping)
+    yield event_view
+    arguments = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
+    again = arguments | {"reached": "reached"}
+    start_view = (
+        _begun(stepping, event_view.restart) if "begins" in functions.target.program else None
+    )
+    if start_view:
+        yield start_view
+    start_call = start_view.function.call(x="&x") if start_view else ""
+    end_state = {"events": "x.seen", "t": "x.t", "q": "x.q", "qd": "x.qd"}
+    values = functions.public.evaluation("events").call(**end_state)
+    changed = event_view.changed.call(x="&x")
     yield run(
-        made, found.happened.call(**here), found.restart.call(**again), begins, changed, values
+        stepping,
+        event_view.happened.call(**arguments),
+        event_view.restart.call(**again),
+        start_call,
+        changed,
+        values,
     )
 
 
-def _begun(made: Stepping, restart: CFunction) -> Begun:
-    functions, x = made.functions, made.state.name
-    values, record = functions.public.evaluation("begins"), functions.public.adaptive_events
-    taken = {a.name for f in (values, restart) for a in f.arguments}
-    own = [a for a in functions.usual("u", "p") if a.name in taken]
-    arguments = (made.state, *own, *record, made.held)
+def _begun(stepping: Stepping, restart: CFunction) -> Begun:
+    """Return the view of events at the start of a motion."""
+    functions, x = stepping.functions, stepping.state.name
+    values, record = (
+        functions.public.evaluation("begins"),
+        functions.public.adaptive_events,
+    )
+    arguments_taken = {a.name for f in (values, restart) for a in f.arguments}
+    extra = [a for a in functions.usual("u", "p") if a.name in arguments_taken]
+    arguments = (stepping.state, *extra, *record, stepping.held)
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
     return Begun(
         **functions.names,
-        function=c.static(f"{made.method}_begun", functions.status, *arguments),
+        function=c.static(f"{stepping.method}_begun", functions.status, *arguments),
         values=values.call(begins="value", **state),
-        method=made.method,
+        method=stepping.method,
         restart=restart.call(reached=state["t"]),
     )  # fmt: skip
 
 
-def _events(made: Stepping) -> Events:
-    functions, method = made.functions, made.method
+def _events(stepping: Stepping) -> Events:
+    """Return the view of event detection."""
+    functions, method = stepping.functions, stepping.method
     target, real, public = functions.target, functions.real, functions.public
     end, system = target.real.function_suffix, target.system
     jumps = "jumps" in target.program
-    asked = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
-    needed = {a.name for f in asked for a in f.arguments}
-    values, number, k = asked[0], made.number, CArgument("int", "k")
+    evaluated = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
+    argument_names = {a.name for f in evaluated for a in f.arguments}
+    values, number, k = evaluated[0], stepping.number, CArgument("int", "k")
     read = c.given(f"{method}_adaptive_state", "x")
-    # what the formulas take besides the state
-    own = [a for a in functions.usual("u", "p") if a.name in needed]
+    # arguments of the formulas besides the state
+    extra = [a for a in functions.usual("u", "p") if a.name in argument_names]
 
-    looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *own)
+    looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *extra)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
-    bracketed = c.static(f"{method}_bracketed", real, read, k, *ends, *own)
+    bracketed = c.static(f"{method}_bracketed", real, read, k, *ends, *extra)
     above = tuple(int(e.above) for e in system.events if "begins" in target.program)
     crossing = c.static(
-        f"{method}_crossing", real, made.state, k, number("from"), c.given(real, "g"),
-        *([number("noise")] if above else []), *own,
+        f"{method}_crossing", real, stepping.state, k, number("from"), c.given(real, "g"),
+        *([number("noise")] if above else []), *extra,
     )  # fmt: skip
-    there = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
+    outputs = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
-    arguments = (made.state, *there, number("tol"), *made.taken, *record, made.held)
+    arguments = (stepping.state, *outputs, number("tol"), *stepping.taken, *record, stepping.held)
     happened = c.static(f"{method}_happened", "int", *arguments)
-    changed = c.static(f"{method}_changed", "int", made.state, *own)
-    calls = [*asked, *([public.project] if made.form.project else ())]
-    taken = {a.name for f in calls for a in f.arguments}
-    behind = [a for a in functions.usual("u", "p") if a.name in taken]
+    changed = c.static(f"{method}_changed", "int", stepping.state, *extra)
+    calls = [*evaluated, *([public.project] if stepping.form.project else ())]
+    taken_by_calls = {a.name for f in calls for a in f.arguments}
+    after_event = [a for a in functions.usual("u", "p") if a.name in taken_by_calls]
     restart = c.static(
-        f"{method}_restarted", functions.status, made.state, number("reached"), *there[1:],
-        *(behind if jumps else ()), *([made.held] if jumps else []),
+        f"{method}_restarted", functions.status, stepping.state, number("reached"), *outputs[1:],
+        *(after_event if jumps else ()), *([stepping.held] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}
     within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
     reached = {"t": "reached", **at}
     now = {name: c.member("x", name) for name in ("t", "q", "qd")}
-    apart = APART if target.real.epsilon < 1e-10 else 1e-3
+    difference = DIFFERENCE_STEP if target.real.epsilon < 1e-10 else 1e-3
     return Events(
         method=method,
         fabs=f"fabs{end}",
@@ -163,12 +187,12 @@ def _events(made: Stepping) -> Events:
         above=above,
         jumps=jumps,
         busy=busy(system),
-        together=BUSY + 4 * (busy(system) - BUSY),
-        apart=target.literal(apart),
+        together=EVENTS_PER_STEP + 4 * (busy(system) - EVENTS_PER_STEP),
+        apart=target.literal(difference),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
-        **_rounding(made, own),
+        **_rounding(stepping, extra),
         looked=looked,
         values=values.call(events="g", **within),
         bracketed=bracketed,
@@ -178,43 +202,43 @@ def _events(made: Stepping) -> Events:
         bracket_dip=bracketed.call(high="z", at_high="value[k]"),
         happened=happened,
         cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
-        look_before=looked.call(g="value", z=f"z - {target.literal(apart / 2)}"),
-        look_behind=looked.call(g="value", z=f"z + {target.literal(apart / 2)}"),
-        inside=made.at.call(),
+        look_before=looked.call(g="value", z=f"z - {target.literal(difference / 2)}"),
+        look_behind=looked.call(g="value", z=f"z + {target.literal(difference / 2)}"),
+        inside=stepping.at.call(),
         values_there=values.call(events="value", **within),
         values_end=values.call(events="value", t=now["t"]),
         changed=changed,
         values_now=values.call(events="value", **now),
         restart=restart,
         values_before=values.call(events="before", **reached),
-        jump=asked[-1].call(**reached) if jumps else "",
-        project=public.project.call(held="set[k]", **reached) if made.form.project else "",
-        project_all=public.project.call(held="0", **reached) if made.form.project else "",
-        set=_set(system) if made.form.project and jumps else (),
+        jump=evaluated[-1].call(**reached) if jumps else "",
+        project=public.project.call(held="set[k]", **reached) if stepping.form.project else "",
+        project_all=public.project.call(held="0", **reached) if stepping.form.project else "",
+        set=_set(system) if stepping.form.project and jumps else (),
         modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
         own=len(system.own_events),
         values_after=values.call(events="value", **reached),
     )
 
 
-def _rounding(made: Stepping, own: Sequence[CArgument]) -> dict[str, Any]:
-    """What rounding makes of an event: its function, its call and the call in it."""
-    read, k = c.given(f"{made.method}_adaptive_state", "x"), CArgument("int", "k")
-    function = c.static(f"{made.method}_rounding", made.functions.real, read, k, *own)
+def _rounding(stepping: Stepping, extra: Sequence[CArgument]) -> dict[str, Any]:
+    """Return the function for rounding errors of an event function, its call and the call in it."""
+    read, k = c.given(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
+    function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
     state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
-    values = made.functions.public.evaluation("events").call(events="value", **state)
+    values = stepping.functions.public.evaluation("events").call(events="value", **state)
     return {"rounding": function, "rounded": function.call(), "values_near": values}
 
 
 def _set(system: System) -> tuple[str, ...]:
-    """Of each event of the scene which of q and qd its jump sets."""
+    """Return, for each event of the scene, flags for the entries of q and qd that its jump sets."""
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
     rows = ({name for name, _ in e.jump} for e in system.own_events)
     return c.in_braces([str(int(name in names)) for name in states] for names in rows)
 
 
 def _tables(functions: Functions) -> dict[str, Any]:
-    """The numbers of the nodes at which events are looked at, by the names of their view."""
+    """Return the numbers of the nodes at which event functions are evaluated, by view field."""
     target = functions.target
     x, real = nodes(), target.real
     return {
@@ -225,9 +249,9 @@ def _tables(functions: Functions) -> dict[str, Any]:
         "nodes": numbers(x, real),
         "slopes": matrix(slopes(x), real),
         "huge": target.literal(1e30),
-        "halvings": HALVINGS,
-        "lately": LATELY,
-        "told": target.literal(TOLD),
+        "halvings": MAX_EVENT_HALVINGS,
+        "lately": RECENT_STEPS,
+        "told": target.literal(MAX_TAIL),
         "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
         "stages": METHOD.stages,
         "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),

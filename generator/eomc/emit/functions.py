@@ -1,6 +1,6 @@
-"""The functions of mechanics in C, for both forms: matrices, energies, forces, accelerations.
+"""C functions of mechanics for both forms: matrices, energies, forces, accelerations.
 
-State in arrays, parameters in a struct. Each is straight-line code, in pieces where it is long.
+State in arrays, parameters in a struct. Each is straight-line code, outlined where it is long.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from eomc.emit import c_function as c
 from eomc.emit import heading
 from eomc.emit.c_expression import REALS, Block, Body, Real, several
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.c_names import Target, sentence, unclashed
-from eomc.emit.evaluations import KINDS, doc, extent, refuses, source
+from eomc.emit.c_names import Target, rename_reserved, sentence
+from eomc.emit.evaluations import KINDS, c_array_size, doc, refuses, source
 from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
     Indexed,
@@ -31,61 +31,61 @@ from eomc.program.program import Program
 STATE = ("q", "qd")
 READ = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
 RATE_TERMS = "Rates of rows that may be left out, then the sums of their terms' sizes."
-FEW = 16  # statements that are read at a glance, without comments between them
+MAX_UNCOMMENTED_LINES = 16  # statements without comments between stages
 
 
 @dataclass(frozen=True)
 class Functions:
-    """A program on its way to C: the arguments that its functions have, and their bodies."""
+    """The C functions of a program: arguments and bodies."""
 
     target: Target
 
     @property
     def prefix(self) -> str:
-        """What every C name begins with."""
+        """The prefix of all C names."""
         return self.target.prefix
 
     @property
     def PREFIX(self) -> str:
-        """What every macro and enumerator begins with."""
+        """The prefix of all macros and enumerators."""
         return self.target.PREFIX
 
     @property
     def real(self) -> str:
-        """The name of the element type."""
+        """The C type of numbers."""
         return self.target.real.name
 
     @property
     def names(self) -> dict[str, str]:
-        """What nearly every view begins with."""
+        """Fields that most views have."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
     def together(self, function: Function) -> bool:
-        """Whether sines of several angles are computed side by side.
+        """Return True if sines of several angles are computed in vector registers.
 
-        Not those of D, by which selftest.c judges the sines that steps take.
+        Not in D, with which selftest.c verifies the sines that steps use.
         """
         return self.target.real.reach > 0 and function.name not in ("D", "D_column")
 
     @property
     def several(self) -> bool:
-        """Whether a function has several angles of which that holds."""
+        """Whether some function computes sines of several angles in vector registers."""
         functions = self.target.program.functions.values()
         return any(self.together(f) and several(f) for f in functions)
 
     @property
     def NQ(self) -> str:
-        """The number of coordinates, in C."""
+        """The number of coordinates, as C text."""
         return f"{self.PREFIX}_NQ"
 
     @property
     def NU(self) -> str:
-        """The number of inputs, in C."""
+        """The number of inputs, as C text."""
         return f"{self.PREFIX}_NU"
 
     @property
     def status(self) -> str:
-        """The type of what functions that can fail return."""
+        """The return type of functions that can fail."""
         return f"{self.prefix}_status"
 
     @property
@@ -100,16 +100,16 @@ class Functions:
 
     @cached_property
     def public(self) -> Public:
-        """The prototypes of what the header declares."""
+        """The prototypes of the functions in the header."""
         return Public(self.target)
 
     @cached_property
-    def brought(self) -> Mapping[str, frozenset[str]]:
-        """The names of the program that each argument brings."""
+    def supplied_names(self) -> Mapping[str, frozenset[str]]:
+        """The names of the program that each argument supplies."""
         return self.target.groups()
 
     def argument(self, name: str) -> CArgument:
-        """One of the usual arguments: q, qd, t, h, u, p."""
+        """Return one of the usual arguments: q, qd, qdd, t, h, u, p."""
         if name in (*STATE, "qdd"):
             return c.given(self.real, name, self.NQ)
         if name == "u":
@@ -119,19 +119,21 @@ class Functions:
         return CArgument(self.real, name)
 
     def usual(self, *names: str) -> tuple[CArgument, ...]:
-        """Those of the usual arguments that this scene has: u where it has inputs, p likewise."""
+        """Return those of the usual arguments that this scene has: u with inputs, p with
+        parameters.
+        """
         there = {"u": bool(self.target.system.inputs), "p": self.target.needs_p}
         return tuple(self.argument(n) for n in names if there.get(n, True))
 
     @property
     def swept(self) -> bool:
-        """Whether stages are found by sweeps."""
+        """Whether some method iterates its stages."""
         run = self.target.system.run
         return run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
 
     @property
     def moves_stages(self) -> tuple[CArgument, ...]:
-        """Of sweeps: whether stages are moved onto the constraints, where there are."""
+        """For iterated stages of systems with constraints, the flag for projecting them."""
         return (CArgument("int", "onto"),) if self.projection else ()
 
     @property
@@ -141,7 +143,7 @@ class Functions:
 
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
         """The arguments that a static function needs, arrays as pointers."""
-        needed = [n for n in names if function.uses & self.brought[n]]
+        needed = [n for n in names if function.uses & self.supplied_names[n]]
         arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
         return tuple(c.given(self.real, n) if n in arrays else self.argument(n) for n in needed)
 
@@ -149,7 +151,7 @@ class Functions:
 
     @cached_property
     def signal(self) -> CFunction | None:
-        """The prototype of the signals, where there are inputs."""
+        """The prototype of the signals; None without inputs."""
         if "signal" not in self.target.program:
             return None
         state = STATE if self.target.signal_state else ()
@@ -159,19 +161,23 @@ class Functions:
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
     def signals(self, function: Function) -> tuple[Block, ...]:
-        """u set to the signals where it is NULL, in a function that reads inputs."""
+        """Return blocks that set u to the signals where it is NULL, for functions that read
+        inputs.
+        """
         if self.signal is None or not self.reads_u(function):
             return ()
         lines = c.otherwise_signal("now", self.signal.call(u="now"))
         return (Block("", (c.local(self.real, f"now[{self.NU}]"),)), Block("", lines))
 
     def reads_u(self, function: Function) -> bool:
-        """Whether a function reads inputs."""
-        return bool(self.brought["u"] and function.uses & self.brought["u"])
+        """Return True if a function reads inputs."""
+        return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
     def read(self, function: Function, follows: bool = True) -> frozenset[str]:
-        """The usual arguments that a function reads, if it `follows` the signals theirs too."""
-        names = {n for n, brings in self.brought.items() if function.uses & brings}
+        """Return the usual arguments that a function reads; with `follows`, also those of the
+        signals it reads.
+        """
+        names = {n for n, brings in self.supplied_names.items() if function.uses & brings}
         if follows and self.reads_u(function) and self.signal is not None:
             names |= {a.name for a in self.signal.arguments}
         return frozenset(names)
@@ -179,46 +185,49 @@ class Functions:
     # bodies
 
     def loads(self, function: Function) -> Block:
-        """Locals for the coordinates, velocities, inputs and directions that are read."""
+        """Return locals for the coordinates, velocities, inputs and directions that are read."""
         return Block(
             "", tuple(self.target.loads(function, self.target.element, self.target.element))
         )
 
     def straight(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
-        """The statements of a function, its results in `out`, or returned where that is empty."""
+        """Return the statements of a function, with results in `out`, or returned where `out` is
+        empty.
+        """
         body = self.target.body(function, together=self.together(function))
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
         last = Block("", ends if out else (c.result(body.results[0]),))
         return (*self.statements(function, body), last), body
 
     def statements(self, function: Function, body: Body) -> tuple[Block, ...]:
-        """Loads and statements, by stage with a comment where they are many."""
+        """Return loads and statements, by stage with comments where there are many."""
         blocks = (self.loads(function), *body.early, *body.blocks)
         lines = tuple(line for b in blocks for line in b.lines)
-        return blocks if len(lines) > FEW else (Block("", lines),)
+        return blocks if len(lines) > MAX_UNCOMMENTED_LINES else (Block("", lines),)
 
-    def cut(
-        self, function: Function, what: str, out: str, given: Sequence[str]
+    def outlined(
+        self, function: Function, name: str, out: str, given: Sequence[str]
     ) -> tuple[str, tuple[CFunction, ...], tuple[Block, ...]]:
-        """A long function in pieces: their struct, the pieces, and the statements that call them.
+        """Outline a long function. Returns the struct of values, the pieces, and the calling
+        blocks.
 
-        out: the array that results go to, of which a piece fills its places.
+        out: the array for the results, of which each piece writes some elements.
         """
-        function = unclashed(function)
+        function = rename_reserved(function)
         parts = outline.split(function, outline.PIECE)
-        handed = {n: c.member("s", n) for part in parts for n in part.keeps}
-        type = f"{self.prefix}_{what}_values"
-        made: list[CFunction] = []
+        shared = {n: c.member("s", n) for part in parts for n in part.keeps}
+        type = f"{self.prefix}_{name}_values"
+        pieces: list[CFunction] = []
         calls: list[str] = []
         for k, part in enumerate(parts, 1):
-            f, P = part.function, f"{self.prefix}_{what}_{k}"
+            f, P = part.function, f"{self.prefix}_{name}_{k}"
             body = self.target.body(
-                f, {n: handed[n] for n in part.reads}, stored={n: handed[n] for n in part.keeps},
+                f, {n: shared[n] for n in part.reads}, stored={n: shared[n] for n in part.keeps},
                 pivots=len(function.checks), together=self.together(function),
             )  # fmt: skip
             failures = c.unless(body.failures, self.singular)
-            found = zip(part.outputs, body.results, strict=True)
-            ends = (*(c.assign(f"{out}[{place}]", x) for place, x in found), *failures)
+            results = zip(part.outputs, body.results, strict=True)
+            ends = (*(c.assign(f"{out}[{place}]", x) for place, x in results), *failures)
             ends += (c.result(self.ok),) if failures else ()
             piece = CFunction(
                 P,
@@ -231,69 +240,75 @@ class Functions:
                 (self.loads(f), *body.early, *body.blocks, Block("", ends)),
                 self.read(f, follows=False) | {"s", out},
                 "static",
-                (f"{what}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
+                (f"{name}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
-            made.append(piece)
+            pieces.append(piece)
             call = piece.call(s="&s")
             calls += c.unless([call], self.singular) if failures else [c.do(call)]
-        values = c.struct(type, self.real, list(handed)) if handed else ""
-        locals_ = Block("", (c.local(type, "s"),) if handed else ())
-        return values, tuple(made), (locals_, Block("", tuple(calls)))
+        values = c.struct(type, self.real, list(shared)) if shared else ""
+        locals_ = Block("", (c.local(type, "s"),) if shared else ())
+        return values, tuple(pieces), (locals_, Block("", tuple(calls)))
 
     # functions
 
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
-        """Those that the program has, in their order."""
+        """The evaluation functions of the program, in their order."""
         return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
 
     def evaluation(self, name: str) -> Computed:
-        """One of D, C, g, bias, tau, the energies, the signals, the sensitivity."""
+        """Return the evaluation function `name`, such as D, bias, energy or signal."""
         kind, target = KINDS[name], self.target
         function = source(target, name)
         assert function is not None
-        told = sentence(function)
+        cost = sentence(function)
         by_columns = name not in target.program
-        said = [doc(target, name)]
+        paragraphs = [doc(target, name)]
         if kind.takes_u and target.system.inputs:
-            said.append("u: the inputs; NULL for the scene's signals.")
+            paragraphs.append("u: the inputs; NULL for the scene's signals.")
         if refuses(target, name):
-            said.append(f"Where the status is not OK, {kind.out} is untouched.")
+            paragraphs.append(f"Where the status is not OK, {kind.out} is untouched.")
         if by_columns:
-            told = f"By {len(target.names)} columns, each: {told[0].lower()}{told[1:]}"
+            cost = f"By {len(target.names)} columns, each: {cost[0].lower()}{cost[1:]}"
         reads = self.read(function) | {kind.out}
-        public = replace(self.public.evaluation(name), reads=reads, doc=(*said, told))
+        public = replace(self.public.evaluation(name), reads=reads, doc=(*paragraphs, cost))
         if by_columns:
             return self._by_columns(public, function, name)
-        if name == "energy" and (summed := self._summed(public)):
+        if name == "energy" and (summed := self._sum_of_energies(public)):
             return summed
         if outline.is_large(function):
             out = kind.out or ("power" if name == "power" else "energy")
             size, last = "1", Block("", (c.result(f"{out}[0]"),))
             if refuses(target, name):
-                out, size, last = "a", extent(target, kind.shape), self._told(name)
-            values, parts, calls = self.cut(function, name, out, READ)
+                out, size, last = "a", c_array_size(target, kind.shape), self._status_block(name)
+            values, parts, calls = self.outlined(function, name, out, READ)
             if out != kind.out:
-                one = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
-                calls = (one, calls[1], last)
+                declarations = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
+                calls = (declarations, calls[1], last)
             body = (*self.signals(function), *calls)
             return Computed(replace(public, body=body), parts, values)
-        (*blocks, last), found = self.straight(function, kind.out)
+        (*blocks, last), statements_ = self.straight(function, kind.out)
         if refuses(target, name):
-            array = c.listed(self.real, "a", extent(target, kind.shape), found.results)
-            blocks.append(Block("", (array, *c.unless(found.failures, self.singular))))
-            last = self._told(name)
+            array = c.listed(self.real, "a", c_array_size(target, kind.shape), statements_.results)
+            blocks.append(Block("", (array, *c.unless(statements_.failures, self.singular))))
+            last = self._status_block(name)
         return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
 
-    def _told(self, name: str) -> Block:
-        """The end of a function that refuses: results `a` where they go, and the status."""
-        size = extent(self.target, KINDS[name].shape)
+    def _status_block(self, name: str) -> Block:
+        """Return the end of a function with a status: copy results `a` to the output and return the
+        status.
+        """
+        size = c_array_size(self.target, KINDS[name].shape)
         unfinite = [f"!{self.prefix}_finite(a, {size})"] if KINDS[name].refuses else []
-        told = c.unless(unfinite, f"{self.PREFIX}_NOT_FINITE")
-        return Block("", (*told, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok)))
+        finite_check = c.unless(unfinite, f"{self.PREFIX}_NOT_FINITE")
+        return Block(
+            "", (*finite_check, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok))
+        )
 
-    def _summed(self, energy: CFunction) -> Computed | None:
-        """K + P by their own functions, whose arguments energy has."""
+    def _sum_of_energies(self, energy: CFunction) -> Computed | None:
+        """Return energy as the sum of kinetic and potential energy; None where their arguments
+        differ.
+        """
         parts = [self.evaluation(f"{what}_energy").function for what in ("kinetic", "potential")]
         read = frozenset(a.name for part in parts for a in part.arguments)
         if not read <= {a.name for a in energy.arguments}:
@@ -302,29 +317,33 @@ class Functions:
         return Computed(replace(energy, body=body, reads=read, doc=energy.doc[:1]))
 
     def _by_columns(self, public: CFunction, function: Function, name: str) -> Computed:
-        """A matrix as a loop over its columns, the matrix times each unit vector."""
+        """Return a matrix function as a loop over columns, which are the matrix times unit
+        vectors.
+        """
         kind = KINDS[name]
         doc = f"{kind.out} times along. {sentence(function)}"
-        made = self.static(function, f"{name}_column", "column", doc)
-        parts, call = (*made.parts, made.function), made.function.call()
-        return Computed(public, parts, made.values, call, kind.out, kind.symmetric)
+        column = self.static(function, f"{name}_column", "column", doc)
+        parts, call = (*column.parts, column.function), column.function.call()
+        return Computed(public, parts, column.values, call, kind.out, kind.symmetric)
 
     def static(
-        self, function: Function, what: str, out: str, doc: str, fails: bool = False
+        self, function: Function, name: str, out: str, doc: str, fails: bool = False
     ) -> Computed:
-        """A static function that fills `out`; one that `fails` has pivots, and returns a status."""
+        """Return a static function that writes `out`. With `fails`, it checks pivots and returns a
+        status.
+        """
         values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
         if outline.is_large(function):
-            values, parts, blocks = self.cut(function, what, out, ("along", *READ))
+            values, parts, blocks = self.outlined(function, name, out, ("along", *READ))
         else:
             blocks, body = self.straight(function, out)
             failures = c.unless(body.failures, self.singular)
         if fails:
             blocks += (Block("", (*failures, c.result(self.ok))),)
         along = (c.given(self.real, "along"),) if out == "column" else ()
-        made = CFunction(
-            f"{self.prefix}_{what}",
+        function_ = CFunction(
+            f"{self.prefix}_{name}",
             self.status if fails else "void",
             (c.filled(self.real, out), *along, *self.pointers(function, *READ)),
             blocks,
@@ -332,11 +351,13 @@ class Functions:
             "static",
             (doc,),
         )
-        return Computed(made, parts, values)
+        return Computed(function_, parts, values)
 
     @cached_property
     def projection(self) -> Computed | None:
-        """What q and qd lack for constraints to hold, where there are; static."""
+        """The static function for corrections of q and qd onto the constraints; None without
+        constraints.
+        """
         function = self.target.program.functions.get("projection")
         if function is None:
             return None
@@ -344,7 +365,9 @@ class Functions:
 
     @cached_property
     def rate_terms(self) -> Computed | None:
-        """Rates of rows that corrections may leave out, and sizes of their terms; static."""
+        """The static function for rates of constraints that corrections may drop, and sums of
+        |terms|.
+        """
         function = self.target.program.functions.get("rate_terms")
         if function is None:
             return None
@@ -352,7 +375,9 @@ class Functions:
 
     @cached_property
     def projection_along(self) -> Computed | None:
-        """The same, and its derivatives along a direction, where steps have them; static."""
+        """The static function for the corrections and their directional derivatives; None where not
+        used.
+        """
         function = self.target.program.functions.get("projection_along")
         if function is None:
             return None
@@ -361,27 +386,27 @@ class Functions:
 
     @cached_property
     def projected(self) -> CFunction:
-        """A state behind a step, moved onto the constraints; of the plain form."""
-        moved, more = self._moved
+        """The static function of portable C that projects the state after a step."""
+        moved, more = self._projection_arguments
         q, far = self.argument("q"), CArgument("int *", "singular")
         return c.static(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
 
     @cached_property
     def onto(self) -> CFunction:
-        """A stage moved onto them, to first order."""
-        moved, more = self._moved
+        """The static function that projects a stage onto the constraints to first order."""
+        moved, more = self._projection_arguments
         return c.static(f"{self.prefix}_onto", "int", *moved, *more)
 
     @property
-    def _moved(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
-        """The state that is moved onto constraints, and what else they are read from."""
-        read = self.read(self.target.program["projection"]) if self.projection else frozenset()
+    def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
+        """The arguments of a projection: the state to be changed, and the others."""
+        arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
         state = tuple(c.filled(self.real, n) for n in "rv")
-        return state, self.usual(*(n for n in ("t", "p") if n in read))
+        return state, self.usual(*(n for n in ("t", "p") if n in arguments))
 
     @cached_property
     def acceleration(self) -> Computed:
-        """qdd, with a status."""
+        """The function for qdd, which returns a status."""
         function = self.target.program["acceleration"]
         force = "tau + A^T lambda" if self.target.system.constraints else "tau"
         doc = [
@@ -392,44 +417,44 @@ class Functions:
         values, parts = "", tuple[CFunction, ...]()
         unfinite = c.unless([f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE")
         if outline.is_large(function):
-            values, parts, blocks = self.cut(function, "acceleration", "a", READ)
+            values, parts, blocks = self.outlined(function, "acceleration", "a", READ)
             first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
             body = self.target.body(function, together=self.together(function))
             array = c.listed(self.real, "a", self.NQ, body.results)
             failures = c.unless(body.failures, self.singular)
-            *most, last = self.statements(function, body)
+            *leading, last = self.statements(function, body)
             last = Block(last.comment, (*last.lines, array))
-            blocks = (*most, last, Block("", failures))
+            blocks = (*leading, last, Block("", failures))
         last = Block("", (*blocks[-1].lines, *unfinite))
         reads = self.read(function) | {"qdd"}
-        made = replace(
+        result = replace(
             self.public.acceleration,
             body=(*self.signals(function), *blocks[:-1], last),
             reads=reads,
             doc=(*doc, sentence(function)),
         )
-        return Computed(made, parts, values)
+        return Computed(result, parts, values)
 
 
 def of(program: Program, real: Real | None = None) -> Functions:
-    """A program as plain C: libm's sine and cosine, whatever the element type."""
+    """Return a program as portable C, with sine and cosine of libm for any element type."""
     return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
 
 
 def indexed(
     plain: Functions,
-    some: Sequence[Constraint | Coordinate | Event | Input | Output],
+    items: Sequence[Constraint | Coordinate | Event | Input | Output],
     prefix: str = "",
 ) -> tuple[Indexed, ...]:
-    """Coordinates, inputs, outputs, constraints or events with their enumerators."""
+    """Return coordinates, inputs, outputs, constraints or events with their enumerators."""
     enum = plain.target.enum
-    return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in some)
+    return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in items)
 
 
 def parameters(plain: Functions) -> tuple[Parameter, ...]:
-    """Names, values and comments."""
+    """Return names, values and comments of the parameters."""
     return tuple(
         Parameter(p.name, plain.target.literal(p.value), heading.words(p.unit, p.note))
         for p in plain.target.system.parameters
@@ -437,6 +462,8 @@ def parameters(plain: Functions) -> tuple[Parameter, ...]:
 
 
 def handshake(plain: Functions) -> str:
-    """What header and source must share: not those of the fast form, whose memory is another."""
+    """Return a number that header and source must share. It differs in optimised C, whose memory
+    differs.
+    """
     digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
     return f"0x{digest[:8]}u"

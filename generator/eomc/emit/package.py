@@ -1,4 +1,4 @@
-"""The views of what stands beside both forms of C: example, binding, Python package."""
+"""Views of the files besides both forms of C: example, binding and Python package."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from eomc.runtime.package import CONSTRAINED
 from eomc.scene.formulas import folded, parse
 
 _OF_STEPS = ("Phi", "Gamma")
-ROWS = 200  # of main.c, about
-LINE = 88  # of the columns' names there
+ROWS = 200  # approximate number of rows that main.c prints
+LINE = 88  # width of the column names there
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
     "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
@@ -44,14 +44,14 @@ ASKED = {  # functions by the option that brings them
 
 
 def main(target: Target) -> Main:
-    """The scene's own run, some two hundred rows of it."""
+    """Return the view of main.c: the scene's own run with about two hundred rows."""
     s, public = target.system, Public(target)
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
     names = [target.as_written(c.name) for c in s.coordinates]
-    method, asked = s.run.methods[0], [o.name for o in s.outputs]
-    columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *asked, "energy"))
-    outputs = public.evaluation("outputs").call(u="NULL") if asked else ""
-    solved = asked and takes_qdd(target, "outputs")
+    method, output_names = s.run.methods[0], [o.name for o in s.outputs]
+    columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *output_names, "energy"))
+    outputs = public.evaluation("outputs").call(u="NULL") if output_names else ""
+    solved = output_names and takes_qdd(target, "outputs")
     rows = {"q_rows": "NULL", "qd_rows": "NULL", "memory": "&memory", "status": "&status"}
     if s.run.tolerance is None:
         run = public.run(method).call(
@@ -84,38 +84,40 @@ def main(target: Target) -> Main:
         energy=public.evaluation("energy").call(),
         outputs=outputs,
         accelerations=public.acceleration.call(u="NULL") if solved else "",
-        refuses=bool(asked and refuses(target, "outputs")),
+        refuses=bool(output_names and refuses(target, "outputs")),
     )  # fmt: skip
 
 
 def _bound(target: Target) -> tuple[Bound, ...]:
-    """The evaluation functions."""
-    at, found = _rows(target), []
+    """Return the bindings of the evaluation functions."""
+    state_arguments, bindings = _rows(target), []
     for function in Public(target).evaluations():
         name = function.name.removeprefix(f"{target.prefix}_")
         kind = KINDS[name]
         extents = {a.name: a.extent for a in function.arguments}
         rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
-        if kind.given:  # in the place of inputs
+        if kind.given:  # passed in place of the inputs
             rows[kind.given] = f"u + {member('own', 'u')}*k"
-        call = function.call(**(at | rows))
-        solve = Public(target).acceleration.call(**at) if takes_qdd(target, name) else ""
-        # what SciPy calls takes doubles alone
-        alone = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
+        call = function.call(**(state_arguments | rows))
+        solve = (
+            Public(target).acceleration.call(**state_arguments) if takes_qdd(target, name) else ""
+        )
+        # functions for SciPy's LowLevelCallable take doubles only
+        state_only = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
         at_x = function.call(q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target))
         text = call if kind.out else f"out[k] = {call}"
         size = extents[kind.out] if refuses(target, name) else ""
-        found.append(Bound(name, text, solve, at_x if alone else "", size))
-    return tuple(found)
+        bindings.append(Bound(name, text, solve, at_x if state_only else "", size))
+    return tuple(bindings)
 
 
 def _parameters(target: Target, place: str = "p") -> str:
-    """The parameters, which come as plain numbers."""
+    """Return the parameters as C text: a cast of an array of numbers to the struct."""
     return cast(f"{target.prefix}_params", place) if target.needs_p else ""
 
 
 def _rows(target: Target) -> dict[str, str]:
-    """The arguments of state k: q, qd, and what `row_strides` say of t, u and p."""
+    """Return the arguments for state k: q, qd, and t, u, p with their strides."""
     NQ = f"{target.PREFIX}_NQ"
     return {
         "q": f"q + {NQ}*k",
@@ -127,7 +129,7 @@ def _rows(target: Target) -> dict[str, str]:
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
-    """The calls of step, run, batch and derivative."""
+    """Return the bindings of step, run, batch and derivative of each method."""
     public, p, NQ = Public(target), _parameters(target), f"{target.PREFIX}_NQ"
     memory = f"work ? &{member('work', 'memory')} : NULL"
     return tuple(
@@ -154,7 +156,7 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
 
 
 def _adaptive(target: Target) -> BoundAdaptive | None:
-    """The call of adaptive steps, where the scene asks for them."""
+    """Return the binding of adaptive steps; None where the scene has no tolerance."""
     if target.system.run.tolerance is None:
         return None
     run = Public(target).adaptive(adaptive.METHOD.name)
@@ -167,7 +169,7 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
 
 
 def _derivative(target: Target, method: str) -> tuple[str, str, str]:
-    """The calls for a step's derivatives: at state k; of a later step, behind one by `_step`."""
+    """Return the calls for the derivatives of a step: at state k, the step before, and after it."""
     function, rows = Public(target).derivative(method), _rows(target)
     out = {a.name: f"{a.name} + {a.extent}*k" for a in function.arguments if a.name in _OF_STEPS}
     later = rows | {"q": "at", "qd": "moving"}
@@ -183,7 +185,7 @@ def _derivative(target: Target, method: str) -> tuple[str, str, str]:
 
 
 def binding(target: Target) -> Binding:
-    """One signature for every function, rows of states at a time."""
+    """Return the view of the binding: the same signature for all functions, over rows of states."""
     public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
     linear = public.linearization
     matrices = {a.name: f"{a.name} + {a.extent}*k" for a in linear.arguments if a.name[0] in "AB"}
@@ -205,11 +207,12 @@ def binding(target: Target) -> Binding:
 
 
 def _linearized(target: Target) -> bool:
+    """Return True if the program has a linearization."""
     return bool({"linearization", "linearization_column"} & set(target.program.functions))
 
 
 def declarations(bound: Binding) -> Declarations:
-    """What cffi is told."""
+    """Return the view of the declarations for cffi."""
     return Declarations(
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
         bound.methods, bound.adaptive,
@@ -217,7 +220,7 @@ def declarations(bound: Binding) -> Declarations:
 
 
 def _functions(target: Target) -> tuple[str, ...]:
-    """The model's functions that are public in the package."""
+    """Return the public functions of the model in the package."""
     s, run = target.system, target.system.run
     functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
     functions += CONSTRAINED if s.constraints else ()
@@ -227,7 +230,7 @@ def _functions(target: Target) -> tuple[str, ...]:
 
 
 def stub(target: Target) -> Stub:
-    """The package's types."""
+    """Return the view of the type stubs."""
     return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
 
 
@@ -247,7 +250,7 @@ def start_formulas(target: Target) -> dict[str, str]:
 
 
 def face(target: Target, extension: str) -> Face:
-    """The Python package's __init__."""
+    """Return the view of the package's __init__.py."""
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}

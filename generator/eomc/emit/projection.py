@@ -1,4 +1,4 @@
-"""Steps that end on the constraints, for both forms of C."""
+"""Views of the projection onto the constraints, for both forms of C."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from eomc.emit.functions import Functions
 from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed
 
-# beside singular positions: squares of what corrections may change; how much more rounding is
+# Near singular configurations: square of the largest relative correction; factor on rounding errors
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
-# beside such positions, of a row's terms what its rate may be where the row is left out: some 3
-# times the root of the part of a pivot below which it is; and of the largest row's terms
+# Largest rate of a dropped constraint near singular configurations, relative to its own terms
+# (about 3 times the root of its pivot tolerance), and to the largest terms of all constraints
 LEFT_OUT = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
-CROSSED = 30  # roundings: what corrections of q and qd together leave of rates
-APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
+COUPLING_ROUNDINGS = 30  # error of the rates, in units of rounding, after correcting q and qd
+ZERO_SQUARE = 1e-12  # a coordinate counts as 0 if its square is below this part of the sum of all
 
 
 def near(target: Target) -> float:
-    """The square of the part of a coordinate beyond which a correction is large."""
+    """Return the square of the relative change of a coordinate above which a correction is
+    large.
+    """
     return 8 * target.real.epsilon
 
 
 def width(target: Target) -> int:
-    """Numbers of a correction: of q, of qd, of the rows' pivots."""
+    """Return the number of results of the projection: corrections of q and qd, inverse pivots."""
     return len(target.program["projection"].outputs)
 
 
@@ -35,10 +37,10 @@ def view(
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
     sines: str = "", sines_call: str = "", onto: CFunction | None = None,
 ) -> Projection:  # fmt: skip
-    """The view for one form and lane. state: where it is, for `rate_terms`."""
+    """Return the view for one form and one lane. state: the arguments of `rate_terms`."""
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
-    part, loose = LEFT_OUT[target.system.run.real]
+    row_fraction, largest_fraction = LEFT_OUT[target.system.run.real]
     large = near(target)
     return Projection(
         PREFIX=functions.PREFIX,
@@ -58,12 +60,12 @@ def view(
         rate_terms=rate_terms,
         rate_terms_call=rate_terms.function.call(**(state or {})) if rate_terms else "",
         rows=width(target) - 2 * len(target.names),
-        loose=target.literal(loose),
-        part=target.literal(part),
+        loose=target.literal(largest_fraction),
+        part=target.literal(row_fraction),
         fabs=f"fabs{target.real.function_suffix}",
         near=target.literal(large),
-        crossed=target.literal((CROSSED * target.real.epsilon) ** 2),
-        apart=target.literal(APART),
+        crossed=target.literal((COUPLING_ROUNDINGS * target.real.epsilon) ** 2),
+        apart=target.literal(ZERO_SQUARE),
         little=target.literal(little),
         slight=target.literal(1e4 * little),
         rounded=target.literal(large**2 * noise),
@@ -71,7 +73,7 @@ def view(
 
 
 def plain(functions: Functions) -> Projection | None:
-    """That of the plain form, where there are constraints."""
+    """Return the projection view of portable C; None without constraints."""
     projection = functions.projection
     if projection is None:
         return None
@@ -84,7 +86,7 @@ def plain(functions: Functions) -> Projection | None:
 
 
 def project(functions: Functions) -> Project:
-    """The view of `project`, for either form."""
+    """Return the view of the public function `project`."""
     target, public = functions.target, functions.public
     end, eps = target.real.function_suffix, target.real.epsilon
     D, A, phi, rates = (
@@ -95,7 +97,7 @@ def project(functions: Functions) -> Project:
     weights = closure.weights if closure else ()
     rows = target.system.constraints
     sums = closure.sums if closure else ()
-    mixed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
+    summed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
     return Project(
         **functions.names,
         fabs=f"fabs{end}",
@@ -114,9 +116,9 @@ def project(functions: Functions) -> Project:
         rounded=target.literal(4 * eps),
         weights="{ " + ", ".join(map(target.literal, weights)) + " }" if weights else "",
         sums=in_braces([*map(target.literal, row)] for row in sums),
-        sum_places=tuple(mixed[: len(sums)]),
+        sum_places=tuple(summed[: len(sums)]),
         redundant=tuple(
-            k for k, row in enumerate(rows) if row.redundant or k in mixed[len(sums) :]
+            k for k, row in enumerate(rows) if row.redundant or k in summed[len(sums) :]
         ),
         pinned=bool(weights) and not all(row.holonomic for row in rows),
         tiny=target.literal(1e-30),

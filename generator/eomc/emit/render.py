@@ -1,6 +1,7 @@
-"""A program as files: header, source, example, self-test and Python face, by Jinja templates.
+"""Rendering of a program to files by Jinja templates: header, source, example, self-test, Python
+package.
 
-The only file that knows Jinja for C. What each template is given is a view.
+This is the only module that uses Jinja for C. Each template gets one view.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from eomc.emit import embedding, package, selftest, views
 from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_function import narrowed
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import borne
+from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.fast import files as fast
 from eomc.emit.fast import views as fast_views
 from eomc.emit.fmu import files as fmu
@@ -32,15 +33,21 @@ from eomc.emit.plain import views as plain_views
 from eomc.program.outline import weight
 from eomc.program.program import Program
 
-FAST = "fast"  # the folder of the form of C that the Python module is compiled from
+FAST = "fast"  # the folder of optimised C, from which the Python module is compiled
 
 
 @dataclass(frozen=True)
 class Sources:
-    """The text of the generated files by name, and what the extension is made of besides.
+    """The generated files by name, and the sources of the Python extension.
 
-    binding: C between the scene's functions and Python, with its cdef. stub: the package's types.
-    operations: how many all functions have together, which tells how long a compiler takes.
+    Attributes
+    ----------
+    binding, cdef
+        C code between the scene's functions and Python, and its declarations for cffi.
+    stub
+        Type stubs of the package.
+    operations
+        Total operations of all functions, a measure of compile time.
     """
 
     name: str
@@ -52,18 +59,18 @@ class Sources:
 
     @property
     def embeddable(self) -> dict[str, str]:
-        """The files that a C program may need, without those of the Python package."""
+        """The files for use from C, without the Python package."""
         return {file: text for file, text in self.files.items() if not file.endswith(".py")}
 
 
 @cache
 def environment() -> jinja2.Environment:
-    """Jinja as it is used here: a missing variable stops the build, free text as it stands too.
+    """Return the Jinja environment. Missing variables are errors, and text is inserted unchanged.
 
-    Pages are escaped by themselves; a Python face escapes its docstring as a whole.
+    HTML pages are escaped. The Python package escapes its docstring.
     """
     loader = jinja2.FunctionLoader(lambda name: resources.text("templates", name))
-    made = jinja2.Environment(
+    result = jinja2.Environment(
         loader=loader,
         bytecode_cache=_bytecode(),
         undefined=jinja2.StrictUndefined,
@@ -72,15 +79,15 @@ def environment() -> jinja2.Environment:
         keep_trailing_newline=True,
         autoescape=lambda name: (name or "").endswith(".html.jinja"),
     )
-    made.filters["docstring"] = docstring
-    made.filters["block"] = indent
-    return made
+    result.filters["docstring"] = docstring
+    result.filters["block"] = indent
+    return result
 
 
 def _bytecode() -> jinja2.BytecodeCache | None:
-    """Templates compiled to Python, kept where this module's own bytecode is, if it may be.
+    """Return a cache for compiled templates next to this module's bytecode, if it is writable.
 
-    Compiling them takes a fifth of a second, a third of what a small scene takes to be derived.
+    Compiling the templates takes 0.2 s, a third of the derivation of a small scene.
     """
     folder = Path(cache_from_source(__file__)).parent
     if sys.dont_write_bytecode or not os.access(folder, os.W_OK):
@@ -89,35 +96,35 @@ def _bytecode() -> jinja2.BytecodeCache | None:
 
 
 def show(view: views.View | plain_views.View | fast_views.View | fmu_views.View) -> str:
-    """A view by its template."""
-    given = {field.name: getattr(view, field.name) for field in fields(view)}
-    return environment().get_template(view.TEMPLATE + ".jinja").render(given)
+    """Render a view by its template."""
+    context = {field.name: getattr(view, field.name) for field in fields(view)}
+    return environment().get_template(view.TEMPLATE + ".jinja").render(context)
 
 
 def _plain_names(program: Program) -> None:
-    """Raise ValueError where a name could not stand in code."""
+    """Raise ValueError where a name cannot stand in code."""
     s = program.system
-    for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
-        plain(given.name)
+    for item in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
+        plain(item.name)
 
 
 def render(program: Program, extension: str) -> Sources:
-    """The generated files of a program, its Python face importing `extension`.
+    """Return the generated files of a program, whose Python package imports `extension`.
 
-    Same program, same text.
+    The same program gives the same text.
     """
     _plain_names(program)
-    program, written = borne(program)
+    program, written = rename_for_c(program)
     run = program.system.run
     target = Target(program, REALS[run.real], written)
     binding = package.binding(target)
     name = program.system.name
-    made = fast.steppers(target)
+    methods = fast.steppers(target)
     return Sources(
         name=name,
         files={
-            **steppers.files(program, show, rooms=fast.rooms(made)),
-            **{f"{FAST}/{file}": text for file, text in fast.files(made, show).items()},
+            **steppers.files(program, show, rooms=fast.rooms(methods)),
+            **{f"{FAST}/{file}": text for file, text in fast.files(methods, show).items()},
             "main.c": narrowed(show(package.main(target))),
             "selftest.c": narrowed(show(selftest.view(target))),
             "CMakeLists.txt": show(embedding.cmake(target)),
@@ -134,6 +141,6 @@ def render(program: Program, extension: str) -> Sources:
 
 
 def unit(program: Program, version: int) -> fmu.Unit:
-    """The unit of FMI 2 or 3 of a program."""
+    """Return the functional mock-up unit of a program, in FMI version 2 or 3."""
     _plain_names(program)
     return fmu.unit(program, version, show, show)

@@ -1,12 +1,13 @@
-"""Runge-Kutta methods: coefficients as fractions, exact or to 40 digits, and what is known of each.
+"""Runge-Kutta methods: coefficients as fractions, exact or to 40 digits, and their properties.
 
-For q'' = a(q, qd, t) a stage needs accelerations only: with A c = the rows' sums,
+For q'' = a(q, qd, t), with A c equal to the row sums, only accelerations are needed:
 
     Q_i = q + c_i h qd + h^2 sum_k (A A)_ik a_k        r = q  + h qd + h^2 sum_k (b A)_k a_k
     V_i = qd + h sum_k A_ik a_k                        v = qd + h sum_k b_k a_k
 
-(Hairer, Norsett & Wanner, *Solving Ordinary Differential Equations I*, sec. II.14). Where A A and
-b A are put by others, it is a method of Nystrom: Euler's and Verlet's are written so.
+(Hairer, Norsett & Wanner, *Solving Ordinary Differential Equations I*, sec. II.14). With other
+matrices in place of A A and b A it is a Nystrom method; the methods of Euler and Verlet are written
+in this form.
 """
 
 from __future__ import annotations
@@ -24,11 +25,23 @@ Row = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class Method:
-    """A method of fixed step: `a` (below the diagonal if explicit), the weights `b`, their nodes c.
+    """A Runge-Kutta or Nystrom method with fixed steps.
 
-    limits: the largest h omega of an undamped and h lambda of a decaying motion. notes: what else
-    to say of it. nodes, end: c and b A, where they are not those of `a`. sweeps: after how many the
-    stages of an implicit method count as found, where these are few and fixed; 0 elsewhere.
+    Attributes
+    ----------
+    name, title, order, source
+        Identifier, description, order of convergence and reference.
+    limits
+        Largest h omega of an undamped oscillation, and h lambda of a decaying motion.
+    a, b
+        Matrix A (only below the diagonal for explicit methods) and weights.
+    notes
+        Further properties, as lines of a comment.
+    nodes, end
+        Nodes c and b A, where they do not follow from A.
+    sweeps
+        Fixed number of iterations for the stages of an implicit method; 0 where Newton's method is
+        used.
     """
 
     name: str
@@ -45,7 +58,7 @@ class Method:
 
     @property
     def stages(self) -> int:
-        """Accelerations a step."""
+        """Number of accelerations per step."""
         return len(self.b)
 
     @cached_property
@@ -55,44 +68,54 @@ class Method:
 
     @property
     def newton(self) -> bool:
-        """Whether the stages are found with derivatives, however stiff the motion is."""
+        """Whether the stages are solved for by Newton's method, which is stable for stiff
+        motions.
+        """
         return self.implicit and not self.sweeps
 
     @cached_property
     def c(self) -> Row:
-        """The nodes, sum_k a_ik."""
+        """The nodes, c_i = sum_k a_ik."""
         return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
     @cached_property
     def a_squared(self) -> tuple[Row, ...]:
-        """A A: what accelerations add to the positions of the stages, over h^2."""
+        """A A: the effect of accelerations on the positions of the stages, over h^2."""
         return tuple(_times(row, self.a) for row in self.a)
 
     @cached_property
     def b_a(self) -> Row:
-        """b A: what they add to the position at the end, over h^2."""
+        """b A: the effect of accelerations on the position at the end, over h^2."""
         return self.end or _times(self.b, self.a)
 
     @cached_property
     def ahead(self) -> tuple[Row, ...]:
-        """E: accelerations at the next step's nodes, E a, by the polynomial through this step's."""
+        """E: extrapolates accelerations to the next step's nodes by the polynomial through this
+        step's.
+        """
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
     @cached_property
     def powers(self) -> tuple[Row, ...]:
-        """Accelerations at the nodes to those of their polynomial's powers of 2 c - 1."""
+        """Matrix from accelerations at the nodes to coefficients of their polynomial in powers of 2
+        c - 1.
+        """
         return tuple(zip(*_lagrange(tuple(2 * x - 1 for x in self.c)), strict=True))
 
     def legendre(self, n: int) -> Row:
-        """To its part in Legendre's polynomial P_n(2 c - 1), n below the stages, at Gauss nodes."""
+        """Return weights that give the coefficient of P_n(2 c - 1) from values at Gauss nodes, n <
+        stages.
+        """
         p = _legendre(n)
         return tuple((2 * n + 1) * b * _value(p, x) for b, x in zip(self.b, self.c, strict=True))
 
     @cached_property
     def eigen(self) -> tuple[tuple[Row, ...], tuple[Row, ...], tuple[Row, ...]]:
-        """Of A, of an even number of stages and without real eigenvalues: those of each pair whose
-        imaginary part is positive, (real, imaginary); the rows to their parts, of each the real
-        and the imaginary one; and those from there, as many.
+        """Eigendecomposition of A, for an even number of stages without real eigenvalues.
+
+        Returns the eigenvalues with positive imaginary part as (real, imaginary), the rows that
+        transform values to eigenvector coordinates (real and imaginary part for each), and the rows
+        that transform back.
         """
         from mpmath import matrix, mp, mpf
 
@@ -118,32 +141,34 @@ class Method:
 
     @cached_property
     def a_ahead(self) -> tuple[Row, ...]:
-        """A E: `a` for the accelerations of the step before."""
+        """A E: A applied to accelerations that are extrapolated from the previous step."""
         return tuple(_times(row, self.ahead) for row in self.a)
 
     @cached_property
     def a_squared_ahead(self) -> tuple[Row, ...]:
-        """A A E."""
+        """A A E: A A applied to accelerations that are extrapolated from the previous step."""
         return tuple(_times(row, self.ahead) for row in self.a_squared)
 
 
 def _times(row: Row, a: tuple[Row, ...]) -> Row:
-    """The product of a row and the matrix `a`."""
+    """Return the product of a row and the matrix `a`."""
     n = len(a)
     padded = [[*r, *([Fraction(0)] * (n - len(r)))] for r in a]
     return tuple(sum((x * padded[j][k] for j, x in enumerate(row)), Fraction(0)) for k in range(n))
 
 
 def _sparse(text: str) -> tuple[Row, ...]:
-    """Rows of a triangle from lines `i k value k value ...`; what is not given is zero."""
+    """Return a triangular matrix from lines `row column value column value ...`; other entries are
+    zero.
+    """
     lines = [line.split() for line in text.strip().splitlines()]
-    given = {
+    entries = {
         (int(i), int(k)): Fraction(x)
         for i, *row in lines
         for k, x in zip(row[::2], row[1::2], strict=True)
     }
-    last = max(i for i, _ in given)
-    return tuple(tuple(given.get((i, k), Fraction(0)) for k in range(i)) for i in range(last + 1))
+    last = max(i for i, _ in entries)
+    return tuple(tuple(entries.get((i, k), Fraction(0)) for k in range(i)) for i in range(last + 1))
 
 
 RK4 = Method(
@@ -156,7 +181,7 @@ RK4 = Method(
     b=(Fraction(1, 6), Fraction(1, 3), Fraction(1, 3), Fraction(1, 6)),
 )
 
-# row 12 holds the weights
+# row 12 contains the weights
 _DP8 = _sparse(
     """
      1  0 5.26001519587677318785587544488e-2
@@ -205,51 +230,51 @@ DP8 = Method(
 
 # --- Gauss and Legendre ---------------------------------------------------------------------------
 
-_DIGITS = 45  # that the nodes are computed to, of which the last few may be off
+_DIGITS = 45  # decimals of the nodes; the last few may be wrong
 _NONE = Decimal(0)
 
 
 def _value(polynomial: Row, x: Fraction) -> Fraction:
-    """A polynomial, lowest power first; one fraction is cancelled in the end, not one a step."""
-    whole = lcm(*(c.denominator for c in polynomial))
+    """Evaluate a polynomial, lowest power first. Fractions are reduced only once, at the end."""
+    denominator = lcm(*(c.denominator for c in polynomial))
     value, power = 0, 1  # over whole and powers of x's denominator
     for c in reversed(polynomial):
-        value = value * x.numerator + c.numerator * (whole // c.denominator) * power
+        value = value * x.numerator + c.numerator * (denominator // c.denominator) * power
         power *= x.denominator
-    return Fraction(value * x.denominator, whole * power)
+    return Fraction(value * x.denominator, denominator * power)
 
 
 def _integral(polynomial: Row) -> Row:
-    """From 0."""
+    """Return the integral of a polynomial from 0."""
     return (Fraction(0), *(c / (k + 1) for k, c in enumerate(polynomial)))
 
 
 def _lagrange(nodes: Row) -> tuple[Row, ...]:
-    """The polynomials that are 1 at one of the nodes and 0 at the others."""
-    whole, out = lcm(*(x.denominator for x in nodes)), []
-    places = [x.numerator * (whole // x.denominator) for x in nodes]
-    for i, at in enumerate(places):
+    """Return the Lagrange polynomials of the nodes, which are 1 at one node and 0 at the others."""
+    denominator, polynomials = lcm(*(x.denominator for x in nodes)), []
+    numerators = [x.numerator * (denominator // x.denominator) for x in nodes]
+    for i, numerator in enumerate(numerators):
         basis, size = [1], 1  # in whole x
-        for other in (x for k, x in enumerate(places) if k != i):
-            basis = [a - other * b for a, b in zip([0, *basis], [*basis, 0], strict=True)]
-            size *= at - other
-        out.append(tuple(Fraction(c * whole**k, size) for k, c in enumerate(basis)))
-    return tuple(out)
+        for node in (x for k, x in enumerate(numerators) if k != i):
+            basis = [a - node * b for a, b in zip([0, *basis], [*basis, 0], strict=True)]
+            size *= numerator - node
+        polynomials.append(tuple(Fraction(c * denominator**k, size) for k, c in enumerate(basis)))
+    return tuple(polynomials)
 
 
 def _legendre(s: int) -> Row:
-    """P_s(2 x - 1)."""
+    """Return the coefficients of Legendre's polynomial P_s(2 x - 1)."""
     return tuple(Fraction((-1) ** (s + k) * comb(s, k) * comb(s + k, k)) for k in range(s + 1))
 
 
 def _legendre_roots(s: int) -> Row:
-    """The s zeros of Legendre's polynomial P_s(2 x - 1), by Newton's iteration in decimals."""
+    """Return the zeros of Legendre's polynomial P_s(2 x - 1), by Newton's method in decimals."""
     p = [Decimal(x.numerator) for x in _legendre(s)]
     roots: list[Decimal] = []
     with localcontext() as context:
         context.prec = _DIGITS + 10
         for _ in range(s):
-            x = Decimal("-0.01")  # left of all: Newton goes to the first that is not yet there
+            x = Decimal("-0.01")  # from the left, Newton's method converges to the next root
             for _ in range(100):
                 value = sum((c * x**k for k, c in enumerate(p)), _NONE)
                 slope = sum((k * c * x ** (k - 1) for k, c in enumerate(p) if k), _NONE)
@@ -262,9 +287,11 @@ def _legendre_roots(s: int) -> Row:
 
 
 def _gauss(s: int, name: str) -> Method:
-    """a_ij = the integral of the j-th Lagrange polynomial over the zeros c from 0 to c_i."""
+    """Return the Gauss method: a_ij is the integral of the j-th Lagrange polynomial from 0 to
+    c_i.
+    """
     c = _legendre_roots(s)
-    areas = [_integral(basis) for basis in _lagrange(c)]
+    integrals_ = [_integral(basis) for basis in _lagrange(c)]
     return Method(
         name=name,
         title=f"the implicit method of Gauss and Legendre with {s} stages",
@@ -272,8 +299,8 @@ def _gauss(s: int, name: str) -> Method:
         source="Hairer & Wanner, Solving ODEs II, sec. IV.5; zeros of Legendre's polynomial "
         f"to {_DIGITS} digits",
         limits=(inf, inf),
-        a=tuple(tuple(_value(area, x) for area in areas) for x in c),
-        b=tuple(_value(area, Fraction(1)) for area in areas),
+        a=tuple(tuple(_value(area, x) for area in integrals_) for x in c),
+        b=tuple(_value(area, Fraction(1)) for area in integrals_),
         notes=(
             "A-stable: no step is too long for a motion that decays. Symmetric, and symplectic in",
             "(q, p) where D is constant; where D depends on q, in (q, qd) nearly so.",
@@ -284,13 +311,14 @@ def _gauss(s: int, name: str) -> Method:
 GAUSS4, GAUSS6, GAUSS8 = (_gauss(s, f"gauss{2 * s}") for s in (2, 3, 4))
 
 
-def _swept(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Method:
-    """The same with stages from the step before, continued as a polynomial, and a few sweeps.
+def _gauss_with_iteration(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Method:
+    """Return a Gauss method whose stages are extrapolated from the last step and iterated a few
+    times.
 
-    P. J. van der Houwen & B. P. Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, who iterate
-    for the sake of stages side by side. What is continued errs by h^s, and each sweep takes a
-    factor of h from that, or h^2 where velocities have no part in accelerations. sweeps: odd, since
-    two sets of accelerations take turns.
+    P. J. van der Houwen & B. P. Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, iterate in
+    this way to compute the stages in parallel. The extrapolation has an error of order h^s, and
+    each iteration gains a factor of h, or h^2 where accelerations do not depend on velocities.
+    sweeps: odd, since two sets of accelerations alternate.
     """
     order = min(2 * s, s + sweeps)
     return replace(
@@ -309,8 +337,8 @@ def _swept(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Metho
     )
 
 
-# the limits are those up to which sweeps, as many as it takes, find the stages: a test has them
-GAUSS16 = _swept(8, 5, "gauss16", (9.0, 7.2))
+# The limits are those for which the iteration of the stages converges; a test computes them.
+GAUSS16 = _gauss_with_iteration(8, 5, "gauss16", (9.0, 7.2))
 
 # --- Euler and Verlet -----------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ from eomc.base.errors import EomcError, FolderError
 from eomc.derive import lagrange
 from eomc.emit.c_expression import QUAD
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import borne
+from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
 from eomc.emit.render import show
@@ -163,7 +163,7 @@ def _computed(system: System, span: float, rows: int) -> Reference:
 def _compiled(system: System, folder: Path) -> Path:
     """The program in __float128 with its integrator, as an executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
-    made = borne(program.build(lagrange.derive(system)))[0]
+    made = rename_for_c(program.build(lagrange.derive(system)))[0]
     shown = plain.files(made, show, QUAD)
     functions = Functions(Target(made, QUAD))
     call = functions.acceleration.function.call(

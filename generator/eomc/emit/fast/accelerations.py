@@ -7,7 +7,7 @@ from functools import cached_property
 
 from sympy import S
 
-from eomc.emit.c_expression import DOUBLE, SEVERAL
+from eomc.emit.c_expression import DOUBLE, MIN_SIMD_ANGLES
 from eomc.emit.c_names import Target
 from eomc.program import outline, trig, two_point
 from eomc.program.ir import Function, Operand, rename
@@ -110,7 +110,7 @@ class Accelerations:
     def across(self) -> bool:
         """Whether one trajectory takes the sines of four angles at a time."""
         constrained = bool(self.target.system.constraints)
-        return self.parts is not None or (constrained and len(self.angles) >= SEVERAL)
+        return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
 
     @property
     def long(self) -> bool:

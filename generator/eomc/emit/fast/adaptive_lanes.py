@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from eomc.emit import adaptive
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import METHOD, Form, Stepping
+from eomc.emit.adaptive import METHOD, Stepping, SweepInterface
 from eomc.emit.fast import runs, views
 from eomc.emit.fast.lanes import INLINE, NOINLINE
 from eomc.emit.fast.steppers import Steppers
 from eomc.scene.schema import LOOSEST
 
 
-def view(made: Steppers, form: Form) -> views.AdaptiveLanes:
+def view(made: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
     """The view of their text."""
     one, wide, s, m = made.one, made.wide, made.accelerations, METHOD
     stepping, computed = Stepping(made.functions, form), runs.constants_call(made)
@@ -20,7 +20,7 @@ def view(made: Steppers, form: Form) -> views.AdaptiveLanes:
         **adaptive.tableau(stepping),
         inline=wide.qualifiers[INLINE],
         noinline=wide.qualifiers[NOINLINE],
-        roughest=s.target.literal(adaptive.ROUGHEST),
+        roughest=s.target.literal(adaptive.REJECT_AFTER_TWO),
         loosest=s.target.literal(LOOSEST),
         tightest=s.target.literal(adaptive.tightest(s.target.real)),
         inputs=bool(s.target.system.inputs),

@@ -43,7 +43,7 @@ def steppers(target: Target) -> Steppers:
 def rooms(made: Steppers) -> list[int]:
     """The numbers that each method's memory keeps, and behind that of adaptive steps."""
     system = made.one.target.system
-    room = adaptive.kept(system, made.one.width)
+    room = adaptive.workspace_size(system, made.one.width)
     return [*(runs.kept(made, m) for m in made.methods), room]
 
 
@@ -282,11 +282,11 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
     yield from map(show, derivatives(made.functions))
 
 
-def _adaptive(made: Steppers) -> adaptive.Form:
+def _adaptive(made: Steppers) -> adaptive.SweepInterface:
     """The sweeps of adaptive steps, stages in a lane each."""
     one, m = made.one, adaptive.METHOD
     sweep = made.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
-    return adaptive.Form(
+    return adaptive.SweepInterface(
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),
         f"{one.target.PREFIX}_LANES",

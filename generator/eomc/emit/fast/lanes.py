@@ -16,7 +16,7 @@ from sympy import Expr, S
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import FOUR, Block, Body, Printer, Real
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.c_names import Target, sentence, unclashed
+from eomc.emit.c_names import Target, rename_reserved, sentence
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.plain.parts import Computed
 from eomc.program import outline
@@ -215,7 +215,7 @@ class Lane:
         takes: the usual arguments, if not all that there are. constants: how those are read, where
         the function has its own.
         """
-        function = unclashed(function)
+        function = rename_reserved(function)
         there = self.there if takes is None else takes
         brought = self.brought | ({"c": frozenset(constants)} if constants is not None else {})
         given = [(self.argument(n), brought[n]) for n in there]

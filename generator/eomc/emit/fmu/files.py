@@ -10,7 +10,7 @@ from eomc.base import resources
 from eomc.emit import c_function
 from eomc.emit.c_expression import REALS
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import borne
+from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.fmu import description, scene
 from eomc.emit.fmu.views import BuildDescription, View
 from eomc.emit.plain import steppers
@@ -47,7 +47,7 @@ def unit(
 
     Same program, same text.
     """
-    safe, written = borne(program)
+    safe, written = rename_for_c(program)
     target = Target(safe, REALS[safe.system.run.real], written)
     name = target.prefix
     sources = (f"{name}.c", f"fmi/fmi{version}.c")

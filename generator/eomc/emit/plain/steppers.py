@@ -118,7 +118,7 @@ def header(
         ),
         adaptive=AdaptiveDeclared(
             adaptive.TITLE, adaptive.memory(plain),
-            rooms[-1] or adaptive.kept(s, len(s.coordinates)),
+            rooms[-1] or adaptive.workspace_size(s, len(s.coordinates)),
             plain.public.adaptive(adaptive.METHOD.name),
             plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.together(target),
@@ -345,7 +345,7 @@ def _adaptive(plain: Functions) -> list[View]:
     )
     end = f"{c.member('x', 't')} + h"
     ended = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
-    form = adaptive.Form(
+    form = adaptive.SweepInterface(
         around, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
         project=ended if plain.projection else "", whole=True,
     )  # fmt: skip
