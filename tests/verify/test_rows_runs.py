@@ -17,6 +17,7 @@ from stand_in import StandIn
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import symbolic
+from eomc.verify.angles import largest_angle
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_runs import TURNS, Runs
 from eomc.verify.sampling import State
@@ -80,6 +81,46 @@ def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
     for off, holds in ((1e-8, True), (1e-3, False)):  # digits of 2.5e7 are of 4e-9
         q = np.array([0.3, 0.1]) + turns * np.array([3, 1]) + [off, 0]
         assert runs.holds(State(q, np.zeros(2))) == holds
+
+
+PHASE = """eomc = 1
+name = "phase"
+[coordinates]
+x = {}
+[definitions]
+late = "t*RATE"
+z = "cos(ANGLE)"
+[energy]
+kinetic = "x_dot**2*(2 + z)"
+[forces]
+x = "z"
+"""
+
+
+def phase(angle: str, rate: str = "1") -> Any:
+    """A scene with a cosine of that angle."""
+    return from_scene(parse(PHASE.replace("ANGLE", angle).replace("RATE", rate), "phase.toml"))
+
+
+@pytest.mark.parametrize("angle", ["late", "late**2", "late**3/12", "late**5", "exp(late/10)"])
+def test_angles_are_compared_as_far_as_doubles_hold_them(
+    monkeypatch: pytest.MonkeyPatch, angle: str
+) -> None:
+    """A time that is off by its last digit is none of the module's faults; by 1e-9 it is one."""
+    monkeypatch.setattr(Runs, "far_steps", lambda *_: 0.0)  # which are the C's own
+    for rate, fails in (("(1 + 2**-52)", False), ("(1 + 1e-9)", True)):
+        module: Any = StandIn(symbolic.derive(phase(angle, rate)))
+        module._model = None
+        system = phase(angle)
+        runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+        assert (runs.far() > runs.limit) == fails
+
+
+def test_the_largest_angle_is_that_of_all_formulas() -> None:
+    at = State(np.array([2.0]), np.array([0.5]), 3.0)
+    assert largest_angle(phase("late**3"))(at) == 27
+    assert largest_angle(phase("late*x - 7*x_dot*sin(100*late)"))(at) == pytest.approx(300)
+    assert largest_angle(phase("dot(late)*1e9"))(at) == 0  # a rate is no part of it
 
 
 THROWN = """eomc = 1

@@ -19,6 +19,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System, t
 from eomc.verify import derivatives
+from eomc.verify.angles import largest_angle
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
@@ -42,6 +43,7 @@ SINES = 20.0  # units; their last terms make hundreds
 FEW, FEWER = 6, 3  # long steps, or steps with a row of u each; where the reference takes long
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
+FARTHEST_ANGLE = 2.0**26  # radians: beyond it roundings of an angle hide all else
 FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
 # parts of h, of runs that differ by rounding alone; the second where the first are too long
 FINE = ((1024, 8192), (8192, 65536))
@@ -236,15 +238,22 @@ class Runs:
     def far(self) -> float:
         """Values, accelerations and steps at angles and times that sines are too small for.
 
-        An angle is as exact as its last digit, so that a unit is that of the angle.
+        An angle is as exact as its last digit, so that a unit is that of the angle. Times are
+        earlier where formulas contain larger angles, such as t**3; states where angles are still
+        larger than the numbers that a double counts are left out.
         """
-        errors = []
+        errors, angle = [], largest_angle(self.check.system)
         for e in self.check.few(2):
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
             held = bool(self.check.system.constraints)  # which do not hold at another time
             t = LATE if _reads_time(self.check.system) and not held else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
+            while t > 1 and angle(at) > FARTHEST_ANGLE:
+                t /= 2
+                at = replace(at, t=s.t + t)
+            if angle(at) > 2 / EPS:
+                continue
             if held and not self.holds(at):
                 continue
             with np.errstate(all="ignore"):
@@ -254,7 +263,7 @@ class Runs:
             # springs that are wound up by so many turns have no motion to compare, and what they
             # accelerate is as exact as the sums of angles in D, not in what it is without them
             wound = 10 * np.max(e.size["acceleration"]) < np.max(np.abs(far.value["acceleration"]))
-            wide = max(TURNS, t)
+            wide = max(TURNS, t, angle(at))
             for name in FAR:
                 near = far if wound and name == "acceleration" else e
                 size = wide * near.size[name] + far.size[name]
