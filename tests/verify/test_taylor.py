@@ -117,7 +117,7 @@ def test_all_parts_of_a_general_kinetic_energy() -> None:
     point = symbol("point")
     kinetic = (1 + dot(t**3 + k)) * v**2 / 2 + x**2 * t * w * y + x**3 * v * y + w**2 * (2 + x**2)
     system = System.make(
-        "general", [x, y], kinetic + (dot(point) + u * w) ** 2 + x**3 * sin(t) * y, k * x**2 * t,
+        "general", [x, y], kinetic + (dot(point) + k * w) ** 2 + x**3 * sin(t) * y, k * x**2 * t,
         parameters={k: 3}, definitions={point: (x + y**2) * cos(t * x)},
         dissipation=sympy.sqrt(1 + v**2) * y, forces={x: u * x}, inputs={u: 5 * t + v},
     )  # fmt: skip
@@ -338,7 +338,8 @@ def test_a_wrong_sign_in_a_function_is_seen(
 def test_what_has_no_rate_is_refused() -> None:
     a, u = symbol("a"), symbol("u")
     for inside, words in ((x * v, "velocities"), (u * x, "inputs"), (dot(sin(t)), "a dot")):
-        made = System.make("odd", [x], v**2, dot(a) * x, definitions={a: inside}, inputs=[u])
+        made = System.make("odd", [x], v**2, 0, definitions={a: inside}, inputs=[u])
+        made = replace(made, potential=dot(a) * x)
         with pytest.raises(EomcError, match=f"hangs on {words}"):
             Jets(made)
 
