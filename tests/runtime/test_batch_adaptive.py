@@ -250,3 +250,50 @@ def test_rows_that_may_be_times_or_instances_are_asked_about(orbits: ModuleType)
         assert len(orbits.simulate_batch(u=u[None], **how)) == 1
         assert len(orbits.simulate_batch(u=u[:, None], **how)) == 4
         assert len(orbits.simulate_batch(*starts(4), u=u, **how)) == 4
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_limit_of_evaluations_ends_an_instance_alone(orbits: ModuleType, threads: int) -> None:
+    """The second falls towards the centre, 30 times as long in steps as the others."""
+    q0, qd0 = starts(9)
+    q0[1], qd0[1] = [1.0, 0.0], [0.0, 1e-3]
+    how = {"tol": 1e-9, "times": np.linspace(0, 20, 9)}
+    free = orbits.simulate_batch(q0, qd0, **how)
+    limit = int(np.delete(free.evaluations, 1).max()) + 1
+    assert free.evaluations[1] > 2 * limit
+    with pytest.warns(RuntimeWarning, match=r"1 too long; .*instance 1,.*max_evaluations="):
+        runs = orbits.simulate_batch(q0, qd0, **how, max_evaluations=limit, threads=threads)
+    others = np.arange(9) != 1
+    assert runs.status[1] == "too long" and set(runs.status[others].tolist()) == {"ok"}
+    assert np.array_equal(runs.q[others], free.q[others])
+    assert limit <= runs.evaluations[1] < limit + 1000
+    rows = int(np.sum(runs.t <= runs.reached[1]))
+    assert 0 < rows < 9 and np.isnan(runs.q[1, rows:]).all()
+    assert np.array_equal(runs.q[1, :rows], free.q[1, :rows])
+    with pytest.warns(RuntimeWarning, match="too long"):
+        alone = orbits.simulate_batch(q0[1:2], qd0[1:2], **how, max_evaluations=limit)
+    assert alone.reached[0] == runs.reached[1] and alone.evaluations[0] == runs.evaluations[1]
+    before, behind = 0.9 * runs.reached[1], 1.1 * runs.reached[1]
+    assert np.array_equal(runs([before])[0][1], free([before])[0][1])
+    assert np.isnan(runs([behind])[0][1]).all() and np.isfinite(runs([behind])[0][others]).all()
+    again = pickle.loads(pickle.dumps(runs))
+    assert again.status[1] == "too long" and np.isnan(again([behind])[0][1]).all()
+
+
+def test_a_limit_of_evaluations_ends_instances_with_events(modules: Modules) -> None:
+    """These go one after the other in C, by the steps of a single run."""
+    balls = modules.unoptimised(BALL.replace("bouncing", "limited_balls"))
+    how = {"tol": 1e-9, "duration": 3.0, "params": {"e": [0.5, 0.9]}}
+    free = balls.simulate_batch(**how)
+    limit = int(free.evaluations.min()) + 1
+    assert free.evaluations.max() > limit + 100
+    with pytest.warns(RuntimeWarning, match="1 too long"):
+        runs = balls.simulate_batch(**how, max_evaluations=limit)
+    k = int(np.argmax(free.evaluations))
+    assert runs.status[k] == "too long" and runs.status[1 - k] == free.status[1 - k]
+    assert runs.reached[k] < free.reached[k]
+    with pytest.raises(ValueError, match=r"^max_evaluations: belongs to adaptive steps"):
+        balls.simulate_batch(h=0.01, max_evaluations=5)
+    for bad in (0, -1, 2.5, "many"):
+        with pytest.raises(ValueError, match=r"^max_evaluations: "):
+            balls.simulate_batch(tol=1e-9, max_evaluations=bad)

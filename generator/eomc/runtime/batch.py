@@ -50,7 +50,8 @@ class BatchModel(Instances):
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None, tol: float | None = None,
         times: ArrayLike | None = None, h_most: float | None = None, stiff: bool = False,
-        events: Mapping[str, Any] | None = None, **unknown: Never,
+        max_evaluations: int | None = None, events: Mapping[str, Any] | None = None,
+        **unknown: Never,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances; see `simulate` for what is not here.
 
@@ -63,7 +64,8 @@ class BatchModel(Instances):
         start can't be assembled, has its own status and leaves the others alone. Ctrl-C raises
         Interrupted with the run so far. tol: by steps that fit a tolerance, each instance its own.
         times: (n,), the rows, within duration; without them those of adaptive steps are start
-        and end. events: as in `simulate`.
+        and end. max_evaluations: the number of accelerations after which an instance of adaptive
+        steps begins no further step; its status is "too long" then. events: as in `simulate`.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate_batch, dict(locals()))
@@ -72,9 +74,11 @@ class BatchModel(Instances):
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
-                stiff, control_period, (h, steps, method, every, None),
+                stiff, control_period, (h, steps, method, every, None), max_evaluations,
             )  # fmt: skip
             return self._told(fitted, whole)
+        if max_evaluations is not None:
+            raise ValueError("max_evaluations: belongs to adaptive steps: give tol=, and no h=")
         if self.events and not self._passes_over:
             seen, whole = batch_adaptive.stepped(
                 self, q0, qd0, h, duration, steps, every, params, u, threads, method, t0, progress,

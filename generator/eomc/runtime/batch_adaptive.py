@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times
 from .adaptive_memory import room_for
-from .arguments import Array, Start, as_number, as_step_size, check_time, cut_table
+from .arguments import Array, Start, as_count, as_number, as_step_size, check_time, cut_table
 from .batch_instances import Instances
 from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
@@ -28,13 +28,15 @@ from .stepped import as_hold, as_rows
 
 _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
+MOST_EVALUATIONS = 2**31 - 1  # of an instance, that every machine's C counts
+_BETWEEN = 8 * 64  # evaluations for a state between two steps: stages times sweeps, at most
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = (
     "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
-    "_stiff", "_period", "_by",
+    "_stiff", "_period", "_by", "_max_evaluations",
 )  # fmt: skip
 _HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
-_ENDS = np.array([*STATUS, "interrupted", FULL])
+_ENDS = np.array([*STATUS, FULL])
 
 
 @dataclass(eq=False, repr=False)
@@ -43,7 +45,8 @@ class AdaptiveBatchRun(BatchRun):
 
     Rows are at the same times for all. evaluations, rejected, stiff_steps: of each instance,
     (batch,). reached: the time to which each
-    has come, (batch,), s; rows behind it are nan, as where an event stops an instance. events: by
+    has come, (batch,), s; rows behind it are nan, as where an event stops an instance, or where it
+    is "too long": where it took max_evaluations. events: by
     name where and when each happened, t, q, qd, instance, of all instances one after the other.
     Everything else as in a BatchRun.
     """
@@ -59,6 +62,7 @@ class AdaptiveBatchRun(BatchRun):
     _stiff: bool = field(kw_only=True)
     _period: float = field(default=0.0, kw_only=True)  # over which a row of _u is held, if any is
     _by: str = field(default="", kw_only=True)  # the method of fixed steps
+    _max_evaluations: int = field(default=0, kw_only=True)  # 0: no limit
     _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
@@ -95,9 +99,18 @@ class AdaptiveBatchRun(BatchRun):
             (held, self._period), p, self._stiff, self._by,
         )  # fmt: skip
         work.leave(stuck(self))
+        if self._max_evaluations:  # what states between steps take is besides
+            each = _BETWEEN + 2 * model.nq + 1
+            work.limit(self._max_evaluations + each * (len(times) + len(self.t)))
         if len(times) and not work.run(None, None):
             raise KeyboardInterrupt
+        work.rows[:, self._late(times)] = np.nan
         return work.rows
+
+    def _late(self, times: Array) -> Array:
+        """Which of these times are behind the end of those that took too long, (batch, n)."""
+        ended = np.where(self._codes == STATUS.index("too long"), self.reached, np.inf)
+        return np.asarray(times > ended[:, None])
 
     @property
     def stopped(self) -> Array:
@@ -161,9 +174,13 @@ def simulate(
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
     h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
+    max_evaluations: int | None,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
+    limit = 0
+    if max_evaluations is not None:
+        limit = min(as_count(max_evaluations, "max_evaluations", 1), MOST_EVALUATIONS)
     t0 = as_number(t0, "t0")
     length = duration
     if times is None:
@@ -178,7 +195,21 @@ def simulate(
     if period and length is not None:
         u = cut_table(u, model.nu, periods_in(length, period), periods_in(span, period), 1)
     return _run(
-        model, q0, qd0, params, u, threads, t0, progress, tol, rows, most, stiff, period, span
+        model,
+        q0,
+        qd0,
+        params,
+        u,
+        threads,
+        t0,
+        progress,
+        tol,
+        rows,
+        most,
+        stiff,
+        period,
+        span,
+        limit=limit,
     )
 
 
@@ -205,11 +236,11 @@ def _run(
     model: Instances, q0: Start, qd0: Start, params: Any,
     u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
-    stiff: bool, period: float, span: float, method: str = "",
+    stiff: bool, period: float, span: float, method: str = "", limit: int = 0,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """From checked arguments. period: over which rows of u are held; 0: none is given. span: s.
 
-    method: of fixed steps of the size `most`.
+    method: of fixed steps of the size `most`. limit: of the evaluations of an instance; 0: none.
     """
     no_signals(model, u, period or None)
     count = periods_in(span, period) if period else None
@@ -221,10 +252,11 @@ def _run(
         first = None if held is None else held[0, 0]
         model._look(q[0], qd[0], most, t0, first, table[0], method, "the first instance: ")
     work = _Work(model, begin.copy(), t0, rows, limits, (held, period), table, stiff, method)
+    work.limit(limit)
     work.leave(codes)
     whole = work.run(threads, progress)
     counts = work.counts
-    cut = len(STATUS) + int(work.full)
+    cut = len(STATUS) if work.full else STATUS.index("interrupted")
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
     given = None if held is None else held_at(rows, t0, period, held) if over else held.copy()
     h, called = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
@@ -236,7 +268,7 @@ def _run(
         evaluations=called, rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
-        _period=period, _by=method,
+        _period=period, _by=method, _max_evaluations=limit,
     )  # fmt: skip
     if work.events:
         made._happened = work.events.all()
@@ -280,6 +312,11 @@ class _Work:
         if times[0] == t0:
             self.kept[:] = 1
             self.rows[:, :, 0] = begin
+
+    def limit(self, evaluations: int) -> None:
+        """So many evaluations of each instance at most, about; 0: no limit."""
+        for memory in self.memory if evaluations else ():
+            memory.max_evaluations = evaluations
 
     def leave(self, codes: Array | None) -> None:
         """Those whose status is not 0 where they are: they make no step."""

@@ -20,7 +20,7 @@ from .model import LARGE
 from .status import STATUS
 
 _NAMES = ("_times", "_begin")
-_CUT = len(STATUS)  # interrupted
+_CUT = STATUS.index("interrupted")
 
 
 @dataclass(eq=False, repr=False)

@@ -21,7 +21,7 @@ from .model import Model
 from .package import own_model, reduced
 from .status import SAID, STATUS
 
-_ENDS = np.array([*STATUS, "interrupted"])
+_ENDS = np.array(STATUS)
 _KEPT = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
 _OF_ONE = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
@@ -206,7 +206,7 @@ class BatchRun(Values, Fans, Columns):
 
 def stuck(run: BatchRun) -> Array:
     """The status of those that made no step, (batch,), and 0 of the others."""
-    return np.where((run.steps == 0) & (run._codes < len(STATUS)), run._codes, 0)
+    return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
 def way_of(run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:

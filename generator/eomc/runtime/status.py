@@ -15,7 +15,10 @@ REMEDY = (
     f"rows and events fill {100 * PART:.0f} % of this machine's memory: keep fewer rows with "
     "times=, or, where events never cease, end sooner with duration="
 )
-STATUS = ("ok", "singular", "not finite", "no convergence", "accumulated", "locked")
+STATUS = (
+    "ok", "singular", "not finite", "no convergence", "accumulated", "locked", "interrupted",
+    "too long",
+)  # fmt: skip
 SAID = {
     "singular": "D is not positive definite there, so no acceleration exists",
     "not finite": "the state would no longer be finite: the step may be too long, "
@@ -25,6 +28,8 @@ SAID = {
     "position is singular, as that of a stretched leg is (eomc dof tells; guess a bent one), or "
     "the step is far too long",
     "interrupted": "interrupted",
+    "too long": "it took max_evaluations= evaluations of accelerations before its end: give more, "
+    "a looser tolerance, or stiff=True where the motion is stiff",
     FULL: REMEDY,
 }
 
