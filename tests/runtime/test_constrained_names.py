@@ -88,7 +88,7 @@ def test_what_is_held_is_a_list_of_names(module: ModuleType) -> None:
 
 def test_what_a_scene_has_to_ask_for_is_told(quickly_compiled: None, tmp_path: Path) -> None:
     module = eomc.load(replace(rod(), reactions=()), tmp_path)
-    with pytest.raises(ValueError, match=r"build it with System.make\(..., linearize=True\)"):
+    with pytest.raises(ValueError, match=r"build it with System\.make\(\.\.\., linearize=True"):
         module.tangent(*module.start)
     with pytest.raises(AttributeError, match=r"reactions: rod_named has no \[\[loop\]\]"):
         module.reactions(*module.start)
@@ -103,9 +103,7 @@ def test_without_constraints_their_functions_say_what_is_missing(
     module = eomc.load(free, tmp_path)
     for name in (*FUNCTIONS, "constraint_names", "loops"):
         assert not hasattr(module, name)
-        with pytest.raises(
-            AttributeError, match=f"{name}: rod_named has no constraints: System.make"
-        ):
+        with pytest.raises(AttributeError, match=f"{name}: rod_named has no constraints: give"):
             getattr(module, name)
     with pytest.raises(AttributeError, match="has no attribute 'tangents'"):
         _ = module.tangents

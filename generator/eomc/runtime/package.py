@@ -249,7 +249,7 @@ class Package(ModuleType):
         """Raises AttributeError: of what only scenes with constraints have, with the reason."""
         model = self.__dict__.get("_model")
         if model is not None and name in _CONSTRAINED:
-            there = "System.make(..., constraints={...})" if is_made_in_python() else (
+            there = "give them by System.make(..., constraints={...})" if is_made_in_python() else (
                 "a scene has them by [constraints] or [[loop]]"
             )  # fmt: skip
             closed = hasattr(model, name) and model.constraint_names
