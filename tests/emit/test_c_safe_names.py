@@ -276,7 +276,7 @@ def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
             continue
         first = replace(function.body[0], name="NAN")
         odd = replace(function, body=(first, *function.body[1:]))
-        found, _ = c_safe_names.borne(replace(made, functions={**made.functions, name: odd}))
+        found, _ = c_safe_names.rename_for_c(replace(made, functions={**made.functions, name: odd}))
         assert found.functions[name].body[0].name == "NAN_", name
 
 

@@ -29,8 +29,8 @@ def is_negative(number: Expr) -> bool:
 
 
 class Sums(Protocol):
-    """What `expand_sums` reads of a tape: weights and constant of each sum by name, and the
-    leaves.
+    """The parts of a tape that `expand_sums` reads: leaves, and weights and constant of each
+    sum.
     """
 
     leaves: dict[Symbol, Any]

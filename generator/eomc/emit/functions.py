@@ -138,7 +138,9 @@ class Functions:
 
     @property
     def state(self) -> tuple[str, ...]:
-        """What accelerations depend on: q, qd, and t where the motion depends on it."""
+        """Names of the arguments of the accelerations: q, qd, and t where the motion depends on
+        time.
+        """
         return (*STATE, "t") if self.target.driven else STATE
 
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:

@@ -1,4 +1,4 @@
-"""What the templates beside both forms of C ask for: one frozen view each, values only."""
+"""Views of the templates besides both forms of C: frozen dataclasses with values only."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Stepped:
-    """A step of a method, and in words what it calls."""
+    """A step of a method, and a description of its calls."""
 
     name: str
     words: str
@@ -124,11 +124,11 @@ class Costs:
 
 @dataclass(frozen=True)
 class Bound:
-    """A function of the scene in the binding: its name, and its call for row k of many.
+    """An evaluation function in the binding: name and call for row k of many.
 
-    solve: the call for the accelerations that it reads, if it does. at: of a number that depends on
-    the state alone, its call at x. refuses: of one that returns a status, how many numbers a row
-    is.
+    solve: the call for the accelerations that it reads, if any. at: for functions of the state that
+    return a number, the call at x. refuses: for functions that return a status, the number of
+    elements of a row.
     """
 
     name: str
@@ -187,7 +187,7 @@ class Binding:
 
 @dataclass(frozen=True)
 class Declarations:
-    """python/binding.cdef.jinja: what cffi is told of the binding."""
+    """python/binding.cdef.jinja: the declarations of the binding for cffi."""
 
     TEMPLATE: ClassVar[str] = "python/binding.cdef"
     real: str
@@ -201,7 +201,7 @@ class Declarations:
 
 @dataclass(frozen=True)
 class Named:
-    """A coordinate, parameter or input by its author's name; of a parameter with its value."""
+    """A coordinate, parameter or input by its author's name; the value of a parameter."""
 
     written: str
     words: FreeText
@@ -265,7 +265,9 @@ class Stub:
 
 @dataclass(frozen=True)
 class Form:
-    """An extension of a wheel: its name, and what the processor must have, as Linux calls it."""
+    """A variant of the extension in a wheel: name, file, and CPU features that it needs, as in
+    Linux.
+    """
 
     name: str
     extension: str
@@ -274,7 +276,7 @@ class Form:
 
 @dataclass(frozen=True)
 class Compiled:
-    """python/compiled.py.jinja: which of several extensions is loaded."""
+    """python/compiled.py.jinja: selection of one of several extensions."""
 
     TEMPLATE: ClassVar[str] = "python/compiled.py"
     prefix: str

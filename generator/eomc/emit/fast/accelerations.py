@@ -1,4 +1,4 @@
-"""The accelerations of a scene, taken apart for what steps do with them."""
+"""The accelerations of a scene, split as the integration methods of optimised C need them."""
 
 from __future__ import annotations
 
@@ -13,76 +13,84 @@ from eomc.program import outline, trig, two_point
 from eomc.program.ir import Function, Operand, rename
 from eomc.program.trig import Angle
 
-SHORT = 300  # operations of accelerations that are inlined into every stage
+MAX_INLINED_OPERATIONS = 300  # of accelerations, up to which every stage inlines them
 
 
 @dataclass(frozen=True)
 class Accelerations:
-    """The accelerations of a scene, taken apart for steppers.
+    """The accelerations of a scene, split for the integration methods.
 
-    constants: what parameters alone decide and the rest reads. angles: those whose sines and
-    cosines come from outside. parts: of the two-point form, where it pays.
+    Attributes
+    ----------
+    constants
+        Names of precomputed expressions of the parameters.
+    angles
+        Angles whose sines and cosines are arguments.
+    parts
+        Position-dependent and velocity-dependent part, where the split is faster.
     """
 
     target: Target
 
     @cached_property
-    def whole(self) -> Function:
-        """As the program has it."""
+    def function(self) -> Function:
+        """The function of the program."""
         return self.target.program["acceleration"]
 
     @cached_property
-    def own(self) -> tuple[str, ...]:
-        """The scene's parameters."""
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the scene's parameters."""
         return tuple(p.name for p in self.target.system.parameters)
 
     @cached_property
     def staged(self) -> tuple[Function, Function]:
-        """What parameters alone decide, as a function of its own; and the rest."""
-        first, rest = outline.split_precomputed(self.whole, self.own)
-        more = [self._correction_parts[0]] if self._correction_parts else []
-        names = [o.name for f in (first, *more) for o in f.outputs]
-        others = ("signal", "rate_terms")  # what else steps read parameters for
-        read = {n for name in others if (f := self.target.program.functions.get(name))
+        """The function of the precomputed expressions of the parameters, and the remaining
+        function.
+        """
+        precomputed, remaining = outline.split_precomputed(self.function, self.parameter_names)
+        projections = [self._split_projection[0]] if self._split_projection else []
+        names = [o.name for f in (precomputed, *projections) for o in f.outputs]
+        others = ("signal", "rate_terms")  # other functions of steps that read parameters
+        read_by_others = {n for name in others if (f := self.target.program.functions.get(name))
                 for n in f.uses}  # fmt: skip
-        kept = [n for n in self.own if n in names or n in read]
-        kept += [n for n in names if n not in self.own]
+        results = [n for n in self.parameter_names if n in names or n in read_by_others]
+        results += [n for n in names if n not in self.parameter_names]
         return replace(
-            first,
-            early=tuple(a for f in (first, *more) for a in f.early),
-            outputs=tuple(Operand(S.One, n) for n in kept),
-            checks=tuple(pair for f in (first, *more) for pair in f.checks),
-        ), rest
+            precomputed,
+            early=tuple(a for f in (precomputed, *projections) for a in f.early),
+            outputs=tuple(Operand(S.One, n) for n in results),
+            checks=tuple(pair for f in (precomputed, *projections) for pair in f.checks),
+        ), remaining
 
     @cached_property
-    def _correction_parts(self) -> tuple[Function, Function] | None:
-        """The correction onto the constraints in the same two parts."""
+    def _split_projection(self) -> tuple[Function, Function] | None:
+        """The projection, split in the same way."""
         whole = self.target.program.functions.get("projection")
         if whole is None:
             return None
-        first, rest = outline.split_precomputed(whole, self.own)
-        own = {a.name: f"rows_{a.name}" for a in first.early}
-        return rename(first, own), rename(rest, own)
+        precomputed, remaining = outline.split_precomputed(whole, self.parameter_names)
+        new_names = {a.name: f"rows_{a.name}" for a in precomputed.early}
+        return rename(precomputed, new_names), rename(remaining, new_names)
 
     @cached_property
     def correction(self) -> tuple[Function, bool]:
-        """The correction onto the constraints; whether its sines are those of the accelerations."""
-        assert self._correction_parts is not None
-        rest = self._correction_parts[1]
-        angles, apart = trig.apart(rest, self.target.names)
+        """The projection, and whether it reads the sines of the accelerations."""
+        assert self._split_projection is not None
+        remaining = self._split_projection[1]
+        angles, separated = trig.apart(remaining, self.target.names)
         known = {(frozenset(a.terms), a.offset): a for a in self.angles}
         pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]
         names = {
             old: new for a, b in pairs if b for old, new in ((a.sine, b.sine), (a.cosine, b.cosine))
         }
-        made = {a.name for a in apart.body}
-        if not angles or not all(b for _, b in pairs) or made & {*names.values()}:
-            return rest, False
-        return rename(apart, names), True
+        computed = {a.name for a in separated.body}
+        if not angles or not all(b for _, b in pairs) or computed & {*names.values()}:
+            return remaining, False
+        return rename(separated, names), True
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the precomputed expressions."""
         return tuple(o.name for o in self.staged[0].outputs)
 
     @cached_property
@@ -94,25 +102,27 @@ class Accelerations:
 
     @property
     def angles(self) -> tuple[Angle, ...]:
-        """The angles."""
+        """Angles whose sines and cosines are arguments."""
         return self.rotated[0]
 
     @cached_property
     def parts(self) -> two_point.Parts | None:
-        """Of the two-point form, which RK4 takes in double precision."""
+        """The two parts for RK4 in double precision; None where they are not used."""
         target = self.target
         if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
             return None
-        early = {a.name for a in self.whole.early}
-        return two_point.apart(self.rotated[1], self.angles, target.system, {*self.own, *early})
+        early = {a.name for a in self.function.early}
+        return two_point.apart(
+            self.rotated[1], self.angles, target.system, {*self.parameter_names, *early}
+        )
 
     @property
-    def across(self) -> bool:
-        """Whether one trajectory takes the sines of four angles at a time."""
+    def simd_angles(self) -> bool:
+        """Whether one trajectory computes the sines of four angles at once."""
         constrained = bool(self.target.system.constraints)
         return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
 
     @property
     def long(self) -> bool:
-        """Whether they are called rather than inlined: that bounds compile time."""
-        return outline.weight(self.rotated[1]) > SHORT
+        """Whether the accelerations are called rather than inlined, which bounds compile time."""
+        return outline.weight(self.rotated[1]) > MAX_INLINED_OPERATIONS

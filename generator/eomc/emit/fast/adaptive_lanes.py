@@ -1,4 +1,4 @@
-"""Adaptive steps of many instances side by side in the fast form: of small systems."""
+"""Adaptive steps of many instances in parallel, in optimised C for small systems."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from eomc.emit.fast.steppers import Steppers
 from eomc.scene.schema import LOOSEST
 
 
-def view(made: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
-    """The view of their text."""
-    one, wide, s, m = made.one, made.wide, made.accelerations, METHOD
-    stepping, computed = Stepping(made.functions, form), runs.constants_call(made)
+def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
+    """Return the view of adaptive steps of many instances."""
+    one, wide, s, m = steppers.one, steppers.wide, steppers.accelerations, METHOD
+    stepping, computed = Stepping(steppers.functions, form), runs.constants_call(steppers)
     here = {"q": "at[i]", "qd": "moving[i]", "t": f"{c.member('x', 't')} + h*c_[i]"}
     return views.AdaptiveLanes(
         **adaptive.tableau(stepping),
@@ -29,10 +29,10 @@ def view(made: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
         compute_constants=computed,
         compute_own=one.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         own=bool(computed) and one.target.needs_p,
-        accelerate=made.accelerate(wide, a="f", **here, u="given", c=f"&{c.member('x', 'c')}"),
+        accelerate=steppers.accelerate(wide, a="f", **here, u="given", c=f"&{c.member('x', 'c')}"),
         forces=stepping.forces.call(f="f", q="s.q", qd="s.qd", t="s.t", u="given"),
-        batch=made.functions.public.adaptive_batch(m.name),
-        alone=adaptive.alone(made.functions),
+        batch=steppers.functions.public.adaptive_batch(m.name),
+        alone=adaptive.alone(steppers.functions),
         kept=adaptive.keep(stepping).call(q="s.q", qd="s.qd"),
         look=stepping.within.call(
             q_at="q_row", qd_at="qd_row", x="&s", u="given", memory="memory + k",

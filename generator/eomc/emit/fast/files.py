@@ -1,7 +1,7 @@
-"""The fast form of C: a program as the views that its templates print, and all of its files.
+"""Optimised C: the views of a program and its files.
 
-For gcc and clang. What a step calls is printed over a lane type: one number for a trajectory, a
-vector register for a batch and for the stages of sweeps, two points for what is long.
+For gcc and clang. Functions of a step are printed over a lane type: one number for a trajectory, a
+vector register for batches and for iterated stages, two configurations for long accelerations.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from eomc.emit.derivatives import derivatives
 from eomc.emit.fast import adaptive_lanes, projection, runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
-from eomc.emit.fast.runs import ahead_count
+from eomc.emit.fast.runs import prediction_width
 from eomc.emit.fast.steppers import Steppers
 from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
@@ -28,94 +28,96 @@ from eomc.integrators.tableaux import RK4
 
 Show = Callable[[views.View | plain_views.View], str]  # a view by its template
 
-# what stands in csrc for names, types and sizes of a lane
+# Placeholders in csrc for names, types and sizes of a lane
 PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")
-OURS = frozenset({"exp", "tanh"})  # functions of the mathematics library that csrc has over a lane
-TWO = ("atan2", "pow", "min", "max", PIVOT)  # of two arguments
+LANE_FUNCTIONS = frozenset({"exp", "tanh"})  # mathematical functions in csrc over a lane
+BINARY_FUNCTIONS = ("atan2", "pow", "min", "max", PIVOT)
 
 
 def steppers(target: Target) -> Steppers:
-    """The methods of a scene, on their accelerations."""
+    """Return the integration methods of a scene with its accelerations."""
     functions = Functions(target)
     return Steppers(Accelerations(target), functions, plain.linearization(functions))
 
 
-def rooms(made: Steppers) -> list[int]:
-    """The numbers that each method's memory keeps, and behind that of adaptive steps."""
-    system = made.one.target.system
-    room = adaptive.workspace_size(system, made.one.width)
-    return [*(runs.kept(made, m) for m in made.methods), room]
+def rooms(steppers: Steppers) -> list[int]:
+    """Return the workspace size of each method, and of adaptive steps."""
+    system = steppers.one.target.system
+    room = adaptive.workspace_size(system, steppers.one.width)
+    return [*(runs.state_size(steppers, m) for m in steppers.methods), room]
 
 
-def files(made: Steppers, show: Show) -> dict[str, str]:
-    """Header and source of the fast form by file name."""
-    functions, slopes, target = made.functions, made.slopes, made.accelerations.target
+def files(steppers: Steppers, show: Show) -> dict[str, str]:
+    """Return header and source of optimised C by file name."""
+    functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    header = show(plain.header(functions, slopes, stamp, rooms(made), fast=True))
+    header = show(plain.header(functions, slopes, stamp, rooms(steppers), fast=True))
     source = show(
         views.Source(
             **plain.source(functions, stamp, slopes, show),
-            rolled=made.two_point,
-            unroll=made.one.unroll,
-            extent=made.one.extent,
-            inline=made.one.qualifiers[INLINE],
-            wide=_wide(made),
-            csrc=tuple(_csrc(made)),
-            lanes=tuple(filter(None, _lanes(made, show))),
-            steppers=tuple(_steppers(made, show)),
+            rolled=steppers.two_point,
+            unroll=steppers.one.unroll,
+            extent=steppers.one.extent,
+            inline=steppers.one.qualifiers[INLINE],
+            wide=_wide(steppers),
+            csrc=tuple(_csrc(steppers)),
+            lanes=tuple(filter(None, _lanes(steppers, show))),
+            steppers=tuple(_steppers(steppers, show)),
         )
     )
     name = target.prefix
     return {f"{name}.h": c.laid_out(header), f"{name}.c": c.laid_out(source)}
 
 
-def _wide(made: Steppers) -> bool:
-    """Whether the lane of a register is needed."""
-    run = made.accelerations.target.system.run
-    return run.batch or made.functions.swept
+def _wide(steppers: Steppers) -> bool:
+    """Return True if code for vector registers is needed."""
+    run = steppers.accelerations.target.system.run
+    return run.batch or steppers.functions.swept
 
 
-def _csrc(made: Steppers) -> Iterator[str]:
-    """The hand-written C that this scene needs, under its own prefix."""
-    target = made.accelerations.target
+def _csrc(steppers: Steppers) -> Iterator[str]:
+    """Yield the hand-written C that this scene needs, with its prefix."""
+    target = steppers.accelerations.target
     end = target.real.function_suffix
     size = 8 if target.real is DOUBLE else 4
-    rotates = bool(made.accelerations.angles) and RK4 in made.methods
-    lanes = [("wide", f"{target.PREFIX}_WIDE_BYTES", True)] * _wide(made)
-    if made.two_point:
+    rotates = bool(steppers.accelerations.angles) and RK4 in steppers.methods
+    lanes = [("wide", f"{target.PREFIX}_WIDE_BYTES", True)] * _wide(steppers)
+    if steppers.two_point:
         lanes += [("two", str(2 * size), False)]
-    across = made.accelerations.across
-    angles = made.functions.several or across
+    simd = steppers.accelerations.simd_angles
+    angles = steppers.functions.several or simd
     if angles:
-        lanes += [("four", str(4 * size), across)]
-    if RK4 in made.methods and made.predicted:
-        bytes_ahead = size * ahead_count(len(made.accelerations.angles))
-        lanes += [("ahead", str(bytes_ahead), False)]
+        lanes += [("four", str(4 * size), simd)]
+    if RK4 in steppers.methods and steppers.predicted:
+        prediction_bytes = size * prediction_width(len(steppers.accelerations.angles))
+        lanes += [("ahead", str(prediction_bytes), False)]
     texts = [(f"sincos/sincos{end}.h", "", "")] if target.sincos else []
     if rotates:
         texts += [("lanes/scalar.h", "", ""), (f"lanes/rotate{end}.h", "", "")]
-    texts += [("lanes/larger.h", "", "")] * any(m.implicit for m in made.methods)
-    for name, width, turns in lanes:
+    texts += [("lanes/larger.h", "", "")] * any(m.implicit for m in steppers.methods)
+    for name, width, rotates_angles in lanes:
         texts += [("lanes/vector.h", name, width)]
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
-        texts += [(f"lanes/rotate{end}.h", name, width)] * (turns and rotates)
-        ours = OURS & set(made.one.calls) if name in ("wide", "two") else frozenset()
-        selects = bool(ours) or (name == "wide" and adaptive.together(target))
+        texts += [(f"lanes/rotate{end}.h", name, width)] * (rotates_angles and rotates)
+        needed_functions = (
+            LANE_FUNCTIONS & set(steppers.one.calls) if name in ("wide", "two") else frozenset()
+        )
+        selects = bool(needed_functions) or (name == "wide" and adaptive.together(target))
         texts += [("lanes/select.h", name, width)] * selects
-        texts += [(f"lanes/exp{end}.h", name, width)] * bool(ours)
-        texts += [(f"lanes/tanh{end}.h", name, width)] * ("tanh" in ours)
-        texts += [("lanes/four.h", name, width)] * (name == "four" and across)
-        texts += [("lanes/interleave.h", name, width)] * (name == "four" and made.two_point)
+        texts += [(f"lanes/exp{end}.h", name, width)] * bool(needed_functions)
+        texts += [(f"lanes/tanh{end}.h", name, width)] * ("tanh" in needed_functions)
+        texts += [("lanes/four.h", name, width)] * (name == "four" and simd)
+        texts += [("lanes/interleave.h", name, width)] * (name == "four" and steppers.two_point)
         texts += [("lanes/angles.h", name, width)] * (name == "four" and angles)
     for file, name, width in texts:
         text = resources.text("csrc", file).replace("#include <math.h>\n", "")
         integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
         for old, new in (
-            # for many angles, gcc takes half as long again where it has inlined each one's
-            *([("static inline void", "static void")] if made.accelerations.long else ()),
+            # With many angles, inlining the sincos of each makes the code of gcc 50 % slower.
+            *([("static inline void", "static void")] if steppers.accelerations.long else ()),
             ("EOMC_BITS_OF_SIZE", bits),
             ("EOMC_INTEGER", integer),
-            # compilers change how they pass what is aligned to more than a register has
+            # Compilers pass values with larger alignment than a register in different ways.
             ("EOMC_LANE_ALIGNED", width if name == "wide" else "16"),
             ("EOMC_LANE_BYTES", width),
             ("EOMC_LANE_COUNT", f"{target.PREFIX}_{name.upper()}_COUNT"),
@@ -134,40 +136,44 @@ def _csrc(made: Steppers) -> Iterator[str]:
         yield text.strip()
 
 
-def _lanes(made: Steppers, show: Show) -> Iterator[str]:
-    """The accelerations over each lane, and RK4 or another explicit method over the register."""
-    if made.two_point:
-        yield _library_text(Lane(made.accelerations, "two"), show)
-    yield _lane(made, made.one, show)
-    batch = made.accelerations.target.system.run.batch
-    if _wide(made):
-        yield _library_text(made.wide, show)
-        yield _lane(made, made.wide, show)
-    if made.functions.projection:
-        yield show(project(made.functions))
-        for lane in (made.one, *([made.wide] * batch)):
-            yield show(projection.view(made.functions, lane))
+def _lanes(steppers: Steppers, show: Show) -> Iterator[str]:
+    """Yield the accelerations over each lane, and RK4 or other explicit methods over vector
+    registers.
+    """
+    if steppers.two_point:
+        yield _library_text(Lane(steppers.accelerations, "two"), show)
+    yield _lane(steppers, steppers.one, show)
+    batch = steppers.accelerations.target.system.run.batch
+    if _wide(steppers):
+        yield _library_text(steppers.wide, show)
+        yield _lane(steppers, steppers.wide, show)
+    if steppers.functions.projection:
+        yield show(project(steppers.functions))
+        for lane in (steppers.one, *([steppers.wide] * batch)):
+            yield show(projection.view(steppers.functions, lane))
     if batch:
         yield show(
             views.Blocks(
-                prefix=made.one.prefix,
-                PREFIX=made.one.target.PREFIX,
-                lane=made.wide.real.name,
-                constants=made.wide.constants if made.accelerations.constants else "",
-                inputs=bool(made.accelerations.target.system.inputs),
-                blocks=1 if made.accelerations.long else 4,
+                prefix=steppers.one.prefix,
+                PREFIX=steppers.one.target.PREFIX,
+                lane=steppers.wide.real.name,
+                constants=steppers.wide.constants if steppers.accelerations.constants else "",
+                inputs=bool(steppers.accelerations.target.system.inputs),
+                blocks=1 if steppers.accelerations.long else 4,
             )
         )
 
 
-def _lane(made: Steppers, lane: Lane, show: Show) -> str:
-    """The accelerations over one lane."""
-    s, target = made.accelerations, lane.target
+def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
+    """Return the accelerations over one lane."""
+    s, target = steppers.accelerations, lane.target
     signal = lane.signal
     constants = c.struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
     parts = s.parts if not lane.name else None
-    rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
-    computed = lane.compute_constants.text if not lane.name and runs.constants_call(made) else ""
+    rates = lane.rates.text if parts is None else show(_two_points(steppers)).rstrip("\n")
+    computed = (
+        lane.compute_constants.text if not lane.name and runs.constants_call(steppers) else ""
+    )
     return show(
         views.LaneText(
             prefix=target.prefix,
@@ -178,13 +184,13 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             constants="\n\n".join(filter(None, (constants, computed))),
             angles=lane.angle_count if s.angles else "",
             count=len(s.angles),
-            across=lane.across,
+            across=lane.simd_angles,
             angles_at=lane.linear("angles_at", "q", offset=True),
             changes=lane.linear("changes", "d", offset=False),
             sincos=lane.sincos,
             signal=signal,
             signal_call=""
-            if signal is None or made.given_signals
+            if signal is None or steppers.given_signals
             else signal.function.call(u="now"),
             rates=rates,
             rates_call=lane.velocity.function.call(k="&k", point="0")
@@ -193,14 +199,14 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             accelerations=lane.all_in_one,
             two_point=parts is not None,
             takes_c=bool(s.constants),
-            alone=lane.alone,
+            alone=lane.computes_own_sines,
         )
     )
 
 
 def _library_text(lane: Lane, show: Show) -> str:
-    """The functions of the mathematics library over a lane of several numbers."""
-    names = set(lane.calls) - OURS
+    """Return the functions of the mathematics library over a lane of several numbers."""
+    names = set(lane.calls) - LANE_FUNCTIONS
     if lane.name == "wide" and adaptive.together(lane.accelerations.target):
         names.add("sqrt")
     return show(
@@ -217,18 +223,20 @@ def _library_text(lane: Lane, show: Show) -> str:
 
 
 def _library(s: Accelerations, name: str, wide: bool) -> views.Library:
-    """A function of the mathematics library, or ours; wide: over a register."""
+    """Return the view of one mathematical function. wide: over a vector register."""
     if name == PIVOT:
         return views.Library(name, name, True, "")
     called = C_NAMES.get(name, name)
     letter = "d" if s.target.real is DOUBLE else "s"
     whole = f"__builtin_ia32_sqrtp{letter}512_mask(x, x, -1, 4)" if wide and name == "sqrt" else ""
-    return views.Library(called, called + s.target.real.function_suffix, name in TWO, whole)
+    return views.Library(
+        called, called + s.target.real.function_suffix, name in BINARY_FUNCTIONS, whole
+    )
 
 
-def _two_points(made: Steppers) -> views.TwoPoints:
-    """The accelerations of one trajectory in the two-point form."""
-    s, one = made.accelerations, made.one
+def _two_points(steppers: Steppers) -> views.TwoPoints:
+    """Return the view of the accelerations of one trajectory in two parts."""
+    s, one = steppers.accelerations, steppers.one
     two = Lane(s, "two")
     assert s.parts is not None
     configuration = two.configuration
@@ -246,51 +254,53 @@ def _two_points(made: Steppers) -> views.TwoPoints:
     )
 
 
-def _steppers(made: Steppers, show: Show) -> Iterator[str]:
-    """The methods: their state, one step, run and batch."""
-    real = made.one.real
-    run = made.accelerations.target.system.run
-    if run.tolerance is not None or any(m.newton for m in made.methods):
+def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
+    """Yield the methods: state, step, run and batch of each."""
+    real = steppers.one.real
+    run = steppers.accelerations.target.system.run
+    if run.tolerance is not None or any(m.newton for m in steppers.methods):
         fabs = f"fabs{real.function_suffix}"
-        yield show(views.Factors(made.one.prefix, made.one.real.name, fabs, real.suffix))
-    for m in made.methods:
-        lanes = [made.one, *([made.wide] if run.batch else [])]
+        yield show(views.Factors(steppers.one.prefix, steppers.one.real.name, fabs, real.suffix))
+    for m in steppers.methods:
+        lanes = [steppers.one, *([steppers.wide] if run.batch else [])]
         if m is RK4:
-            yield from (show(made.rk4(lane)) for lane in lanes)
+            yield from (show(steppers.rk4(lane)) for lane in lanes)
         elif not m.implicit:
-            yield from (show(made.explicit(lane, m)) for lane in lanes)
-        if runs.predicts(made, m):
-            yield show(made.predictions())
-        yield show(runs.state(made, m))
-        if runs.predicts(made, m):
-            yield show(made.prediction())
+            yield from (show(steppers.explicit(lane, m)) for lane in lanes)
+        if runs.predicts(steppers, m):
+            yield show(steppers.predictions())
+        yield show(runs.state(steppers, m))
+        if runs.predicts(steppers, m):
+            yield show(steppers.prediction())
         if m.sweeps:
-            yield show(made.stages(m)) + "\n" + show(made.sweeps(m)).rstrip("\n")
+            yield show(steppers.stages(m)) + "\n" + show(steppers.sweeps(m)).rstrip("\n")
         elif m.implicit:
-            yield show(made.gauss(m))
-        yield show(runs.loop(made, m))
+            yield show(steppers.gauss(m))
+        yield show(runs.loop(steppers, m))
         if run.batch:
-            yield show(runs.batch(made, m))
+            yield show(runs.batch(steppers, m))
     if run.tolerance is not None:
-        if adaptive.METHOD not in made.methods:
-            yield show(made.stages(adaptive.METHOD))
-        yield from map(show, events.views(made.functions, _adaptive(made)))
+        if adaptive.METHOD not in steppers.methods:
+            yield show(steppers.stages(adaptive.METHOD))
+        yield from map(show, events.views(steppers.functions, _adaptive(steppers)))
         if run.batch:
-            side_by_side = adaptive.together(made.accelerations.target)
-            many = adaptive_lanes.view(made, _adaptive(made)) if side_by_side else None
-            yield show(many or adaptive.batch(made.functions))
-    yield from map(show, derivatives(made.functions))
+            side_by_side = adaptive.together(steppers.accelerations.target)
+            batch_view = (
+                adaptive_lanes.view(steppers, _adaptive(steppers)) if side_by_side else None
+            )
+            yield show(batch_view or adaptive.batch(steppers.functions))
+    yield from map(show, derivatives(steppers.functions))
 
 
-def _adaptive(made: Steppers) -> adaptive.SweepInterface:
-    """The sweeps of adaptive steps, stages in a lane each."""
-    one, m = made.one, adaptive.METHOD
-    sweep = made.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
+def _adaptive(steppers: Steppers) -> adaptive.SweepInterface:
+    """Return the iteration over the stages for adaptive steps, one stage per lane element."""
+    one, m = steppers.one, adaptive.METHOD
+    sweep = steppers.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
     return adaptive.SweepInterface(
-        made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
-        bool(made.accelerations.constants), runs.constants_call(made),
+        steppers.stepping(one), sweep, steppers.accelerate(one, a="f"), one.extent,
+        bool(steppers.accelerations.constants), runs.constants_call(steppers),
         f"{one.target.PREFIX}_LANES",
         projection.ending(
-            made.functions, one, s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
+            steppers.functions, one, s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
         ),
     )  # fmt: skip

@@ -1,7 +1,7 @@
-"""Accelerations over a lane type: one number, a register of several, or two points at once.
+"""Accelerations over a lane type: one number, a vector register, or two configurations at once.
 
-Every function of the fast form that a step calls is printed here once, for whichever lane: its
-types, its arguments and how failures are noted are the lane's.
+Every function of optimised C that a step calls is printed here for any lane. The lane determines
+types, arguments and the representation of failures.
 """
 
 from __future__ import annotations
@@ -27,35 +27,39 @@ INLINE, NOINLINE = "INLINE", "NOINLINE"
 
 
 def four(n: int) -> int:
-    """The next multiple of four."""
+    """Return the next multiple of four."""
     return -(-n // FOUR) * FOUR
 
 
 def interleaved(k: int) -> int:
-    """Where number k of two points stands among both, as two_point.c.jinja has it."""
+    """Return the index of number k in the interleaved layout of two points, as in
+    two_point.c.jinja.
+    """
     return k - k % FOUR + (0, 2, 1, 3)[k % FOUR]
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Accelerations with numbers of one type. name: what its C names end in, "" for one number."""
+    """Accelerations with numbers of one type. name: the suffix of its C names, "" for one
+    number.
+    """
 
     accelerations: Accelerations
     name: str = ""
 
     @property
     def prefix(self) -> str:
-        """What every C name begins with."""
+        """The prefix of all C names."""
         return self.accelerations.target.prefix
 
     @property
     def end(self) -> str:
-        """What every C name of the lane ends in."""
+        """The suffix of C names of the lane."""
         return f"_{self.name}" if self.name else ""
 
     @cached_property
     def real(self) -> Real:
-        """The type."""
+        """The type of numbers of one lane."""
         scalar = self.accelerations.target.real
         if not self.name:
             return scalar
@@ -64,12 +68,12 @@ class Lane:
 
     @property
     def mask(self) -> str:
-        """The type of failures."""
+        """The C type of failures."""
         return f"{self.real.name}_mask" if self.name else "int"
 
     @property
     def clear(self) -> str:
-        """No failure."""
+        """The initialiser for no failure."""
         return "{ 0 }" if self.name else "0"
 
     @cached_property
@@ -79,78 +83,84 @@ class Lane:
 
     @property
     def NQ(self) -> str:
-        """The number of coordinates, in C."""
+        """The number of coordinates, as C text."""
         return f"{self.target.PREFIX}_NQ"
 
     @property
     def constants(self) -> str:
-        """The type of the constants."""
+        """The C type of the precomputed expressions."""
         return f"{self.prefix}_constants{self.end if self.name != 'two' else ''}"
 
     @property
     def qualifiers(self) -> Mapping[str, str]:
-        """Of functions that are to be inlined, and of those that are not."""
+        """The qualifiers of functions that are inlined and of those that are not."""
         return {kind: f"{self.target.PREFIX}_{kind}" for kind in (INLINE, NOINLINE)}
 
     @property
     def names(self) -> dict[str, Any]:
-        """What texts over a lane name."""
+        """Fields that all views over a lane have."""
         inline = self.qualifiers[INLINE]
         return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
     @property
     def unroll(self) -> str:
-        """What stands before loops over coordinates: in the two-point form they are vectors."""
+        """The macro before loops over coordinates. They are vectors where accelerations are split
+        in two parts.
+        """
         return f"{self.target.PREFIX}_{'ROLLED' if self.padded else 'UNROLL'}"
 
     @property
-    def alone(self) -> bool:
-        """Whether something computes all of its sines anew."""
+    def computes_own_sines(self) -> bool:
+        """Whether some method computes all sines anew."""
         run = self.target.system.run
         return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
 
     @property
     def padded(self) -> bool:
-        """Whether vectors of coordinates are multiples of four numbers, with zeros behind."""
+        """Whether vectors of coordinates are padded with zeros to multiples of four."""
         return not self.name and self.accelerations.parts is not None
 
     @property
-    def across(self) -> bool:
-        """Whether four angles go into a register."""
-        return not self.name and self.accelerations.across
+    def simd_angles(self) -> bool:
+        """Whether four angles are computed in one register."""
+        return not self.name and self.accelerations.simd_angles
 
     @cached_property
     def width(self) -> int:
-        """Numbers in a vector of coordinates; angles that are coordinates are read there too."""
+        """Size of a vector of coordinates, including the angles that are read from it in groups of
+        four.
+        """
         n = len(self.target.names)
         if not self.padded:
             return n
-        first = self.straight or 0
+        first = self.contiguous_angles or 0
         return max(four(n), four(first + four(len(self.accelerations.angles))))
 
     @property
     def extent(self) -> str:
-        """The same in C."""
+        """`width` as C text."""
         return str(self.width) if self.padded else self.NQ
 
     @cached_property
-    def straight(self) -> int | None:
-        """The first coordinate, where the angles are coordinates in their order."""
+    def contiguous_angles(self) -> int | None:
+        """The index of the first coordinate, if the angles are consecutive coordinates; else
+        None.
+        """
         names = self.target.names
-        found = [
+        indices = [
             names.index(a.terms[0][1])
             for a in self.accelerations.angles
             if len(a.terms) == 1 and a.terms[0][0] == 1 and a.offset == 0
         ]
         count = len(self.accelerations.angles)
-        if len(found) < count or found != list(range(found[0], found[0] + count)):
+        if len(indices) < count or indices != list(range(indices[0], indices[0] + count)):
             return None
-        return found[0]
+        return indices[0]
 
     # arguments
 
     def argument(self, name: str) -> CArgument:
-        """One of q, qd, s, t, u, c."""
+        """Return one of the arguments q, qd, s, t, u, c."""
         if name == "t":
             return CArgument(self.real.name, "t")
         if name == "s":
@@ -160,8 +170,8 @@ class Lane:
         return c.given(self.real.name, name)
 
     @cached_property
-    def there(self) -> tuple[str, ...]:
-        """What accelerations of this scene take, besides results."""
+    def argument_names(self) -> tuple[str, ...]:
+        """Names of the arguments of the accelerations, without results."""
         s = self.accelerations
         return (
             "q", "qd", *(["s"] if s.angles else []), *(["t"] if self.target.driven else []),
@@ -169,8 +179,8 @@ class Lane:
         )  # fmt: skip
 
     @cached_property
-    def brought(self) -> dict[str, frozenset[str]]:
-        """The names of the program that each argument brings."""
+    def names_of(self) -> dict[str, frozenset[str]]:
+        """The names of the program that each argument supplies."""
         groups = self.target.groups()
         sines = {n for a in self.accelerations.angles for n in (a.sine, a.cosine)}
         groups = {k: v for k, v in groups.items() if k in ("q", "qd", "t", "u")}
@@ -178,28 +188,32 @@ class Lane:
 
     @cached_property
     def where(self) -> dict[str, str]:
-        """How sines, cosines and constants are read."""
-        found = {n: c.member("c", n) for n in self.accelerations.constants}
+        """The C expression of each sine, cosine and precomputed expression."""
+        expressions = {n: c.member("c", n) for n in self.accelerations.constants}
         for n, a in enumerate(self.accelerations.angles):
             k = interleaved(n) if self.name == "two" else n
-            found[a.sine] = f"{c.member('s', 's')}[{k}]"
-            found[a.cosine] = f"{c.member('s', 'c')}[{k}]"
-        return found
+            expressions[a.sine] = f"{c.member('s', 's')}[{k}]"
+            expressions[a.cosine] = f"{c.member('s', 'c')}[{k}]"
+        return expressions
 
     # bodies
 
     def _loads(self, function: Function) -> Block:
+        """Return definitions of local variables for the coordinates, velocities and inputs that are
+        read.
+        """
         element = self.target.element
         state = self._interleaved if self.name == "two" else element
         return Block("", tuple(self.target.loads(function, state, element)))
 
     def _interleaved(self, array: str, name: str) -> str:
+        """Return the element of a coordinate in the interleaved layout of two points."""
         return f"{array}[{interleaved(self.target.names.index(name))}]"
 
     def computed(
         self,
         function: Function,
-        what: str,
+        name: str,
         out: CArgument | None,
         places: Sequence[str],
         extra: Iterable[tuple[CArgument, frozenset[str], str]] = (),
@@ -209,114 +223,122 @@ class Lane:
         in_order: bool = False,
         inline: bool = True,
     ) -> Computed:
-        """A function whose results go to `places` of `out`, and that returns what failed.
+        """Return a function that writes its results to `places` of `out`, and returns failures.
 
-        extra: arguments besides the usual, the names that each brings, and how these are read.
-        takes: the usual arguments, if not all that there are. constants: how those are read, where
-        the function has its own.
+        Parameters
+        ----------
+        extra
+            Additional arguments, the names that each supplies, and the C expression of these.
+        takes
+            Names of the usual arguments; all of them by default.
+        constants
+            C expressions of precomputed values, where the function has its own.
         """
         function = rename_reserved(function)
-        there = self.there if takes is None else takes
-        brought = self.brought | ({"c": frozenset(constants)} if constants is not None else {})
-        given = [(self.argument(n), brought[n]) for n in there]
-        given += [(argument, names) for argument, names, _ in extra]
+        names_of_arguments = self.argument_names if takes is None else takes
+        supplied = self.names_of | ({"c": frozenset(constants)} if constants is not None else {})
+        supplied_by = [(self.argument(n), supplied[n]) for n in names_of_arguments]
+        supplied_by += [(argument, names) for argument, names, _ in extra]
         where = dict(self.where if constants is None else constants)
         for _, names, form in extra:
             where |= {n: form.format(n) for n in names}
-        whole = CFunction(
-            f"{self.prefix}_{what}{self.end}",
+        outer = CFunction(
+            f"{self.prefix}_{name}{self.end}",
             self.mask,
-            (*([out] if out else []), *(a for a, _ in given)),
+            (*([out] if out else []), *(a for a, _ in supplied_by)),
             qualifier=self.qualifiers[INLINE if inline else NOINLINE],
             doc=(doc,) if doc else (),
         )
         if outline.is_large(function):
-            return self._in_pieces(whole, function, what, out, places, given, where, in_order)
+            return self._in_pieces(outer, function, name, out, places, supplied_by, where, in_order)
         body = self.target.body(function, where, pivots=self.pivots, in_order=in_order)
-        read = {a.name for a, names in given if names & function.uses}
-        reads = read | {a.name for a in whole.arguments[:1] if a is out}
+        read = {a.name for a, names in supplied_by if names & function.uses}
+        reads = read | {a.name for a in outer.arguments[:1] if a is out}
         statements = self._statements(function, body, places)
-        return Computed(replace(whole, body=statements, reads=frozenset(reads)))
+        return Computed(replace(outer, body=statements, reads=frozenset(reads)))
 
     def _in_pieces(
         self,
-        whole: CFunction,
+        outer: CFunction,
         function: Function,
-        what: str,
+        name: str,
         out: CArgument | None,
         places: Sequence[str],
-        given: Sequence[tuple[CArgument, frozenset[str]]],
+        supplied_by: Sequence[tuple[CArgument, frozenset[str]]],
         where: Mapping[str, str],
         in_order: bool,
     ) -> Computed:
-        """A long function as a call of its pieces, which hand values on in a struct."""
+        """Return a long function as calls of outlined functions, which share values in a struct."""
         parts = outline.split(function, outline.PIECE)
-        handed = {n: c.member("v", n) for part in parts for n in part.keeps}
-        values = f"{self.prefix}_{what}_values{self.end}"
-        made: list[CFunction] = []
+        shared = {n: c.member("v", n) for part in parts for n in part.keeps}
+        values = f"{self.prefix}_{name}_values{self.end}"
+        pieces: list[CFunction] = []
         calls: list[str] = []
         for k, part in enumerate(parts, 1):
             f = part.function
             body = self.target.body(
-                f, dict(where) | {n: handed[n] for n in part.reads},
-                stored={n: handed[n] for n in part.keeps}, pivots=self.pivots,
+                f, dict(where) | {n: shared[n] for n in part.reads},
+                stored={n: shared[n] for n in part.keeps}, pivots=self.pivots,
                 in_order=in_order,
             )  # fmt: skip
             head = [c.filled(values, "v")] if part.reads or part.keeps else []
             head += [out] if out and part.outputs else []
-            arguments = (*head, *(a for a, names in given if names & f.uses))
+            arguments = (*head, *(a for a, names in supplied_by if names & f.uses))
             fails = self._fails(body)
             piece = CFunction(
-                f"{self.prefix}_{what}_{k}{self.end}",
+                f"{self.prefix}_{name}_{k}{self.end}",
                 self.mask if fails else "void",
                 arguments,
                 self._statements(f, body, [places[n] for n in part.outputs], fails),
                 frozenset(a.name for a in arguments),
                 self.qualifiers[NOINLINE],
-                (f"{what}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
+                (f"{name}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
-            made.append(piece)
+            pieces.append(piece)
             calls += c.note([piece.call(v="&v")]) if fails else [c.do(piece.call(v="&v"))]
         if self.padded and out == self.out:
             calls += [c.assign(f"a[{k}]", self.target.zero) for k in range(len(places), self.width)]
         locals_ = [c.local(self.mask, f"failed = {self.clear}")]
-        locals_ += [c.local(values, "v")] if handed else []
+        locals_ += [c.local(values, "v")] if shared else []
         blocks = (locals_, calls, [c.result("failed")])
-        reads = frozenset(a.name for f in made for a in f.arguments)
-        struct = c.struct(values, self.real.name, list(handed)) if handed else ""
+        reads = frozenset(a.name for f in pieces for a in f.arguments)
+        struct = c.struct(values, self.real.name, list(shared)) if shared else ""
         body_ = tuple(Block("", tuple(lines)) for lines in blocks)
-        return Computed(replace(whole, body=body_, reads=reads), tuple(made), struct)
+        return Computed(replace(outer, body=body_, reads=reads), tuple(pieces), struct)
 
     @property
     def pivots(self) -> int:
-        """How many the whole has: what rounding leaves of one grows with them."""
-        return len(self.accelerations.whole.checks)
+        """The number of pivots of the accelerations, on which the tolerance of each depends."""
+        return len(self.accelerations.function.checks)
 
     def _fails(self, body: Body) -> bool:
+        """Return True if a body can fail."""
         return bool(body.failures or (self.name and body.sincos))
 
     def _statements(
         self, function: Function, body: Body, places: Sequence[str], fails: bool = True
     ) -> tuple[Block, ...]:
-        """Loads, statements, results; what failed is returned where it can."""
+        """Return loads, statements and results. Failures are returned if `fails`."""
         if list(places) == self.places and self.padded:
             sets = self._stored("a", body.results, self.width)
         else:
             sets = tuple(c.assign(to, x) for to, x in zip(places, body.results, strict=True))
-        noted = c.note(body.failures)
+        failure_statements = c.note(body.failures)
         if not fails:
             return (self._loads(function), *body.early, *body.blocks, Block("", sets))
         head = Block("", (c.local(self.mask, f"failed = {self.clear}"),))
-        end = Block("", (*sets, *noted, c.result("failed")))
+        end = Block("", (*sets, *failure_statements, c.result("failed")))
         return (head, self._loads(function), *body.early, *body.blocks, end)
 
     def _stored(self, array: str, values: Sequence[str], width: int) -> tuple[str, ...]:
-        """Numbers into an array of that width, zeros behind, where angles go four at a time."""
-        if not self.across:
+        """Return statements that store numbers, in groups of four padded with zeros where
+        `simd_angles`.
+        """
+        if not self.simd_angles:
             return tuple(c.assign(f"{array}[{k}]", x) for k, x in enumerate(values))
-        whole = [*values, *[self.target.zero] * (width - len(values))]
+        padded = [*values, *[self.target.zero] * (width - len(values))]
         return tuple(
-            c.do(f"{self.prefix}_put({array} + {k}, {', '.join(whole[k : k + FOUR])})")
+            c.do(f"{self.prefix}_put({array} + {k}, {', '.join(padded[k : k + FOUR])})")
             for k in range(0, width, FOUR)
         )
 
@@ -324,54 +346,56 @@ class Lane:
 
     @cached_property
     def out(self) -> CArgument:
-        """Where accelerations go."""
+        """The argument for the accelerations."""
         return c.filled(self.real.name, "a")
 
     @cached_property
     def places(self) -> list[str]:
-        """The accelerations there, one by one."""
+        """The elements of the accelerations."""
         return [self.target.element("a", n) for n in self.target.names]
 
     @cached_property
     def rates(self) -> Computed:
-        """The accelerations from the state, its sines and the inputs."""
-        doc = sentence(self.accelerations.whole)
+        """The function for the accelerations from the state, its sines and the inputs."""
+        doc = sentence(self.accelerations.function)
         return self.computed(self.accelerations.rotated[1], "rates", self.out, self.places, doc=doc)
 
     @cached_property
     def signal(self) -> Computed | None:
-        """The scene's signals."""
+        """The function for the scene's signals; None without signals."""
         if "signal" not in self.target.program:
             return None
-        takes = [*(["t"] if self.target.signal_t else [])]
-        takes += ["q", "qd"] if self.target.signal_state else []
-        takes += ["c"] if self.accelerations.constants else []
-        own = {n: c.member("c", n) for n in self.accelerations.own}
+        arguments = [*(["t"] if self.target.signal_t else [])]
+        arguments += ["q", "qd"] if self.target.signal_state else []
+        arguments += ["c"] if self.accelerations.constants else []
+        parameters = {n: c.member("c", n) for n in self.accelerations.parameter_names}
         return self.computed(
             self.target.program["signal"], "signals", c.filled(self.real.name, "u"),
             [f"u[{self.target.enum[n]}]" for n in self.target.input_names],
-            doc="The scene's signals.", takes=takes, constants=own,
+            doc="The scene's signals.", takes=arguments, constants=parameters,
         )  # fmt: skip
 
     @cached_property
     def compute_constants(self) -> Computed:
-        """The constants from the parameters; what failed: parameters alone make D singular."""
-        own, target = frozenset(self.accelerations.own), self.target
+        """The function that precomputes expressions of the parameters. It fails if they make D
+        singular.
+        """
+        parameters, target = frozenset(self.accelerations.parameter_names), self.target
         p = c.given(f"{self.prefix}_params", "p")
         out = c.filled(self.constants, "c") if self.accelerations.constants else None
         return self.computed(
             self.accelerations.staged[0], "compute_constants", out,
             [c.member("c", n) for n in self.accelerations.constants],
-            [(p, own, c.member("p", "{}"))] if target.needs_p else (),
+            [(p, parameters, c.member("p", "{}"))] if target.needs_p else (),
             doc="Constants of the parameters.", takes=(), constants={},
         )  # fmt: skip
 
     def linear(self, what: str, vector: str, offset: bool) -> CFunction:
-        """The angles at q, or how they change where q does."""
+        """Return the function for the angles at q, or for their change with q."""
         angles = self.accelerations.angles
-        values = [self.along(a, vector, a.offset if offset else S.Zero) for a in angles]
-        if self.padded and self.straight is not None:
-            sums = c.copied("x", vector, self.straight, self.angle_count)
+        values = [self.angle_text(a, vector, a.offset if offset else S.Zero) for a in angles]
+        if self.padded and self.contiguous_angles is not None:
+            sums = c.copied("x", vector, self.contiguous_angles, self.angle_count)
         else:
             sums = self._stored("x", values, four(len(values)))
         return CFunction(
@@ -380,20 +404,22 @@ class Lane:
             (Block("", sums),), frozenset({"x", vector}), self.qualifiers[INLINE],
         )  # fmt: skip
 
-    def along(self, angle: Angle, vector: str, offset: Expr) -> str:
-        """An angle of a vector of coordinates."""
+    def angle_text(self, angle: Angle, vector: str, offset: Expr) -> str:
+        """Return an angle as C text, as a combination of the elements of a vector of
+        coordinates.
+        """
         where = {n: self.target.element(vector, n) for _, n in angle.terms}
         return Printer(self.prefix, self.real, where).value(Sum(angle.terms, offset))[0]
 
     @cached_property
     def calls(self) -> tuple[str, ...]:
-        """Functions of the mathematics library that the lane has to have."""
-        read = [self.accelerations.whole]
+        """Names of functions of the mathematics library that the lane needs."""
+        functions = [self.accelerations.function]
         others = ("signal", "projection")
-        read += [f for n in others if (f := self.target.program.functions.get(n))]
+        functions += [f for n in others if (f := self.target.program.functions.get(n))]
         names = {
             a.value.function
-            for f in read
+            for f in functions
             for a in (*f.early, *f.body)
             if isinstance(a.value, Call)
         } - {"sin", "cos", "reciprocal"}  # fmt: skip
@@ -401,19 +427,21 @@ class Lane:
 
     @property
     def sincos(self) -> str:
-        """The function for the sine and cosine of one angle."""
+        """The name of the C function for sine and cosine of one angle."""
         return f"{self.prefix}_sincos{self.accelerations.target.real.function_suffix}"
 
     @property
     def angle_count(self) -> str:
-        """The number of angles, in C: to whole registers where those take them together."""
+        """The number of angles as C text, padded to whole registers where four are computed at
+        once.
+        """
         n = len(self.accelerations.angles)
-        return str(four(n) if self.accelerations.across and self.name != "wide" else n)
+        return str(four(n) if self.accelerations.simd_angles and self.name != "wide" else n)
 
     @cached_property
     def all_in_one(self) -> CFunction:
-        """The accelerations with sines and signals, where those are not given."""
-        arguments = (self.out, *map(self.argument, self.there))
+        """The function for accelerations including signals and sines, where they are not given."""
+        arguments = (self.out, *map(self.argument, self.argument_names))
         called = self.padded or self.accelerations.long
         return CFunction(
             f"{self.prefix}_accelerations{self.end}", self.mask, arguments,
@@ -424,11 +452,11 @@ class Lane:
 
     @cached_property
     def configuration(self) -> Computed:
-        """What two configurations decide, printed for the lane of two."""
+        """The function for position-dependent terms at two configurations."""
         parts = self.accelerations.parts
         assert parts is not None
         out = c.filled(f"{self.prefix}_configuration", "k")
-        takes = [n for n in self.there if n in ("q", "s", "c")]
+        takes = [n for n in self.argument_names if n in ("q", "s", "c")]
         places = [c.member("k", n) for n in parts.handed]
         return self.computed(
             parts.configuration, "configurations", out, places, takes=takes, in_order=True,
@@ -437,12 +465,14 @@ class Lane:
 
     @cached_property
     def velocity(self) -> Computed:
-        """The accelerations at one of two points, from what the configurations decide."""
+        """The function for the accelerations at one of two points, from the position-dependent
+        terms.
+        """
         parts = self.accelerations.parts
         assert parts is not None
-        handed, form = frozenset(parts.handed), f"{c.member('k', '{}')}[point]"
-        known = c.given(f"{self.prefix}_configuration", "k")
-        extra = [(known, handed, form), (CArgument("int", "point"), handed, form)]
+        shared, form = frozenset(parts.handed), f"{c.member('k', '{}')}[point]"
+        argument = c.given(f"{self.prefix}_configuration", "k")
+        extra = [(argument, shared, form), (CArgument("int", "point"), shared, form)]
         doc = "The accelerations at point 0 or 1 of k."
         return self.computed(
             parts.velocity, "velocities", self.out, self.places, extra, doc=doc, in_order=True,

@@ -1,4 +1,4 @@
-"""Steps of the fast form that end on the constraints, over a lane."""
+"""Projection onto the constraints in optimised C, over a lane."""
 
 from __future__ import annotations
 
@@ -14,73 +14,78 @@ from eomc.program.program import TIME
 
 
 def view(functions: Functions, lane: Lane) -> Projection:
-    """The view of a lane."""
-    made, state = _correction(lane), {"q": "at", "qd": "moving"}
-    call = made.function.call(**state)
+    """Return the view of the projection over a lane."""
+    correction, state = _correction(lane), {"q": "at", "qd": "moving"}
+    call = correction.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
     sines = lane.accelerations.correction[1]
     return projection.view(
-        functions, made, projected(lane), call, terms, state, lane=lane.real.name, L=lane.end,
+        functions, correction, projected(lane), call, terms, state, lane=lane.real.name, L=lane.end,
         mask=lane.mask, extent=lane.extent, increments=True,
         sines=f"{lane.prefix}_sines{lane.end}" if sines else "",
-        sines_call=f"{lane.prefix}_sines_at{lane.end}(&own, at)" if sines and lane.alone else "",
+        sines_call=f"{lane.prefix}_sines_at{lane.end}(&own, at)"
+        if sines and lane.computes_own_sines else "",
         onto=onto(lane) if functions.swept and not lane.name else None,
     )  # fmt: skip
 
 
 def projected(lane: Lane) -> CFunction:
-    """What a step adds, so changed that it ends on the constraints."""
+    """Return the function that changes the increment of a step so that its end satisfies the
+    constraints.
+    """
     out = tuple(c.filled(lane.real.name, n) for n in "rv")
-    told = () if lane.name else (CArgument("int *", "singular"),)
+    singular_flag = () if lane.name else (CArgument("int *", "singular"),)
     return CFunction(
         f"{lane.prefix}_projected{lane.end}",
         lane.mask if lane.name else f"{lane.prefix}_status",
-        (*out, *map(lane.argument, _placed(lane)), *told),
+        (*out, *map(lane.argument, _arguments(lane)), *singular_flag),
         qualifier=lane.qualifiers[NOINLINE],
     )
 
 
 def ending(functions: Functions, lane: Lane, **passed: str) -> str:
-    """The call that ends a step on the constraints; "" where there are none."""
+    """Return the call that projects the end of a step; "" without constraints."""
     return projected(lane).call(**passed) if functions.projection else ""
 
 
 def onto(lane: Lane) -> CFunction:
-    """A stage moved onto the constraints, to first order."""
-    moved = tuple(c.filled(lane.real.name, n) for n in ("at", "moving"))
-    more = (n for n in _placed(lane, sines=False) if n in "tc")
+    """Return the function that projects a stage onto the constraints to first order."""
+    state = tuple(c.filled(lane.real.name, n) for n in ("at", "moving"))
+    others = (n for n in _arguments(lane, sines=False) if n in "tc")
     return CFunction(
-        f"{lane.prefix}_onto", "int", (*moved, *map(lane.argument, more)),
+        f"{lane.prefix}_onto", "int", (*state, *map(lane.argument, others)),
         qualifier=lane.qualifiers[NOINLINE],
     )  # fmt: skip
 
 
 def _correction(lane: Lane) -> Computed:
-    """What q and qd lack for the constraints to hold."""
+    """Return the function for the corrections of q and qd."""
     function = lane.accelerations.correction[0]
     places = [f"d[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
-        takes=_placed(lane),
+        takes=_arguments(lane),
     )  # fmt: skip
 
 
 def _rate_terms(lane: Lane) -> Computed | None:
-    """Rates of rows that corrections may leave out, and sizes of their terms."""
+    """Return the function for rates of constraints that corrections may drop, and sums of
+    |terms|.
+    """
     function = lane.target.program.functions.get("rate_terms")
     if function is None:
         return None
-    own = {n: c.member("c", n) for n in lane.accelerations.own}
+    parameters = {n: c.member("c", n) for n in lane.accelerations.parameter_names}
     places = [f"rates[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "rate_terms", c.filled(lane.real.name, "rates"), places, doc=RATE_TERMS,
-        takes=_placed(lane, sines=False), constants=own, inline=False,
+        takes=_arguments(lane, sines=False), constants=parameters, inline=False,
     )  # fmt: skip
 
 
-def _placed(lane: Lane, sines: bool = True) -> tuple[str, ...]:
-    """What constraints are read from: q, qd, s, t, c, as far as they are."""
+def _arguments(lane: Lane, sines: bool = True) -> tuple[str, ...]:
+    """Return the arguments that the constraints depend on, among q, qd, s, t, c."""
     timed = TIME in lane.target.program["projection"].uses
     known = sines and lane.accelerations.correction[1]
     names = ("q", "qd", *(["s"] if known else []), *(["t"] if timed else []), "c")
-    return tuple(n for n in lane.there if n in names)
+    return tuple(n for n in lane.argument_names if n in names)

@@ -1,4 +1,4 @@
-"""Methods of integration in the fast form: their views, and the calls in them."""
+"""Integration methods in optimised C: their views and calls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from eomc.program import two_point
 
 @dataclass(frozen=True)
 class Steppers:
-    """The methods of a scene. accelerations: what they integrate, one number at a time or wide."""
+    """The integration methods of a scene, with its accelerations."""
 
     accelerations: Accelerations
     functions: Functions
@@ -38,12 +38,12 @@ class Steppers:
 
     @cached_property
     def wide(self) -> Lane:
-        """The lane of a register."""
+        """The lane of a vector register."""
         return Lane(self.accelerations, "wide")
 
     @property
     def two_point(self) -> bool:
-        """Whether one trajectory goes by the two-point form."""
+        """Whether one trajectory uses the accelerations in two parts."""
         return self.accelerations.parts is not None
 
     @property
@@ -55,37 +55,37 @@ class Steppers:
         return few and s.target.real is DOUBLE and free
 
     def corrected(self, method: Method) -> bool:
-        """Whether a method hands its last sines on to the correction onto constraints."""
+        """Return True if a method passes its last sines to the projection."""
         s = self.accelerations
         return method is RK4 and self.functions.projection is not None and s.correction[1]
 
     @property
     def methods(self) -> tuple[Method, ...]:
-        """Those that the scene asks for."""
+        """The methods that the scene requests."""
         return tuple(METHODS[name] for name in self.accelerations.target.system.run.methods)
 
     @property
     def shared_signals(self) -> bool:
-        """Whether the signals are of time alone, so that stages share them."""
+        """Whether the signals depend on time only, so that stages share them."""
         target = self.accelerations.target
         return "signal" in target.program and not target.signal_state
 
     @property
     def given_signals(self) -> bool:
-        """Whether all that asks for accelerations has the signals already."""
+        """Whether all callers of the accelerations supply the signals."""
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
         return self.shared_signals and alone and not self.predicted
 
     def accelerate(self, lane: Lane, **passed: str) -> str:
-        """A call of the accelerations of a lane, with other expressions for some arguments."""
+        """Return a call of the accelerations of a lane, with some arguments replaced."""
         if self.accelerations.angles:
             passed = {"s": "NULL"} | passed
         return lane.all_in_one.call(**passed)
 
     @property
     def driven(self) -> dict[str, Any]:
-        """Whether steps read the time, inputs, and constants of the parameters."""
+        """View fields: whether steps read time, inputs and precomputed expressions."""
         target = self.accelerations.target
         return {
             "timed": target.driven, "inputs": bool(target.system.inputs),
@@ -93,34 +93,34 @@ class Steppers:
         }  # fmt: skip
 
     def looping(self, lane: Lane) -> dict[str, Any]:
-        """What templates with loops over coordinates name."""
+        """Return fields of views with loops over coordinates."""
         return self.functions.names | {"unroll": lane.unroll}
 
     def extended(self, lane: Lane) -> dict[str, Any]:
-        """And those with vectors of coordinates that accelerations take."""
+        """Return fields of views with vectors of coordinates."""
         return self.functions.names | {"extent": lane.extent}
 
     # what a step takes
 
     def stepping(self, lane: Lane) -> tuple[CArgument, ...]:
-        """q, qd, t, h, u and the constants: those that this scene has."""
+        """Return the arguments of a step that this scene has: q, qd, t, h, u, c."""
         real = self.accelerations.target.real.name
-        names = [n for n in lane.there if n != "s"]
-        found = [lane.argument(n) for n in names]
-        place = next((k for k, n in enumerate(names) if n in "uc"), len(names))
-        return (*found[:place], CArgument(real, "h"), *found[place:])
+        names = [n for n in lane.argument_names if n != "s"]
+        arguments = [lane.argument(n) for n in names]
+        position = next((k for k, n in enumerate(names) if n in "uc"), len(names))
+        return (*arguments[:position], CArgument(real, "h"), *arguments[position:])
 
-    def advanced(self, lane: Lane, name: str, *more: CArgument) -> CFunction:
-        """A function that computes what a step adds."""
+    def advanced(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
+        """Return a function that computes the increment of a step."""
         out = tuple(c.filled(lane.real.name, n) for n in "rv")
         return CFunction(
-            f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *more)
+            f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *extra)
         )
 
     # methods
 
     def rk4(self, lane: Lane) -> views.RungeKutta4:
-        """RK4 over a lane."""
+        """Return the view of RK4 over a lane."""
         s = self.accelerations
         double, one = s.target.real is DOUBLE, not lane.name
         two_point = one and self.two_point
@@ -138,7 +138,7 @@ class Steppers:
             source=RK4.source,
             stability=stability(RK4),
             angles=lane.angle_count if s.angles else "",
-            across=lane.across,
+            across=lane.simd_angles,
             sincos=lane.sincos,
             largest=s.target.literal(0.125 if double else 0.25),
             small=s.target.literal(0.015625 if double else 0.0625),
@@ -154,7 +154,7 @@ class Steppers:
         )
 
     def predictions(self) -> views.Predictions:
-        """The angles of the next step, predicted."""
+        """Return the view of predicted angles."""
         lane, angles = self.one, len(self.accelerations.angles)
         return views.Predictions(
             prefix=lane.prefix, real=lane.real.name, unroll=lane.unroll,
@@ -162,7 +162,7 @@ class Steppers:
         )  # fmt: skip
 
     def prediction(self) -> views.Predicted:
-        """The loop of RK4 whose angles are predicted."""
+        """Return the view of the loop of RK4 with predicted angles."""
         lane, s = self.one, self.accelerations
         signal = lane.signal.function if lane.signal else None
         shared = self.shared_signals
@@ -170,8 +170,8 @@ class Steppers:
         def stage(k: int) -> str:
             names = ["&w", *(a.name for a in self.stepping(lane))]
             named = {"q": "x.q", "qd": "x.qd", "u": "w.u[0]" if shared else "given"}
-            given = [str(k), "1", *(named.get(n, n) for n in names)]
-            return f"{lane.prefix}_rk4_stage({', '.join(given)})"
+            arguments = [str(k), "1", *(named.get(n, n) for n in names)]
+            return f"{lane.prefix}_rk4_stage({', '.join(arguments)})"
 
         def signalled(place: str, time: str) -> str:
             return signal.call(u=place, t=time) if signal and shared else ""
@@ -190,7 +190,7 @@ class Steppers:
         )
 
     def explicit(self, lane: Lane, m: Method) -> views.Explicit:
-        """An explicit method over a lane; RK4 has a text of its own."""
+        """Return the view of an explicit method over a lane, except RK4."""
         real = self.accelerations.target.real
 
         def total(row: Row) -> str:
@@ -205,7 +205,7 @@ class Steppers:
                 "" if start else literal(node, real), total(positions), total(velocities), call
             )
 
-        found = zip(m.c, m.a_squared, m.a, strict=True)
+        rows = zip(m.c, m.a_squared, m.a, strict=True)
         return views.Explicit(
             prefix=lane.prefix,
             real=real.name,
@@ -221,49 +221,49 @@ class Steppers:
             order=m.order,
             notes=m.notes,
             stability=stability(m),
-            stages=tuple(stage(k, *rest) for k, rest in enumerate(found)),
+            stages=tuple(stage(k, *rest) for k, rest in enumerate(rows)),
             position=total(m.b_a),
             velocity=total(rounded(m.b, real)),
         )
 
     def implicit(self, m: Method) -> CFunction:
-        """The step of an implicit method."""
+        """Return the function for a step of an implicit method."""
         lane = self.one
         state = c.filled(f"{lane.prefix}_{m.name}_state", "m")
-        more = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
-        made = self.advanced(lane, m.name, *more, state)
-        return c.static(made.name, f"{lane.prefix}_status", *made.arguments)
+        extra = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
+        prototype = self.advanced(lane, m.name, *extra, state)
+        return c.static(prototype.name, f"{lane.prefix}_status", *prototype.arguments)
 
     @property
     def newton_p(self) -> bool:
-        """Whether Newton's derivatives take the parameters."""
+        """Whether the derivatives for Newton's method depend on parameters."""
         slopes = self.slopes
         if slopes is None or not self.accelerations.target.needs_p:
             return False
-        read = {a.name for a in slopes.slopes.function.arguments}
-        return "p" in read or bool(slopes.signal_call) or self.follows
+        arguments_read = {a.name for a in slopes.slopes.function.arguments}
+        return "p" in arguments_read or bool(slopes.signal_call) or self.follows
 
     @property
     def follows(self) -> bool:
-        """Whether the signals answer the state."""
+        """Whether the signals depend on the state."""
         return self.accelerations.target.signal_state
 
     def gauss(self, m: Method) -> views.Gauss:
-        """A method of Gauss and Legendre by Newton's iteration."""
+        """Return the view of a Gauss method with Newton's method."""
         lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
         assert slopes is not None
         f = self.functions
         signal = f.signal if slopes.signal_call or self.follows else None
         state = lane.argument
-        taken = [n for n in ("t", "u") if n in lane.there]
+        time_and_inputs = [n for n in ("t", "u") if n in lane.argument_names]
         factor = c.static(
             f"{lane.prefix}_{m.name}_factor", "void",
             c.filled(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
-            *map(state, ("q", "qd")), *map(state, taken),
+            *map(state, ("q", "qd")), *map(state, time_and_inputs),
             *([f.argument("p")] if self.newton_p else []),
         )  # fmt: skip
-        read = {a.name for a in slopes.slopes.function.arguments}
-        read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
+        arguments_read = {a.name for a in slopes.slopes.function.arguments}
+        arguments_read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
         return views.Gauss(
             **self.extended(lane),
             **self.literals,
@@ -277,7 +277,9 @@ class Steppers:
             extrapolation=matrix(m.ahead, real),
             width=slopes.width,
             factor=factor,
-            factor_unread=tuple(a.name for a in factor.arguments[2:] if a.name not in read),
+            factor_unread=tuple(
+                a.name for a in factor.arguments[2:] if a.name not in arguments_read
+            ),
             signal_call=slopes.signal_call,
             follows=signal.call(u="near_u", q="near_q", qd="near_qd")
             if signal and self.follows
@@ -292,7 +294,7 @@ class Steppers:
 
     @property
     def literals(self) -> dict[str, str]:
-        """Numbers and functions of the library by the names that templates have for them."""
+        """View fields: literals and names of library functions."""
         real = self.one.real
         end = real.function_suffix
         return {
@@ -301,15 +303,17 @@ class Steppers:
         }  # fmt: skip
 
     def sweep(self, m: Method) -> CFunction:
-        """A sweep over the stages of a method, these in a lane each."""
+        """Return the function for one iteration over the stages of a method, one stage per lane
+        element.
+        """
         P = f"{self.one.prefix}_{m.name}"
         out = c.filled(f"{P}_stages", "b")
-        given = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
-        around = (*self.stepping(self.one), *self.functions.moves_stages)
-        return c.static(f"{P}_sweep", "int", out, *given, *around)
+        arguments = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
+        others = (*self.stepping(self.one), *self.functions.moves_stages)
+        return c.static(f"{P}_sweep", "int", out, *arguments, *others)
 
     def stages(self, m: Method) -> views.Stages:
-        """The accelerations at the stages of a method, and a sweep over them."""
+        """Return the view of the accelerations at the stages and one iteration over them."""
         lane, wide, real = self.one, self.wide, self.one.real
         fixed = m.name in lane.target.system.run.methods
 
@@ -339,7 +343,7 @@ class Steppers:
         )
 
     def sweeps(self, m: Method) -> views.Sweeps:
-        """A method of few sweeps."""
+        """Return the view of a method with a fixed number of iterations."""
         lane, real = self.one, self.one.real
         P = f"{lane.prefix}_{m.name}"
         state = c.filled(f"{P}_state", "m")
@@ -350,7 +354,7 @@ class Steppers:
         return views.Sweeps(
             **self.extended(lane),
             **self.literals,
-            # steps that five sweeps do not do are long, and err by more than this
+            # Steps that need more than five iterations are long, with errors above this value.
             enough=lane.target.literal(max(1e-8, real.epsilon)),
             loose=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
             inputs=bool(lane.target.system.inputs),
@@ -376,7 +380,7 @@ class Steppers:
 
 
 def stability(m: Method) -> str:
-    """Up to which step a method is stable."""
+    """Return the stability limits of a method as text."""
     undamped, decay = m.limits
     return f"h omega <= {undamped:.3g} undamped" + (
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."

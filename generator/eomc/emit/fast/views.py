@@ -1,4 +1,4 @@
-"""What the templates of the fast form of C ask for: one frozen view each, values only."""
+"""Views of the templates of optimised C: frozen dataclasses with values only."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from eomc.emit.plain.views import AnySource
 
 @dataclass(frozen=True)
 class Library:
-    """A function of the mathematics library over a lane. two: of two arguments.
+    """A function of the mathematics library over a lane. two: whether it has two arguments.
 
-    whole: of a lane as wide as AVX-512's registers, in an instruction; else "".
+    whole: a single AVX-512 instruction for it over a register, or "".
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What each derivative and output depends on: coordinates, velocities, inputs, the time."""
+"""Dependencies of derivatives and outputs on coordinates, velocities, inputs and time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ Names = frozenset[str]
 
 @dataclass(frozen=True)
 class Dependencies:
-    """Of a program's results, by the names of coordinates, velocities, inputs, parameters, time.
+    """Dependencies of a program's results, as names of coordinates, velocities, inputs, parameters,
+    time.
 
-    signals: whether the scene's signals may act in place of inputs, and bring what they read.
+    signals: whether the scene's signals may replace the inputs, which adds their dependencies.
     """
 
     program: Program
@@ -24,50 +25,55 @@ class Dependencies:
 
     @cached_property
     def known(self) -> Names:
-        """What an importer sets."""
+        """The names of variables that an importer sets."""
         s = self.program.system
         return frozenset(x.name for x in (*s.q, *s.qd, *s.u, *s.parameters)) | {TIME}
 
     @cached_property
     def accelerations(self) -> Sequence[Names]:
-        """Of each acceleration."""
+        """Dependencies of each acceleration."""
         return self._of("acceleration")
 
     @cached_property
     def outputs(self) -> Sequence[Names]:
-        """Of each output."""
+        """Dependencies of each output."""
         return self._of("outputs")
 
     @cached_property
     def events(self) -> Sequence[Names]:
-        """Of each event."""
+        """Dependencies of each event function."""
         return self._of("events")
 
     @cached_property
     def _signals(self) -> Mapping[str, Names]:
-        """What each input reads where it follows the scene's signal."""
+        """Dependencies of each input on the variables of the scene's signal for it."""
         names = [x.name for x in self.program.system.u]
         if not self.signals or "signal" not in self.program:
             return {}
         return dict(zip(names, read(self.program["signal"]), strict=True))
 
     def _of(self, name: str) -> Sequence[Names]:
-        """Of each result of a function, where there is that function."""
+        """Return the dependencies of each result of a function; [] where the program does not have
+        it.
+        """
         return [self._whole(x) for x in read(self.program[name])] if name in self.program else []
 
     def _whole(self, names: Names) -> Names:
+        """Return names with accelerations and signals replaced by their dependencies."""
         qdd = [x.name for x in self.program.system.qdd]
-        found = set(names)
-        for name, behind in zip(qdd, self.accelerations if names & {*qdd} else (), strict=False):
-            found |= behind if name in names else set()
-        for name, behind in self._signals.items():
-            found |= behind if name in found else set()
-        return frozenset(found) & self.known
+        result = set(names)
+        for name, dependencies in zip(
+            qdd, self.accelerations if names & {*qdd} else (), strict=False
+        ):
+            result |= dependencies if name in names else set()
+        for name, dependencies in self._signals.items():
+            result |= dependencies if name in result else set()
+        return frozenset(result) & self.known
 
 
 def read(function: Function) -> list[Names]:
-    """The names from outside that each result of a function is computed from."""
-    behind: dict[str, Names] = {}
+    """Return the names from outside that each result of a function is computed from."""
+    dependencies: dict[str, Names] = {}
     for a in (*function.early, *function.body):
-        behind[a.name] = frozenset().union(*(behind.get(n, {n}) for n in a.value.names))
-    return [behind.get(o.name, frozenset({o.name} - {""})) for o in function.outputs]
+        dependencies[a.name] = frozenset().union(*(dependencies.get(n, {n}) for n in a.value.names))
+    return [dependencies.get(o.name, frozenset({o.name} - {""})) for o in function.outputs]

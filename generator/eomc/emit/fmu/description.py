@@ -1,4 +1,4 @@
-"""modelDescription.xml of both versions: variables, units, what depends on what."""
+"""modelDescription.xml for both versions of FMI: variables, units and dependencies."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from eomc.scene.formulas import parse
 def view(
     target: Target, version: int, token: str, sources: Sequence[str]
 ) -> Description2 | Description3:
-    """The view for FMI 2 or 3. sources: the files to be compiled."""
+    """Return the view for FMI 2 or 3. sources: the files to compile."""
     s, known = target.system, variables(target)
-    behind = Dependencies(target.program, has_signals(target))
+    dependencies = Dependencies(target.program, has_signals(target))
     structure = _Structure(target, known, version)
     rates = [*zip(known.der_q, (frozenset({x.name}) for x in s.qd), strict=True)]
-    rates += zip(known.der_qd, behind.accelerations, strict=True)
+    rates += zip(known.der_qd, dependencies.accelerations, strict=True)
     outputs = [
         (v, frozenset({x.name})) for v, x in zip((*known.q, *known.qd), (*s.q, *s.qd), strict=True)
     ]
-    computed = [*zip(known.outputs, behind.outputs, strict=True)]
+    computed = [*zip(known.outputs, dependencies.outputs, strict=True)]
     names = {target.as_written(p.name): p.name for p in s.parameters}
     formulas = start_formulas(target)
     starts = [
@@ -58,32 +58,32 @@ def view(
     }
     if version == 2:
         return Description2(**common, indicators=len(known.indicators), sources=tuple(sources))
-    crossings = zip(known.indicators, behind.events, strict=True)
+    crossings = zip(known.indicators, dependencies.events, strict=True)
     return Description3(**common, crossings=structure.unknowns(crossings))
 
 
 class _Structure:
-    """Names of a program's values to references of variables."""
+    """Value references of variables by the names of a program's values."""
 
     def __init__(self, target: Target, known: Variables, version: int) -> None:
         s = target.system
-        found = {x.name: v for x, v in zip((*s.q, *s.qd), (*known.q, *known.qd), strict=True)}
-        found |= {x.name: v for x, v in zip(s.inputs, known.inputs, strict=True)}
+        by_name = {x.name: v for x, v in zip((*s.q, *s.qd), (*known.q, *known.qd), strict=True)}
+        by_name |= {x.name: v for x, v in zip(s.inputs, known.inputs, strict=True)}
         if version == 3:
-            found[TIME] = known.time
-        self._moving = {n: (v.reference,) for n, v in found.items()}
-        found |= {p.name: v for p, v in zip(s.parameters, known.parameters, strict=True)}
-        self._all: dict[str, tuple[int, ...]] = {n: (v.reference,) for n, v in found.items()}
+            by_name[TIME] = known.time
+        self._moving = {n: (v.reference,) for n, v in by_name.items()}
+        by_name |= {p.name: v for p, v in zip(s.parameters, known.parameters, strict=True)}
+        self._all: dict[str, tuple[int, ...]] = {n: (v.reference,) for n, v in by_name.items()}
         for i in s.inputs:  # which may follow their signals
             self._all[i.name] += tuple(v.reference for v in known.switches)
 
     def unknowns(
         self, pairs: Iterable[tuple[Variable, Names]], initial: bool = False
     ) -> tuple[Unknown, ...]:
-        """What depends on what; initial: before the start, when it does on parameters too."""
-        of = self._all if initial else self._moving
+        """Return the dependencies of variables. initial: before the start, including parameters."""
+        references = self._all if initial else self._moving
         return tuple(
-            Unknown(v.reference, tuple(sorted({r for n in names for r in of.get(n, ())})))
+            Unknown(v.reference, tuple(sorted({r for n in names for r in references.get(n, ())})))
             for v, names in pairs
         )
 
@@ -93,11 +93,11 @@ def _free(pairs: Iterable[tuple[str, str]]) -> Attributes:
 
 
 def _units(known: Variables) -> tuple[Described, ...]:
-    """Those that are used and whose meaning is plain."""
-    found = {v.unit: meaning for v in known if (meaning := units.parsed(v.unit)) is not None}
+    """Return the units that are used and that FMI can express."""
+    meanings = {v.unit: meaning for v in known if (meaning := units.parsed(v.unit)) is not None}
     return tuple(
         Described("Unit", _free([("name", text)]), _free(meaning.attributes))
-        for text, meaning in found.items()
+        for text, meaning in meanings.items()
     )
 
 

@@ -1,4 +1,4 @@
-"""What a unit's text means: its base units as FMI wants them."""
+"""Units of measurement in terms of FMI's base units."""
 
 from __future__ import annotations
 
@@ -51,19 +51,19 @@ _MOST = 20  # of an exponent
 
 @dataclass(frozen=True)
 class Meaning:
-    """factor times the product of BASE to the powers."""
+    """factor times the product of BASE to the given powers."""
 
     factor: float
     powers: tuple[int, ...]
 
     def times(self, other: Meaning, power: int) -> Meaning:
-        """This times another to a power."""
+        """Return this unit times a power of another."""
         powers = (a + power * b for a, b in zip(self.powers, other.powers, strict=True))
         return Meaning(self.factor * other.factor**power, tuple(powers))
 
     @property
     def attributes(self) -> tuple[tuple[str, str], ...]:
-        """Those of an element BaseUnit."""
+        """The attributes of the element BaseUnit."""
         named = [(b, str(n)) for b, n in zip(BASE, self.powers, strict=True) if n]
         return (*named, *([("factor", repr(self.factor))] if self.factor != 1 else []))
 
@@ -72,7 +72,7 @@ ONE = Meaning(1.0, _NONE)
 
 
 def parsed(text: str) -> Meaning | None:
-    """What a text such as "N m/rad" or "kg*m^2" means; None where that is not plain.
+    """Parse a unit such as "N m/rad" or "kg*m^2"; None where its meaning is not clear.
 
     >>> parsed("N m/rad").attributes
     (('kg', '1'), ('m', '2'), ('s', '-2'), ('rad', '-1'))
@@ -83,11 +83,11 @@ def parsed(text: str) -> Meaning | None:
     at = 0
     text = text.rstrip()
     while at < len(text):
-        found = _TOKEN.match(text, at)
-        if found is None:
+        match = _TOKEN.match(text, at)
+        if match is None:
             return None
-        tokens.append(found[1])
-        at = found.end()
+        tokens.append(match[1])
+        at = match.end()
     if not tokens:
         return None
     try:
@@ -100,7 +100,7 @@ def parsed(text: str) -> Meaning | None:
 
 
 def _product(left: Iterator[str], token: str) -> tuple[Meaning, str]:
-    """Factors up to a bracket or the end; a slash is for the next factor alone."""
+    """Parse factors up to a bracket or the end. A slash applies to the next factor only."""
     meaning, sign = ONE, 1
     while True:
         factor, token = _factor(left, token)
@@ -114,7 +114,7 @@ def _product(left: Iterator[str], token: str) -> tuple[Meaning, str]:
 
 
 def _factor(left: Iterator[str], token: str) -> tuple[Meaning, str]:
-    """A unit or what is in brackets, to its power; and the token behind it."""
+    """Parse a unit or a bracket with its power. Returns it and the next token."""
     if token == "(":
         meaning, end = _product(left, next(left))
         if end != ")":
@@ -138,6 +138,7 @@ def _factor(left: Iterator[str], token: str) -> tuple[Meaning, str]:
 
 
 def _word(word: str) -> Meaning:
+    """Return the meaning of a unit with an optional prefix. Raises ValueError."""
     if word in _OTHERS:
         return Meaning(*_OTHERS[word])
     if word in _SI:

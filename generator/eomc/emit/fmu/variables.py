@@ -92,60 +92,62 @@ def numeric_limits(one: Input) -> tuple[float | None, float | None]:
 
 
 def variables(target: Target) -> Variables:
-    """Those of a scene."""
+    """Return the variables of a scene."""
     s, written, next_reference = target.system, target.as_written, count().__next__
     of_parameters = start_formulas(target)
 
-    def made(name: str, causality: str, **more: str | int | bool) -> Variable:
+    def new_variable(name: str, causality: str, **more: str | int | bool) -> Variable:
         return Variable(name, next_reference(), causality, **more)  # type: ignore[arg-type]
 
     def state(name: str, start: float, unit: str, words: str) -> Variable:
         initial = "approx" if name in of_parameters else "exact"
-        return made(name, "output", initial=initial, start=repr(start), unit=unit, words=words)
+        return new_variable(
+            name, "output", initial=initial, start=repr(start), unit=unit, words=words
+        )
 
-    time = made(TIME_NAME, "independent", unit="s", words="time")
+    time = new_variable(TIME_NAME, "independent", unit="s", words="time")
     named = [(written(c.name), c) for c in s.coordinates]
     q = tuple(state(name, c.start, c.unit, c.note) for name, c in named)
     qd = tuple(
         state(f"{name}_dot", c.rate, rate(c.unit, 1), f"rate of {name}") for name, c in named
     )
     der_q = tuple(
-        made(f"der({x.name})", "local", initial="calculated", unit=v.unit, words=v.words,
+        new_variable(f"der({x.name})", "local", initial="calculated", unit=v.unit, words=v.words,
              derivative=x.reference)
         for x, v in zip(q, qd, strict=True)
     )  # fmt: skip
     der_qd = tuple(
-        made(f"der({v.name})", "local", initial="calculated", unit=rate(c.unit, 2),
+        new_variable(f"der({v.name})", "local", initial="calculated", unit=rate(c.unit, 2),
              words=f"acceleration of {name}", derivative=v.reference)
         for v, (name, c) in zip(qd, named, strict=True)
     )  # fmt: skip
     return Variables(
         time, q, qd, der_q, der_qd,
         inputs=tuple(
-            made(written(i.name), "input", start=repr(value), unit=i.unit, words=i.note,
+            new_variable(written(i.name), "input", start=repr(value), unit=i.unit, words=i.note,
                  **_range_of(i))
             for i, value in zip(s.inputs, input_starts(target), strict=True)
         ),
         outputs=tuple(
-            made(o.name, "output", initial="calculated", unit=o.unit, words=o.note)
+            new_variable(o.name, "output", initial="calculated", unit=o.unit, words=o.note)
             for o in s.outputs
         ),
         parameters=tuple(
-            made(written(p.name), "parameter", variability="tunable", initial="exact",
+            new_variable(written(p.name), "parameter", variability="tunable", initial="exact",
                  start=repr(p.value), unit=p.unit, words=p.note)
             for p in s.parameters
         ),
         energies=tuple(
-            made(f"energy.{name}", "local", initial="calculated", unit="J", words=words)
+            new_variable(f"energy.{name}", "local", initial="calculated", unit="J", words=words)
             for name, words in _ENERGIES.items()
         ),
         indicators=tuple(
-            made(f"indicator.{e.name}", "local", initial="calculated",
+            new_variable(f"indicator.{e.name}", "local", initial="calculated",
                  words=f"zero where event {e.name} happens")
             for e in s.events
         ),
         switches=tuple(
-            made(name, "parameter", variability="tunable", initial="exact", start="false",
+            new_variable(name, "parameter", variability="tunable", initial="exact", start="false",
                  boolean=True, words="whether the scene's signals act in place of the inputs")
             for name in ["inputs.follow_signals"] * has_signals(target)
         ),

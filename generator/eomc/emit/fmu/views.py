@@ -1,4 +1,4 @@
-"""What the templates of a unit of FMI ask for: one frozen view each, values only."""
+"""Views of the templates of FMUs: frozen dataclasses with values only."""
 
 from __future__ import annotations
 

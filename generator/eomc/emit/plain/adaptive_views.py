@@ -1,4 +1,4 @@
-"""What the templates of adaptive steps and events ask for, in both forms of C: a view each."""
+"""Views of the templates for adaptive steps and events, in both forms of C."""
 
 from __future__ import annotations
 
@@ -11,13 +11,22 @@ from eomc.emit.plain.parts import Named
 
 @dataclass(frozen=True)
 class AdaptiveTableau(Named):
-    """The numbers that both texts of adaptive steps have.
+    """Coefficients and constants of adaptive steps.
 
-    method: what C names begin with. powers: from accelerations at the stages, one a row, to their
-    polynomial's powers. most: sweeps of a step; anew: steps by Newton's method, before sweeps alone
-    are tried again. of_most, of_most_coarse: of the largest coordinate and velocity, in the
-    measures of all, and where rounding counts. still: how many of the last coordinates jumps alone
-    change; they have no scale.
+    Attributes
+    ----------
+    method
+        Prefix of the C names.
+    powers
+        Matrix from accelerations at the stages (rows) to coefficients of their polynomial.
+    most
+        Largest number of iterations over the stages.
+    anew
+        Steps by Newton's method before fixed-point iteration is tried again.
+    of_most, of_most_coarse
+        Least scale of coordinates and velocities, relative to the largest; for rounding errors.
+    still
+        Number of trailing coordinates that only jumps change, which have no scale.
     """
 
     method: str
@@ -38,17 +47,16 @@ class AdaptiveTableau(Named):
 
 @dataclass(frozen=True)
 class Adaptive(AdaptiveTableau):
-    """c/adaptive.c.jinja, which takes in four others, for both forms: tableau, functions, calls.
+    """c/adaptive.c.jinja and the four templates that it includes: a step with error control.
 
-    total: the sum of half[0], ... over half of the stages. lanes: before loops over stages. top:
-    from accelerations at the stages, one a row, to their polynomial's parts in the last four of
-    Legendre's; weights: to what a step adds to a position and a velocity.
-    project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
-    held: whether forces that change in time may hold all at rest; capped: what rounding makes then.
-    corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
-    ends: from accelerations at the stages to the ends of the polynomial through them; forces: the
-    accelerations at a state; slopes: their derivatives, by differences over `nudge`. eigenvalues,
-    to_parts, from_parts: of A, as Method.eigen has them.
+    total: the sum of half[0], ... over half of the stages. lanes: macro before loops over stages.
+    top: matrix from accelerations at the stages (rows) to the last four Legendre coefficients.
+    weights: matrix to the increments of position and velocity. project: the call that projects the
+    end of a step, given as an increment, or as a state with `whole`. held: whether time-dependent
+    forces may hold all bodies at rest; capped: the effect of rounding errors then. corners: whether
+    forces jump or have kinks; share: of the tolerance, for steps with them. ends: weights of the
+    values at both ends of a step. forces: accelerations at a state; slopes: their derivatives, by
+    finite differences with step `nudge`. eigenvalues, to_parts, from_parts: see `Method.eigen`.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -92,12 +100,12 @@ class Adaptive(AdaptiveTableau):
 
 @dataclass(frozen=True)
 class FixedSteps(Named):
-    """c/fixed_steps.c.jinja: steps of fixed size of a scene with events, and calls in them.
+    """c/fixed_steps.c.jinja: steps of fixed size with event detection.
 
-    fixed, at: the next step, and the state within the last one; step: the call of the method's own,
-    through a pointer; inside: that of the state within an adaptive step; forces_before,
-    forces_halfway, forces_behind: of the accelerations there. above: whether events are made of
-    friction that sticks.
+    fixed, at: the next step, and the state within the last one. step: the call of the method
+    through a function pointer. inside: the call for the state within an adaptive step.
+    forces_before, forces_halfway, forces_behind: calls of the accelerations at both ends and the
+    middle of a step. above: whether there are events of stick-slip friction.
     """
 
     TEMPLATE: ClassVar[str] = "c/fixed_steps.c"
@@ -121,13 +129,14 @@ class FixedSteps(Named):
 
 @dataclass(frozen=True)
 class Events(Named):
-    """c/events.c.jinja: functions that find events in an adaptive step, and calls in them.
+    """c/events.c.jinja: event detection in adaptive steps.
 
-    samples: the parts of a step at which events are looked at, nodes; slopes: of the polynomial
-    through values there. busy: the most events in one step; apart, near, close: parts of a step;
-    chance: of the time between jumps, below which the next one has come by chance. last: to the
-    last coefficients of the polynomial through values; told: what these may be of the largest
-    value, beyond which a step is halved, `halvings` times more than a step in `lately` at most.
+    samples, nodes: number and positions of evaluations in a step. slopes: matrix from values at the
+    nodes to derivatives. last: weights of the last Chebyshev coefficients. told: largest such
+    coefficient relative to the largest value; above it, a step is halved, at most `halvings` times
+    besides one step in `lately`. busy: largest number of events in a step. apart, near, close:
+    fractions of a step. chance: fraction of the time between jumps below which the next jump counts
+    as coincidental.
     """
 
     TEMPLATE: ClassVar[str] = "c/events.c"
@@ -189,7 +198,7 @@ class Events(Named):
 
 @dataclass(frozen=True)
 class Begun(Named):
-    """c/begun.c.jinja: events that happen as a motion begins, and calls in them."""
+    """c/begun.c.jinja: events at the start of a motion."""
 
     TEMPLATE: ClassVar[str] = "c/begun.c"
     function: CFunction
@@ -234,7 +243,7 @@ class AdaptiveRun(Named):
 
 @dataclass(frozen=True)
 class AdaptiveBatch:
-    """c/adaptive_batch.c.jinja: many, one after the other. alone: the call for one."""
+    """c/adaptive_batch.c.jinja: instances one after the other. alone: the call for one."""
 
     TEMPLATE: ClassVar[str] = "c/adaptive_batch.c"
     prefix: str

@@ -1,4 +1,4 @@
-"""What the templates of constraints ask for, in both forms of C: one frozen view each."""
+"""Views of the templates for constraints, in both forms of C."""
 
 from __future__ import annotations
 
@@ -11,16 +11,28 @@ from eomc.emit.plain.parts import Computed, Named
 
 @dataclass(frozen=True)
 class Projection:
-    """c/projection.c.jinja, for both forms of C: a step's end moved onto the constraints.
+    """c/projection.c.jinja: projection of a step's end onto the constraints.
 
-    L, lane, mask: of the lane, L "" for one number. increments: whether r, v are what a step adds.
-    near, apart: squares of parts of a coordinate, and of all, beyond which a correction is large.
-    rate_terms, rate_terms_call: of rows that may be left out, where there are; rows: their number;
-    loose, part: of the largest of their terms, and of a row's own, what its rate may be then.
-    little, slight: squares of parts of all coordinates and of all velocities, which corrections
-    near a singular position are below; rounded: of coordinates, where one may be rounding there.
-    sines, sines_call: their type where a caller may know them, and how they are had at `at`. onto:
-    of a stage, where sweeps may take it.
+    Attributes
+    ----------
+    L, lane, mask
+        Suffix of C names ("" for one number), type and failure type of the lane.
+    increments
+        Whether r and v are increments of a step.
+    near, apart
+        Squares of relative changes, of one and of all coordinates, above which a correction is
+        large.
+    rate_terms, rate_terms_call, rows
+        Rates of constraints that may be dropped, and their number.
+    loose, part
+        Largest rate of a dropped constraint, relative to the largest terms and to its own terms.
+    little, slight, rounded
+        Squares that bound corrections near a singular configuration, of coordinates and velocities,
+        and below which a correction of a coordinate may be rounding.
+    sines, sines_call
+        Type of sines that a caller may supply, and the call that computes them at `at`.
+    onto
+        The projection of a stage, for iterated stages.
     """
 
     TEMPLATE: ClassVar[str] = "c/projection.c"
@@ -54,14 +66,25 @@ class Projection:
 
 @dataclass(frozen=True)
 class Project(Named):
-    """c/project.c.jinja, for both forms of C: a state moved onto the constraints, and calls in it.
+    """c/project.c.jinja: projection of a state onto the constraints.
 
-    dependent: the part of a row's square below which it depends on others; small: of the square of
-    q, where a change is rounding; enough: where what rows lack is; loose: of the terms of a rate;
-    rounded: the same of rows and rates, where a state is left as it is; redundant: rows that the
-    others imply; weights: of rows, an initializer, where D alone is singular; sums: initializers of
-    sums of rows, which stand in the places of the rows `sum_places`. pinned: whether coordinates
-    may have neither inertia nor a row of positions.
+    Attributes
+    ----------
+    dependent
+        Fraction of a gradient's square below which a constraint depends on others.
+    small, enough
+        Squares of relative changes of q that are rounding errors, and of sufficiently small
+        residuals.
+    loose, rounded
+        Fractions of a rate's terms, and of residuals and rates below which the state is unchanged.
+    redundant
+        Constraints that others imply.
+    weights
+        Initialiser of the weights of constraints where D alone is singular.
+    sums, sum_places
+        Initialisers of sums of constraints, and the constraints that they replace.
+    pinned
+        Whether coordinates may have neither inertia nor a holonomic constraint.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"

@@ -1,4 +1,4 @@
-"""What views of both forms of C have in common."""
+"""Fields that views of both forms of C share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from eomc.emit.c_function import CFunction
 
 @dataclass(frozen=True)
 class Prefixed:
-    """What every template names: the scene's prefix, and the type of numbers."""
+    """Fields of all views: the scene's prefix and the C type of numbers."""
 
     prefix: str
     real: str
@@ -17,14 +17,14 @@ class Prefixed:
 
 @dataclass(frozen=True)
 class Named(Prefixed):
-    """And the prefix of macros and enumerators."""
+    """Fields of `Prefixed`, and the prefix of macros and enumerators."""
 
     PREFIX: str
 
 
 @dataclass(frozen=True)
 class Tableau(Named):
-    """And the coefficients of a method, as `coefficients.tableau` writes them."""
+    """Fields of `Named`, and the coefficients of a method, see `coefficients.tableau`."""
 
     c: tuple[str, ...]
     A: tuple[str, ...]
@@ -35,10 +35,16 @@ class Tableau(Named):
 
 @dataclass(frozen=True)
 class Computed:
-    """A function that is computed from the program.
+    """A C function that is generated from a function of the program.
 
-    parts: the static functions that it calls: pieces of a long one, or one column of a matrix.
-    values: the struct in which pieces hand values on. column_call: where it is a loop over columns.
+    Attributes
+    ----------
+    parts
+        Static functions that it calls: pieces of a long function, or one column of a matrix.
+    values
+        The struct with the values that pieces share.
+    column_call
+        The call for one column, in functions that loop over columns.
     """
 
     function: CFunction
@@ -50,6 +56,6 @@ class Computed:
 
     @property
     def text(self) -> str:
-        """All of it, where it is no loop over columns."""
+        """The text of all functions, except for loops over columns."""
         texts = (self.values, *(f.definition for f in self.parts), self.function.definition)
         return "\n\n".join(filter(None, texts))

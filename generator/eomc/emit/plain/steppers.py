@@ -1,4 +1,4 @@
-"""The plain form's linearization and methods of integration, and all of its files."""
+"""Portable C: linearization, integration methods and files."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from eomc.program.program import Program
 
 Show = Callable[[View], str]  # a view by its template
 
-SWEEPS = {True: 50, False: 60}  # at most, with Newton's method and without
+MAX_ITERATIONS = {True: 50, False: 60}  # over the stages, with Newton's method and without
 
 
 def files(
     program: Program, show: Show, real: Real | None = None, rooms: Sequence[int] = ()
 ) -> dict[str, str]:
-    """Header and source of the plain form by file name; real: other numbers than the scene's.
+    """Return header and source of portable C by file name.
 
-    rooms: those of `header`.
+    real: the type of numbers, the scene's by default. rooms: see `header`.
     """
     plain = of(program, real)
     name = plain.prefix
@@ -80,14 +80,14 @@ def header(
     rooms: Sequence[int],
     fast: bool = False,
 ) -> Header:
-    """The header's view. rooms: the numbers that each method's memory keeps in the fast form, and
-    that of adaptive steps behind.
+    """Return the view of the header.
 
-    The plain form has the room too, so that a program built with the one header runs with both.
+    rooms: the workspace size of each method in optimised C, and of adaptive steps. Portable C
+    reserves the same space, so that a program compiled with one header runs with both forms.
     """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
-    found = [*plain.evaluations, plain.acceleration]
+    functions = [*plain.evaluations, plain.acceleration]
     return Header(
         title=FreeText(s.title),
         stamp=tuple(heading.stamp(target)),
@@ -105,7 +105,7 @@ def header(
         parameters=parameters(plain),
         implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
         timed=target.driven,
-        functions=tuple(x.function for x in found),
+        functions=tuple(x.function for x in functions),
         linearization=slopes.linearization if slopes else None,
         project=plain.public.project if s.constraints else None,
         methods=tuple(
@@ -129,7 +129,7 @@ def header(
 
 
 def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) -> dict[str, Any]:
-    """What the views of both forms' sources have, but for their steppers."""
+    """Return the fields that the source views of both forms share, except for the methods."""
     target, s = functions.target, functions.target.system
     return {
         "title": FreeText(s.title),
@@ -151,37 +151,39 @@ def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) 
 
 
 def linearization(plain: Functions) -> Slopes | None:
-    """A_q, A_qd and B, where the program has them."""
+    """Return the view of A_q, A_qd and B; None where the program has none."""
     target = plain.target
     function = evaluations.source(target, "linearization")
     if function is None:
         return None
     NQ, inputs = plain.NQ, bool(target.system.inputs)
     width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
-    told, doc = sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
+    cost, doc = sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
     if "linearization" in target.program:
         slopes = plain.static(function, "slopes", "slopes", doc, fails=True)
     else:
         column = "[da/dq, da/dqd, da/du] times along."
         one = plain.static(function, "slopes_column", "column", column, fails=True)
         along = ("column", "along")
-        rest = tuple(a for a in one.function.arguments if a.name not in along)
-        made = replace(
+        arguments_ = tuple(a for a in one.function.arguments if a.name not in along)
+        loop_function = replace(
             one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
-            arguments=(c.filled(plain.real, "slopes"), *rest),
+            arguments=(c.filled(plain.real, "slopes"), *arguments_),
         )  # fmt: skip
-        slopes = Computed(made, (*one.parts, one.function), one.values, one.function.call())
-        told = f"By {width} columns, each: {told[0].lower()}{told[1:]}"
+        slopes = Computed(
+            loop_function, (*one.parts, one.function), one.values, one.function.call()
+        )
+        cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"
     arguments = plain.usual(*plain.state, "u", "p")
-    read = plain.read(function)
+    arguments_read = plain.read(function)
     reads_u = plain.reads_u(function) and plain.signal is not None
     return Slopes(
         **plain.names,
         inputs=inputs,
         width=width,
         slopes=slopes,
-        linearization=replace(plain.public.linearization, doc=(told,)),
-        unread=tuple(a.name for a in arguments if a.name not in read),
+        linearization=replace(plain.public.linearization, doc=(cost,)),
+        unread=tuple(a.name for a in arguments if a.name not in arguments_read),
         signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
         slopes_call=slopes.function.call(),
     )
@@ -191,12 +193,14 @@ def linearization(plain: Functions) -> Slopes | None:
 
 
 def _titled(m: Method) -> str:
-    """What a method is called, with its order."""
+    """Return the title of a method with its order."""
     return m.title if "order" in m.title else f"{m.title}, order {m.order}"
 
 
 def _about(m: Method) -> tuple[str, ...]:
-    """What a method is, where from, and up to which step: lines of a comment."""
+    """Return the description of a method, its reference and stability limits, as lines of a
+    comment.
+    """
     undamped, decay = m.limits
     stable = f"h omega <= {undamped:.3g} undamped" + (
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
@@ -210,7 +214,7 @@ def _about(m: Method) -> tuple[str, ...]:
 
 
 def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
-    """The view of the function that computes one step."""
+    """Return the view of one step."""
     if m.implicit:
         return _gauss(plain, m)
     accelerate, step = plain.acceleration.function.call, plain.public.step(m.name)
@@ -243,19 +247,20 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
 
 
 def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
-    """The step of an explicit method, inside of the public one where constraints have more to tell;
-    the call that ends it on these.
+    """Return the function for a step of an explicit method, and the call that projects its end.
+
+    With constraints, it is a static function that the public function calls.
     """
     step = plain.public.step(m.name)
     if not plain.projection:
         return step, ""
-    told = plain.projected.arguments[-1]
-    inner = c.static(f"{plain.prefix}_{m.name}", plain.status, *step.arguments, told)
+    singular_flag = plain.projected.arguments[-1]
+    inner = c.static(f"{plain.prefix}_{m.name}", plain.status, *step.arguments, singular_flag)
     return inner, plain.projected.call(t="t + h")
 
 
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
-    """What the implicit methods share."""
+    """Return the view of functions that implicit methods share."""
     real, accelerate = plain.target.real, plain.acceleration.function.call
     newton = any(m.newton for m in methods)
     return Implicit(
@@ -279,27 +284,27 @@ def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
 
 
 def _gauss(plain: Functions, m: Method) -> Gauss:
-    """A method of Gauss and Legendre."""
+    """Return the view of a Gauss method."""
     accelerate = plain.acceleration.function.call
     method = f"{plain.prefix}_{m.name}"
-    around = plain.usual(*plain.state, "h", "u", "p")
+    state_arguments = plain.usual(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
     onto = plain.moves_stages if m.sweeps else ()
     out = (c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
     a = c.given(plain.real, "a")
-    stages = c.static(f"{method}_evaluated", plain.status, *out, a, *around, *onto)
+    stages = c.static(f"{method}_evaluated", plain.status, *out, a, *state_arguments, *onto)
     matrix_out = (c.filled(plain.real, "M"), c.filled("int", "row"))
-    matrix_function = c.static(f"{method}_matrix", plain.status, *matrix_out, *around)
+    matrix_function = c.static(f"{method}_matrix", plain.status, *matrix_out, *state_arguments)
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
-    told = plain.projected.arguments[-1:] if plain.projection else ()
-    solve = c.static(method, plain.status, *one.arguments, count, *told)
+    singular_flag = plain.projected.arguments[-1:] if plain.projection else ()
+    solve = c.static(method, plain.status, *one.arguments, count, *singular_flag)
     return Gauss(
         **plain.names,
         title=m.title,
         method=method,
         newton=m.newton,
-        sweeps=SWEEPS[m.newton],
+        sweeps=MAX_ITERATIONS[m.newton],
         stages=m.stages,
         **tableau(m, plain.target.real),
         eps=plain.target.literal(plain.target.real.epsilon),
@@ -323,13 +328,13 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
 
 
 def _adaptive(plain: Functions) -> list[View]:
-    """Adaptive steps, where the scene asks for them."""
+    """Return the views of adaptive steps, where the scene requests them."""
     if plain.target.system.run.tolerance is None:
         return []
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
-    around = plain.usual(*plain.state, "h", "u", "p")
+    state_arguments = plain.usual(*plain.state, "h", "u", "p")
     values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
-    sweep = c.static(f"{method}_sweep", "int", *values, *around, *plain.moves_stages)
+    sweep = c.static(f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages)
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = Nodes(
         **plain.names,
@@ -344,17 +349,17 @@ def _adaptive(plain: Functions) -> list[View]:
         onto=plain.onto.call(t="t + c[i]*h") if plain.projection else "",
     )
     end = f"{c.member('x', 't')} + h"
-    ended = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
+    projection_call = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
     form = adaptive.SweepInterface(
-        around, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
-        project=ended if plain.projection else "", whole=True,
+        state_arguments, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
+        project=projection_call if plain.projection else "", whole=True,
     )  # fmt: skip
-    many = [adaptive.batch(plain)] if plain.target.system.run.batch else []
-    return [nodes, *events.views(plain, form), *many]
+    batch_views = [adaptive.batch(plain)] if plain.target.system.run.batch else []
+    return [nodes, *events.views(plain, form), *batch_views]
 
 
 def loop(plain: Functions, m: Method) -> Loop:
-    """The view of a method's step, run and batch."""
+    """Return the view of a method's step, run and batch."""
     NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)
     one = stepper(plain, m)

@@ -1,4 +1,4 @@
-"""What the templates of the plain form of C ask for: one frozen view each, values only."""
+"""Views of the templates of portable C: frozen dataclasses with values only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from eomc.emit.plain.parts import Computed, Named, Tableau
 
 @dataclass(frozen=True)
 class Indexed:
-    """A coordinate or an input: its enumerator, and unit and note."""
+    """A coordinate, input or output: enumerator, unit and note."""
 
     enum: str
     words: FreeText
@@ -38,10 +38,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """A method of integration in the header: step, run and what else the scene wants of it.
-
-    kept: the numbers that its memory has room for.
-    """
+    """A method in the header: step, run, batch and derivative. kept: the size of its workspace."""
 
     name: str
     title: str
@@ -55,10 +52,11 @@ class Declared:
 
 @dataclass(frozen=True)
 class AdaptiveDeclared:
-    """Adaptive steps in the header. memory: the type of what they keep, kept numbers of it.
+    """Adaptive steps in the header.
 
-    together: whether the fast form has many side by side. fixed: the type of fixed steps in which
-    events are seen, where there are events.
+    memory, kept: C type of the workspace and its length. together: whether optimised C steps many
+    instances in parallel. fixed: the function type of fixed steps with event detection, for scenes
+    with events.
     """
 
     title: str
@@ -100,7 +98,7 @@ class Header(Named):
 
 @dataclass(frozen=True)
 class AnySource(Named):
-    """A source of either form. slopes, steppers: the finished texts of other views."""
+    """Source of either form. slopes, steppers: rendered text of other views."""
 
     title: FreeText
     stamp: tuple[FreeText, ...]
