@@ -87,13 +87,17 @@ def sources(
 
 def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
     from eomc.derive import lagrange
-    from eomc.program import program, unreached
+    from eomc.program import program, unused_parameters
 
     if isinstance(system, (str, os.PathLike)):
         raise EomcError(f"give a System, such as eomc.read({str(system)!r})")
     system = _assembled(system)
     derived = program.build(lagrange.derive(system))
-    for problem in (*system.warnings, *program.inertia(derived), *unreached.parameters(derived)):
+    for problem in (
+        *system.warnings,
+        *program.inertia(derived),
+        *unused_parameters.parameters(derived),
+    ):
         if warn is not None:
             warn(problem)
     return derived

@@ -18,7 +18,7 @@ from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
 from eomc.program.manifold import Manifold, Place
-from eomc.program.walks import random_walk
+from eomc.program.manifold_sampling import random_walk
 from eomc.scene.read import parse
 
 NAMES = list(constrained.cases())

@@ -99,12 +99,12 @@ class Stepping:
         return f"{self.functions.prefix}_{METHOD.name}"
 
     @property
-    def rest(self) -> Sequence[CArgument]:
+    def constant_arguments(self) -> Sequence[CArgument]:
         """The arguments that are constant along a run."""
         return [a for a in self.form.around if a.name in "ucp"]
 
     @property
-    def held(self) -> CArgument:
+    def workspace(self) -> CArgument:
         """The workspace of a run."""
         return c.filled(memory(self.functions), "memory")
 
@@ -118,7 +118,7 @@ class Stepping:
         return CArgument(self.functions.real, name)
 
     @cached_property
-    def settle(self) -> CFunction:
+    def solve_stages(self) -> CFunction:
         """The function that solves for the accelerations at the stages of a step."""
         real = self.functions.real
         out = c.filled(f"{self.method}_stages", "a")
@@ -139,7 +139,7 @@ class Stepping:
         return bool(target.system.modes) and target.driven
 
     @cached_property
-    def capped(self) -> CFunction:
+    def rounding_cap(self) -> CFunction:
         """The function for the effect of rounding errors on the accelerations of a step."""
         real = self.functions.real
         values = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
@@ -163,22 +163,22 @@ class Stepping:
     @cached_property
     def step(self) -> CFunction:
         """The function for the next step."""
-        arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.rest)
+        arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
-        return c.static(f"{self.method}_adapted", status, self.state, *arguments, self.held)
+        return c.static(f"{self.method}_adapted", status, self.state, *arguments, self.workspace)
 
     @cached_property
-    def within(self) -> CFunction:
+    def interpolate(self) -> CFunction:
         """The function for the state within the last step."""
         out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.given(f"{self.method}_adaptive_state", "x")
-        arguments = (state, self.number("z"), self.number("tol"), *self.rest)
-        return c.static(f"{self.method}_inside", "void", *out, *arguments, self.held)
+        arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
+        return c.static(f"{self.method}_inside", "void", *out, *arguments, self.workspace)
 
     @property
-    def taken(self) -> Sequence[CArgument]:
+    def step_arguments(self) -> Sequence[CArgument]:
         """The constant arguments, and those that the public functions of steps take."""
-        rest = self.rest
+        rest = self.constant_arguments
         present = {a.name for a in rest}
         return [*rest, *(a for a in self.functions.usual("u", "p") if a.name not in present)]
 
@@ -186,15 +186,22 @@ class Stepping:
     def fixed(self) -> CFunction:
         """The function for the next step of fixed size."""
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
-        return c.static(f"{self.method}_fixed", status, self.state, *limits, *self.taken, self.held)
+        return c.static(
+            f"{self.method}_fixed",
+            status,
+            self.state,
+            *limits,
+            *self.step_arguments,
+            self.workspace,
+        )
 
     @cached_property
-    def at(self) -> CFunction:
+    def state_within(self) -> CFunction:
         """The function for the state within the last step, which may be of fixed size."""
         if not self.functions.target.system.events:
-            return self.within
-        own = self.within.arguments[: -len(self.rest) - 1]
-        return c.static(f"{self.method}_at", "void", *own, *self.taken, self.held)
+            return self.interpolate
+        own = self.interpolate.arguments[: -len(self.constant_arguments) - 1]
+        return c.static(f"{self.method}_at", "void", *own, *self.step_arguments, self.workspace)
 
 
 def tableau(stepping: Stepping) -> dict[str, Any]:
@@ -238,20 +245,20 @@ def steps(stepping: Stepping) -> Adaptive:
         weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
         timed=target.driven,
         held=stepping.may_rest,
-        capped=stepping.capped,
-        capped_now=stepping.capped.call(a="&a"),
+        capped=stepping.rounding_cap,
+        capped_now=stepping.rounding_cap.call(a="&a"),
         events=bool(target.system.events),
         begins="begins" in target.program,
         project=form.project,
         whole=form.whole,
-        settle=stepping.settle,
+        settle=stepping.solve_stages,
         sweep=form.sweep,
         step=stepping.step,
         start=form.start,
-        settled=stepping.settle.call(
+        settled=stepping.solve_stages.call(
             most=f"{target.literal(REJECT_AFTER_TWO)}*aim", cap="capped ? cap : 0", **references
         ),
-        within=stepping.within,
+        within=stepping.interpolate,
         corners=steep(target.system),
         longest=target.literal(MAX_TIME_SCALES),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
@@ -267,7 +274,7 @@ def steps(stepping: Stepping) -> Adaptive:
         to_parts=c.in_braces(numbers(row, real) for row in to_parts),
         from_parts=c.in_braces(numbers(row, real) for row in from_parts),
         forces_there=stepping.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
-        settled_within=stepping.settle.call(most=target.literal(1e30), cap="0", **references),
+        settled_within=stepping.solve_stages.call(most=target.literal(1e30), cap="0", **references),
     )
 
 
@@ -289,8 +296,8 @@ def fixed(stepping: Stepping) -> FixedSteps:
         jumps="jumps" in target.program,
         above="begins" in target.program,
         fixed=stepping.fixed,
-        at=stepping.at,
-        inside=stepping.within.call(),
+        at=stepping.state_within,
+        inside=stepping.interpolate.call(),
         step=functions.public.fixed_step.call(**at),
         forces_before=stepping.forces.call(f="before", **state),
         forces_halfway=stepping.forces.call(f="halfway", t="t + h/2", **at),
@@ -298,12 +305,12 @@ def fixed(stepping: Stepping) -> FixedSteps:
     )
 
 
-def busy(system: System) -> int:
+def max_events_per_step(system: System) -> int:
     """Return the number of events after which a step ends."""
     return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
-def keep(stepping: Stepping) -> CFunction:
+def row_storage(stepping: Stepping) -> CFunction:
     """Return the function that stores a state in a row."""
     arguments = (c.filled(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_kept", "void", tuple(arguments))
@@ -330,9 +337,9 @@ def run(
     functions, form = stepping.functions, stepping.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
-    store_row = keep(stepping)
+    store_row = row_storage(stepping)
     row_arguments = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
-    takes_p = "p" in {a.name for a in stepping.rest} or bool(
+    takes_p = "p" in {a.name for a in stepping.constant_arguments} or bool(
         form.compute_constants or happen or form.project
     )
 
@@ -356,7 +363,7 @@ def run(
         changed=changed,
         values=values,
         huge=target.literal(1e30),
-        busy=busy(target.system),
+        busy=max_events_per_step(target.system),
         anew=RETRY_AFTER,
         run=functions.public.adaptive(METHOD.name),
         advance=stepping.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
@@ -365,13 +372,13 @@ def run(
         restart=restart,
         row=store_row.call(q="x.q", qd="x.qd", **row_arguments),
         row_before=store_row.call(q="q_at", qd="qd_at", **row_arguments),
-        look=stepping.at.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
+        look=stepping.state_within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
         project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
         project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )
 
 
-def together(target: Target) -> bool:
+def steps_in_parallel(target: Target) -> bool:
     """Return True if optimised C steps many instances in parallel: small systems with smooth
     forces.
 
@@ -386,7 +393,7 @@ def together(target: Target) -> bool:
     )
 
 
-def alone(functions: Functions) -> str:
+def call_for_instance(functions: Functions) -> str:
     """Return the call for instance k of a batch."""
     NQ = functions.NQ
     rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
@@ -404,7 +411,7 @@ def batch(functions: Functions) -> AdaptiveBatch:
     return AdaptiveBatch(
         prefix=functions.prefix,
         batch=functions.public.adaptive_batch(METHOD.name),
-        alone=alone(functions),
+        alone=call_for_instance(functions),
         events=bool(functions.target.system.events),
     )
 

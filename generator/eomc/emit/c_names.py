@@ -12,7 +12,7 @@ from sympy import Symbol
 from eomc.derive.frames import wrenches
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Body, Real
-from eomc.emit.c_safe_names import may_be_enumerator_of_others
+from eomc.emit.c_identifiers import may_be_enumerator_of_others
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program.ir import Call, Function, rename

@@ -14,8 +14,8 @@ from eomc.emit.adaptive import (
     RECENT_STEPS,
     Stepping,
     SweepInterface,
-    busy,
     fixed,
+    max_events_per_step,
     run,
     steps,
 )
@@ -128,7 +128,7 @@ def _begun(stepping: Stepping, restart: CFunction) -> Begun:
     )
     arguments_taken = {a.name for f in (values, restart) for a in f.arguments}
     extra = [a for a in functions.usual("u", "p") if a.name in arguments_taken]
-    arguments = (stepping.state, *extra, *record, stepping.held)
+    arguments = (stepping.state, *extra, *record, stepping.workspace)
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
     return Begun(
         **functions.names,
@@ -162,15 +162,15 @@ def _events(stepping: Stepping) -> Events:
     )  # fmt: skip
     outputs = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
-    arguments = (stepping.state, *outputs, number("tol"), *stepping.taken, *record, stepping.held)
-    happened = c.static(f"{method}_happened", "int", *arguments)
+    rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
+    happened = c.static(f"{method}_happened", "int", stepping.state, *outputs, *rest)
     changed = c.static(f"{method}_changed", "int", stepping.state, *extra)
     calls = [*evaluated, *([public.project] if stepping.form.project else ())]
     taken_by_calls = {a.name for f in calls for a in f.arguments}
     after_event = [a for a in functions.usual("u", "p") if a.name in taken_by_calls]
     restart = c.static(
         f"{method}_restarted", functions.status, stepping.state, number("reached"), *outputs[1:],
-        *(after_event if jumps else ()), *([stepping.held] if jumps else []),
+        *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}
     within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
@@ -186,8 +186,8 @@ def _events(stepping: Stepping) -> Events:
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
         above=above,
         jumps=jumps,
-        busy=busy(system),
-        together=EVENTS_PER_STEP + 4 * (busy(system) - EVENTS_PER_STEP),
+        busy=max_events_per_step(system),
+        together=EVENTS_PER_STEP + 4 * (max_events_per_step(system) - EVENTS_PER_STEP),
         apart=target.literal(difference),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
@@ -204,7 +204,7 @@ def _events(stepping: Stepping) -> Events:
         cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
         look_before=looked.call(g="value", z=f"z - {target.literal(difference / 2)}"),
         look_behind=looked.call(g="value", z=f"z + {target.literal(difference / 2)}"),
-        inside=stepping.at.call(),
+        inside=stepping.state_within.call(),
         values_there=values.call(events="value", **within),
         values_end=values.call(events="value", t=now["t"]),
         changed=changed,

@@ -22,8 +22,8 @@ from eomc.base.texts import name as plain
 from eomc.emit import embedding, package, selftest, views
 from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_function import narrowed
+from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.fast import files as fast
 from eomc.emit.fast import views as fast_views
 from eomc.emit.fmu import files as fmu

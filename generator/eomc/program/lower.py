@@ -1,6 +1,4 @@
-"""Lowering from a tape to the intermediate representation: simplify, count operations and name
-values.
-"""
+"""Lowering from a tape to the intermediate representation: simplify, count and name values."""
 
 from __future__ import annotations
 
@@ -12,9 +10,9 @@ from sympy import Expr, S, Symbol
 
 from eomc.derive.atoms import split
 from eomc.derive.tape import Stage, Tape
-from eomc.program.draft import ScheduleBuilder
+from eomc.program.common_subexpressions import reduce_operations
 from eomc.program.ir import Assignment, Call, Cost, Function, Operand, Product, Sum, Value, rename
-from eomc.program.tidy import tidy
+from eomc.program.schedule_builder import ScheduleBuilder
 
 
 def lower(
@@ -41,7 +39,7 @@ def lower(
     for symbol in tape.live(ends):
         work.take(symbol)
     operands = [work.operand(atom) for atom in ends]
-    tidy(work, operands)
+    reduce_operations(work, operands)
     assignments = work.assignments(operands)
     for o, label in zip(operands, labels, strict=False):
         if o.coefficient == 1 and o.name in work.values:

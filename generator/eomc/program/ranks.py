@@ -17,7 +17,7 @@ import numpy as np
 
 from eomc.program.interpret import context
 from eomc.program.manifold import NO_MASS, RANK_TOLERANCE, Frame, Manifold, Place, Vector
-from eomc.program.walks import random_walk, trace_branch
+from eomc.program.manifold_sampling import random_walk, trace_branch
 
 SAMPLE_COUNT = 12  # configurations besides the start
 # Fewer samples suffice for many constraints whose rank is full at the start.

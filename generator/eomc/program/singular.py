@@ -13,7 +13,7 @@ import numpy as np
 from eomc.model import discrete, sticking
 from eomc.model.system import System
 from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
-from eomc.program.walks import step_on_manifold, trace_branch
+from eomc.program.manifold_sampling import step_on_manifold, trace_branch
 
 MAX_CONFIGURATIONS = 120  # in each direction from the start
 MAX_STEP = 0.1  # between configurations, in the units of the coordinates

@@ -31,8 +31,8 @@ from eomc import pipeline
 from eomc.base.errors import EomcError, FolderError
 from eomc.derive import lagrange
 from eomc.emit.c_expression import QUAD
+from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
 from eomc.emit.render import show

@@ -32,9 +32,9 @@ def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
         accelerate=steppers.accelerate(wide, a="f", **here, u="given", c=f"&{c.member('x', 'c')}"),
         forces=stepping.forces.call(f="f", q="s.q", qd="s.qd", t="s.t", u="given"),
         batch=steppers.functions.public.adaptive_batch(m.name),
-        alone=adaptive.alone(steppers.functions),
-        kept=adaptive.keep(stepping).call(q="s.q", qd="s.qd"),
-        look=stepping.within.call(
+        alone=adaptive.call_for_instance(steppers.functions),
+        kept=adaptive.row_storage(stepping).call(q="s.q", qd="s.qd"),
+        look=stepping.interpolate.call(
             q_at="q_row", qd_at="qd_row", x="&s", u="given", memory="memory + k",
             z="(times[kept[k]] - s.from - s.from_rest)/s.size",
         ),

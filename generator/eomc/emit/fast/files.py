@@ -102,7 +102,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
         needed_functions = (
             LANE_FUNCTIONS & set(steppers.one.calls) if name in ("wide", "two") else frozenset()
         )
-        selects = bool(needed_functions) or (name == "wide" and adaptive.together(target))
+        selects = bool(needed_functions) or (name == "wide" and adaptive.steps_in_parallel(target))
         texts += [("lanes/select.h", name, width)] * selects
         texts += [(f"lanes/exp{end}.h", name, width)] * bool(needed_functions)
         texts += [(f"lanes/tanh{end}.h", name, width)] * ("tanh" in needed_functions)
@@ -207,7 +207,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
 def _library_text(lane: Lane, show: Show) -> str:
     """Return the functions of the mathematics library over a lane of several numbers."""
     names = set(lane.calls) - LANE_FUNCTIONS
-    if lane.name == "wide" and adaptive.together(lane.accelerations.target):
+    if lane.name == "wide" and adaptive.steps_in_parallel(lane.accelerations.target):
         names.add("sqrt")
     return show(
         views.LibraryText(
@@ -284,7 +284,7 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
             yield show(steppers.stages(adaptive.METHOD))
         yield from map(show, events.views(steppers.functions, _adaptive(steppers)))
         if run.batch:
-            side_by_side = adaptive.together(steppers.accelerations.target)
+            side_by_side = adaptive.steps_in_parallel(steppers.accelerations.target)
             batch_view = (
                 adaptive_lanes.view(steppers, _adaptive(steppers)) if side_by_side else None
             )

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from eomc.base import resources
 from eomc.emit import c_function
 from eomc.emit.c_expression import REALS
+from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
-from eomc.emit.c_safe_names import rename_for_c
 from eomc.emit.fmu import description, scene
 from eomc.emit.fmu.views import BuildDescription, View
 from eomc.emit.plain import steppers

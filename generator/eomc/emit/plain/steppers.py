@@ -121,10 +121,10 @@ def header(
             rooms[-1] or adaptive.workspace_size(s, len(s.coordinates)),
             plain.public.adaptive(adaptive.METHOD.name),
             plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
-            adaptive.together(target),
+            adaptive.steps_in_parallel(target),
             plain.public.fixed_type if s.events else None,
         ) if s.run.tolerance else None,
-        busy=adaptive.busy(s),
+        busy=adaptive.max_events_per_step(s),
     )  # fmt: skip
 
 

@@ -11,14 +11,14 @@ from sympy import Expr, S
 
 from eomc.derive.atoms import is_negative
 from eomc.derive.tape import Stage
-from eomc.program.draft import ScheduleBuilder
 from eomc.program.ir import Operand, Product, Sum
+from eomc.program.schedule_builder import ScheduleBuilder
 
 Term = tuple[Expr, str]  # (weight, name)
 _Pair = tuple[str, str, Expr]  # (name, name, ratio of the second weight to the first)
 
 
-def tidy(d: ScheduleBuilder, ends: list[Operand]) -> None:
+def reduce_operations(d: ScheduleBuilder, ends: list[Operand]) -> None:
     """Reduce the operations of a function without changing its results."""
     _scale(d, ends)
     d.drop(ends)
