@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from conftest import tiers
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, SceneError
 from eomc.cli.main import main
 from eomc.model import kinematics, mobility
 from eomc.model.from_scene import from_scene
@@ -438,7 +438,8 @@ def warnings(written):
     return assembled(from_scene(parse(written))).warnings
 
 
-def test_a_loop_that_is_closed_by_another_turn_is_told():
+def test_a_loop_is_closed_by_the_rotation_that_is_meant():
+    """From 2.9 it was closed half a turn off, where its rows hold too, with a warning."""
     written = (
         'eomc = 1\nname = "welded"\ngravity = [0, -9.81]\n[coordinates]\n'
         "x = { guess = true }\ny = { guess = true }\n"
@@ -448,8 +449,25 @@ def test_a_loop_that_is_closed_by_another_turn_is_told():
         + '[[loop]]\nname = "seam"\njoint = "weld"\nbodies = ["arm", "plate"]\n'
         "points = [[1, 0], [0, 0]]\n"
     )
-    told = {
-        angle: [w.key for w in warnings(written.replace("ANGLE", angle)) if w.severity == "warning"]
-        for angle in ("2.9", "0.9")
-    }
-    assert told == {"2.9": ["loop.seam"], "0.9": []}
+    for angle in ("2.9", "0.9"):
+        made = assembled(from_scene(parse(written.replace("ANGLE", angle))))
+        assert [w.key for w in made.warnings if w.severity == "warning"] == []
+        assert made.coordinates[2].start == pytest.approx(0.2, abs=1e-14)
+    held = written.replace("ANGLE, guess = true", "ANGLE").replace("ANGLE", "3.2")
+    with pytest.raises(SceneError, match=r"with a = 3\.2, b = 0\.2 held: a would have to be 0\.2"):
+        assembled(from_scene(parse(held)))
+
+
+def test_a_loop_that_stands_in_a_wrong_rotation_wherever_it_moves_is_refused():
+    """Its rows of axes are zero all the same, and left out."""
+    written = (
+        'eomc = 1\nname = "reversed"\ngravity = [0, 0, -9.81]\n[coordinates]\n'
+        "x = {}\ny = {}\na = {}\n" + body("plate", "planar", "x y a") + '[[loop]]\nname = "pin"\n'
+        'bodies = ["world", "plate"]\npoints = [[0, 0, 0], [0, 0, 0]]\n'
+    )
+    for rest in (
+        'joint = "revolute"\naxis = [[0, 0, 1], [0, 0, -1]]',
+        'joint = "weld"\nrotation = [["x", "pi"]]',
+    ):
+        with pytest.raises(SceneError, match=r"loop\.pin: can't close as is meant"):
+            assembled(from_scene(parse(written + rest)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 import sympy
 from conftest import tiers
+from scipy.spatial.transform import Rotation
 
 from eomc.base.errors import SceneError
+from eomc.model import loops
 from eomc.model.from_scene import from_scene
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
@@ -500,3 +503,72 @@ def test_rounding_is_that_of_the_terms_and_the_intermediate_values() -> None:
     assert found == pytest.approx(expected, rel=0.01)
     nowhere = Manifold(scene("x = {}", 'r = "log(x)"'))
     assert nowhere.rounding(np.zeros(1), np.zeros(1), 0.0) == [0.0]
+
+
+FREE = """eomc = 1
+name = "free_body"
+gravity = [0, 0, -9.81]
+[coordinates]
+x = {}
+y = {}
+z = {}
+yaw = {}
+pitch = {}
+roll = {}
+[[body]]
+name = "a"
+joint = "free"
+coordinates = ["x", "y", "z", "yaw", "pitch", "roll"]
+mass = 1
+center = [0.1, 0, 0]
+inertia = [0.1, 0.2, 0.25]
+[[loop]]
+name = "pin"
+bodies = ["world", "a"]
+points = [[0, 0, 1], [0.1, 0, 0]]
+"""
+
+
+def welded(axis: Sequence[float], angle: float) -> str:
+    """The free body welded to the world, turned by an angle about an axis."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis) * np.sin(angle / 2)
+    w = np.cos(angle / 2)
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = np.arcsin(2 * (w * y - x * z))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return f'{FREE}joint = "weld"\nrotation = [["z", {yaw}], ["y", {pitch}], ["x", {roll}]]\n'
+
+
+@pytest.mark.parametrize(
+    ("degrees", "axis"),
+    [
+        (70, (1, 1, 1)), (90, (1, 0, 0)), (180, (1, 0, 0)),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [
+                (90, (0, 0, 1)), (90, (1, 2, 3)), (150, (1, 2, -1)), (180, (0, 0, 1)),
+                (180, (0, 1, 0)), (180, (-1, 2, 0.3)),
+            ]
+        ),
+    ],
+)  # fmt: skip
+def test_a_weld_is_closed_in_its_one_orientation(degrees: float, axis: Sequence[float]) -> None:
+    """It was refused at a quarter turn, and closed in a wrong rotation from far away."""
+    made = assembled(from_scene(parse(welded(axis, np.radians(degrees)))))
+    q = start_of(made)[0]
+    assert loops.find_wrong_rotations(made)(q.tolist(), 0.0, {}) == []
+    turned = Rotation.from_euler("ZYX", q[3:]).as_quat()
+    expected = Rotation.from_rotvec(np.radians(degrees) * np.array(axis) / np.linalg.norm(axis))
+    assert abs(turned @ expected.as_quat()) == pytest.approx(1, abs=1e-14)
+
+
+def test_a_hinge_whose_axes_are_far_apart_is_closed_with_axes_alike() -> None:
+    text = f'{FREE}joint = "revolute"\naxis = [[0, 0, 1], [0.95, 0, -0.31]]\n'
+    made = assembled(from_scene(parse(text)))
+    assert loops.find_wrong_rotations(made)(start_of(made)[0].tolist(), 0.0, {}) == []
+
+
+def test_a_start_at_which_angles_are_singular_is_named() -> None:
+    """It was told to give what moves a mass."""
+    said = refusal(from_scene(parse(welded([0, 1, 0], np.pi / 2))))
+    assert "the mass matrix is singular, though it is not nearby" in said and "quaternion" in said

@@ -59,6 +59,8 @@ class Constraints:
         For each equation, the pivot below which its gradient vanishes in this configuration.
     switched : frozenset of int
         The constraints that hold in some modes only.
+    rotation_errors : tuple of (Expr, Expr)
+        Of each constraint that has one, its rotation error and cos(a/2)^2.
     """
 
     values: Vector
@@ -72,6 +74,7 @@ class Constraints:
     weights: Vector = ()
     pivot_limits: Vector = ()
     switched: frozenset[int] = frozenset()
+    rotation_errors: tuple[tuple[Expr, Expr], ...] = ()
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
@@ -100,6 +103,7 @@ def constraints(system: System, e: Energies) -> Constraints | None:
         # the gradient of a sum of constraints is of order 1
         tuple(sympy.Rational(_number_of(row, weights)) for row in solved if weights),
         switched=frozenset(k for k, c in enumerate(system.constraints) if c.switched),
+        rotation_errors=tuple(e.rotation_errors),
     )  # fmt: skip
     tolerance = ZERO_GRADIENT_TOLERANCE[system.run.real]
     A = jacobian(tape, rows)

@@ -28,6 +28,7 @@ class Energies:
     points: dict[Symbol, Expr]  # velocity w of a point -> its position y
     applied: list[tuple[Expr, Expr]]  # (velocity of a point, force applied there)
     rows: list[Expr]  # residuals of the constraints
+    rotation_errors: list[tuple[Expr, Expr]]  # of the constraints that have one
 
 
 def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
@@ -87,7 +88,7 @@ def energies_on_tape(
     formulas += [row.formula for row in system.constraints]
     for defined, expr in needed(system.definitions, formulas):
         definitions[defined] = tape.named(value(expr), defined.name)
-    return Energies(
+    energies = Energies(
         tape,
         value(kinetic),
         value(potential),
@@ -98,7 +99,15 @@ def energies_on_tape(
         points,
         [(value(v), value(force)) for v, force in applied],
         [value(row.formula) for row in system.constraints],
+        [],
     )
+    errors = [c.rotation_error for c in system.constraints if c.rotation_error is not None]
+    # last, since no other function needs their definitions
+    for defined, expr in needed(system.definitions, [x for pair in errors for x in pair]):
+        if defined not in definitions:
+            definitions[defined] = tape.named(value(expr), defined.name)
+    energies.rotation_errors += [(value(error), value(half)) for error, half in errors]
+    return energies
 
 
 def _position(system: System, derivative: dot) -> Expr:

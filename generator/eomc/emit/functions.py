@@ -30,6 +30,10 @@ from eomc.program.program import Program
 
 STATE = ("q", "qd")
 READ = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
+ROTATION_ERRORS = (
+    "2 tan(a/2) n along axes of loops, whose second frames are out by angles a about n, then "
+    "cos(a/2)^2 of each, then the derivatives of the first along q, by rows."
+)
 RATE_TERMS = "Rates of rows that may be left out, then the sums of their terms' sizes."
 MAX_UNCOMMENTED_LINES = 16  # statements without comments between stages
 
@@ -364,6 +368,23 @@ class Functions:
         if function is None:
             return None
         return self.static(function, "projection", "d", sentence(function), fails=True)
+
+    @cached_property
+    def rotation_errors(self) -> Computed | None:
+        """By what rotations loops are not closed, with the slopes; static."""
+        function = self.target.program.functions.get("rotation_errors")
+        if function is None:
+            return None
+        return self.static(function, "rotation_errors", "errors", ROTATION_ERRORS)
+
+    @cached_property
+    def rotated(self) -> CFunction | None:
+        """What puts rotation vectors in the place of rows of axes; static."""
+        if self.rotation_errors is None:
+            return None
+        read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]
+        out = (c.filled(self.real, "lack"), c.filled(self.real, "A"))
+        return c.static(f"{self.prefix}_rotated", "void", *out, *read)
 
     @cached_property
     def rate_terms(self) -> Computed | None:

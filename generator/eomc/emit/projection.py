@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import accumulate
 
 from eomc.emit.c_function import CFunction, in_braces
 from eomc.emit.c_names import Target
@@ -17,6 +18,8 @@ SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 LEFT_OUT = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
 COUPLING_ROUNDINGS = 30  # error of the rates, in units of rounding, after correcting q and qd
 ZERO_SQUARE = 1e-12  # a coordinate counts as 0 if its square is below this part of the sum of all
+SETTLED = 1e-14  # of the squared distance to the nearest state: the square of the last change
+STARTS = 16  # random starts, if the search from a state does not converge
 
 
 def near(target: Target) -> float:
@@ -98,6 +101,8 @@ def project(functions: Functions) -> Project:
     rows = target.system.constraints
     sums = closure.sums if closure else ()
     summed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
+    errors, rotated = functions.rotation_errors, functions.rotated
+    rotations = target.system.rotations if errors else ()
     return Project(
         **functions.names,
         fabs=f"fabs{end}",
@@ -122,4 +127,15 @@ def project(functions: Functions) -> Project:
         ),
         pinned=bool(weights) and not all(row.holonomic for row in rows),
         tiny=target.literal(1e-30),
+        errors=errors,
+        error_rows="{ " + ", ".join(str(k) for rows in rotations for k in rows) + " }",
+        error_ends=tuple(accumulate(map(len, rotations))),
+        rotated=rotated,
+        call_rotated=rotated.call(q="at", A="A") if rotated else "",
+        call_turn=rotated.call(q="at", A="0") if rotated else "",
+        atan=f"atan{end}",
+        searched=any(row.holonomic and row.loop for row in rows),
+        starts=STARTS,
+        settled=target.literal(SETTLED),
+        half_turn=target.literal(float(f"{eps**0.5:.0e}")),
     )

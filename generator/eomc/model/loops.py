@@ -9,17 +9,22 @@ a row is one of
   (p.p - l^2)/2 = 0: the points stay l apart.
 Where the second body's point moves by dp and its frame rotates by dr, these change by dp.e, dp.u,
 dr.(b x a) and dp.p: each multiplier times what stands beside dp is a force on the second body at
-its point, beside dr a moment. The first body feels the opposite, at the same place. Rows a.b = 0
-hold after some other turns too: a reaction's branches are 1 where the joint is closed as is meant,
-and one of them is 0 or -1 elsewhere.
+its point, beside dr a moment. The first body feels the opposite, at the same place.
+
+Rows a.b = 0 hold after some other rotations too, and have no slope a quarter turn off. So each row
+of axes has its component of 2 tan(a/2) n besides, where the second frame is out by an angle a about
+n: of rotation matrices R, 2 (R_zy - R_yz, ...)/(1 + tr R). It has one zero and a slope everywhere
+but at half a turn. A reaction's branches are 1 where the joint is closed as is meant, and one of
+them is 0 or -1 elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from sympy import Expr, Float, S
+import sympy
+from sympy import Expr, S
 
 from eomc.base.spatial import apply, cross, dot, plus, product, scaled, transposed
 from eomc.model import exact
@@ -39,11 +44,15 @@ class End:
 
 @dataclass(frozen=True)
 class _Pull:
-    """A row, and what a multiplier of one does to the second body: a force, a moment."""
+    """A row, and what a multiplier of one does to the second body: a force, a moment.
+
+    rotation_error: as of a constraint.
+    """
 
     row: Expr
     force: Vector = ZERO
     moment: Vector = ZERO
+    rotation_error: tuple[Expr, Expr] | None = None
 
 
 @dataclass
@@ -67,7 +76,7 @@ def close(
     R = (product(first.R, turned), second.R)
     p = plus(second.point, scaled(first.point, S.NegativeOne))
     kinds = loop.rows(plane)
-    pulls = {**_of_points(p, length), **dict(_of_frames(*R))}
+    pulls = {**_of_points(p, length), **dict(_of_frames(*R, plane=plane))}
     if loop.axes:
         pulls |= _of_axes(loop.axes, plane, (first.R, second.R), p)
     made, force, moment = list[Constraint](), ZERO, ZERO
@@ -75,6 +84,7 @@ def close(
         pull = pulls[kind]
         unit = {"length": "m^2"}.get(kind, "m" if kind in "xyzuv" else "")
         row = Constraint(name, pull.row, True, unit, loop.note, loop.name)
+        row = replace(row, rotation_error=pull.rotation_error)
         made.append(row)
         force = plus(force, scaled(pull.force, row.multiplier))
         moment = plus(moment, scaled(pull.moment, row.multiplier))
@@ -100,25 +110,34 @@ def _of_axes(
     """Rows of an axis of each body."""
     u, v, a = (apply(R[0], axis) for axis in across(axes[0], plane))
     b = apply(R[1], _unit(axes[1]))
+    half = (1 + dot(a, b)) / 2
     return {
         "u": _Pull(dot(p, u), force=u),
         "v": _Pull(dot(p, v), force=v),
-        "ru": _at_right_angles(scaled(v, S.NegativeOne), b),
-        "rv": _at_right_angles(u, b),
+        "ru": _at_right_angles(scaled(v, S.NegativeOne), b, (-dot(v, b) / half, half)),
+        "rv": _at_right_angles(u, b, (dot(u, b) / half, half)),
         "cross": _at_right_angles(a, b),
     }
 
 
-def _of_frames(first: Matrix, second: Matrix) -> Iterator[tuple[str, _Pull]]:
+def _of_frames(first: Matrix, second: Matrix, plane: bool) -> Iterator[tuple[str, _Pull]]:
     """Rows of frames that stand alike."""
-    x, y, z = transposed(first)
-    for kind, a, k in (("rx", z, 1), ("ry", x, 2), ("rz", y, 0)):
-        yield kind, _at_right_angles(a, transposed(second)[k])
+    mine, other = transposed(first), transposed(second)
+    if plane:
+        half = (1 + dot(mine[0], other[0])) / 2
+        yield "rz", _at_right_angles(mine[1], other[0], (dot(mine[1], other[0]) / half, half))
+        return
+    R = [[dot(a, b) for b in other] for a in mine]
+    half = (1 + R[0][0] + R[1][1] + R[2][2]) / 4
+    for kind, i, k in (("rx", 2, 1), ("ry", 0, 2), ("rz", 1, 0)):
+        yield kind, _at_right_angles(mine[i], other[k], ((R[i][k] - R[k][i]) / (2 * half), half))
 
 
-def _at_right_angles(a: Vector, b: Vector) -> _Pull:
+def _at_right_angles(
+    a: Vector, b: Vector, rotation_error: tuple[Expr, Expr] | None = None
+) -> _Pull:
     """a.b of an axis of the first body and one of the second."""
-    return _Pull(dot(a, b), moment=cross(b, a))
+    return _Pull(dot(a, b), moment=cross(b, a), rotation_error=rotation_error)
 
 
 def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterator[Expr]:
@@ -152,17 +171,28 @@ def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
     return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])
 
 
-def closed_otherwise(system: Mechanics) -> Iterator[str]:
-    """The loops whose rows hold at the start as they do after some other turn than is meant."""
-    values: dict[Expr, Expr] = {c.q: Float(c.start) for c in system.coordinates}
-    values |= {p.symbol: Float(p.value) for p in system.parameters}
-    values[t] = S.Zero
-    asked = [b for r in system.reactions for b in r.branches]
-    for name, e in needed(system.definitions, asked):
-        values[name] = e.xreplace(values).evalf()
-    for r in system.reactions:
-        if any(float(b.xreplace(values)) < 0.5 for b in r.branches):
-            yield r.name
+def find_wrong_rotations(
+    system: Mechanics,
+) -> Callable[[Sequence[float], float, Mapping[str, float]], list[str]]:
+    """A function of q, t and parameters by name: the loops that are closed by another rotation.
+
+    Their rows of axes may hold all the same.
+    """
+    cosines = [(r.name, branch) for r in system.reactions for branch in r.branches]
+    if not cosines:
+        return lambda q, t, parameters: []
+    wanted = [branch for _, branch in cosines]
+    known = needed(system.definitions, wanted)
+    names = [*(c.q for c in system.coordinates), t, *(p.symbol for p in system.parameters)]
+    defaults = {p.name: p.value for p in system.parameters}
+    of = sympy.lambdify(names, wanted, "math", cse=lambda e: (known, e))
+
+    def wrong(q: Sequence[float], time: float, parameters: Mapping[str, float]) -> list[str]:
+        found = of(*q, time, *(defaults | dict(parameters)).values())
+        each = zip(cosines, found, strict=True)
+        return list(dict.fromkeys(name for (name, _), x in each if x < 0.5))
+
+    return wrong
 
 
 def settled(

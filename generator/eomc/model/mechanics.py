@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from typing import Any, Self, TypeVar
 
 import sympy
@@ -150,6 +151,12 @@ class Mechanics:
             *(tuple((k, w) for k, w in enumerate(row) if w) for row in sums),
             *(((k, 1.0),) for k in own),
         )
+
+    @property
+    def rotations(self) -> tuple[tuple[int, ...], ...]:
+        """Of each loop with rotation errors, the places of the rows that have one."""
+        rows = [(k, c.loop) for k, c in enumerate(self.constraints) if c.rotation_error is not None]
+        return tuple(tuple(k for k, _ in some) for _, some in groupby(rows, key=lambda row: row[1]))
 
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""

@@ -166,6 +166,9 @@ class Constraint(_Named):
     holonomic: of positions and t alone; else it is linear in the rates. loop: the [[loop]] that the
     row is of. redundant: whether the other rows say the same, so that none is solved for it.
     switched: whether it holds in some modes only, and is zero by itself in the others.
+    rotation_error: of a loop's row of axes, the component of 2 tan(a/2) n along the axis that the
+    row is named after, where the second frame is out by an angle a about n, and cos(a/2)^2: zero
+    only where the joint is closed as is meant; a start is assembled with it.
     """
 
     formula: Expr
@@ -175,6 +178,7 @@ class Constraint(_Named):
     loop: str = ""
     redundant: bool = False
     switched: bool = False
+    rotation_error: tuple[Expr, Expr] | None = None
 
     @property
     def multiplier(self) -> Symbol:

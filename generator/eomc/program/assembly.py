@@ -19,13 +19,16 @@ from eomc.model import discrete, loops, sticking
 from eomc.model.closure import Closure, Move
 from eomc.model.system import System
 from eomc.program import contradictions
-from eomc.program.manifold import ROUNDED, Flags, Manifold, Place, Vector
+from eomc.program.manifold import AWAY, ROUNDED, Flags, Manifold, Place, Vector
 from eomc.program.ranks import Ranks, ranks
 
 NOTHING = 1e-25  # of all values together, as lengths: what forty digits leave of a zero
 BEGUN = 1e-3  # of a run: rows that hold no longer do not hold
 SHOWN = 1e-9  # of a value: a coordinate has moved
 ROUNDING = 1e-13  # of all values together: what a coordinate that is 0 may move by
+STARTS = 16  # random starts that are tried where the search from the guess ends nowhere
+NEAREST, FARTHEST = 0.1, 3.0  # how far they lie from the guess, in coordinates' own units or rad
+ROTATED = 0.5  # rad: rows of axes that hold all the same hold after some other rotation
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def assembled(system: System) -> System:
     if found.rank == 0:
         raise SceneError(list(contradictions.of_slopes(system, found.flat)))
     if found.loose:
-        raise SceneError([contradictions.of_inertia(system, found.loose)])
+        raise SceneError([contradictions.of_inertia(manifold, found.loose, start.place)])
     constraints = tuple(
         replace(c, redundant=k in found.left_out) for k, c in enumerate(system.constraints)
     )
@@ -76,13 +79,13 @@ def assembled(system: System) -> System:
     )
     closure = _closure(manifold, start, found)
     made = replace(system, coordinates=coordinates, constraints=constraints)
+    _refuse_wrong_rotations(made)
     return replace(
         made,
         closure=replace(closure, made_for=_made_for(made)),
         warnings=(
             *system.warnings,
             *_warnings(manifold, found, closure),
-            *_otherwise(made),
         ),
     )
 
@@ -117,17 +120,18 @@ def _start(manifold: Manifold) -> Start:
     system = manifold.system
     free = np.array([not c.held for c in system.coordinates])
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
-    place, strayed = manifold.place(guess), False
-    if place is None:
+    if not manifold.has_values(guess):
         raise SceneError(list(contradictions.of_values(manifold, guess)))
+    place, strayed = manifold.place(guess), False
     q: Sequence[Any] = guess.tolist()
-    if _off(manifold, guess, free):
-        found, held = manifold.descend(guess, free)
+    if place is None or _off(manifold, place, free):
+        found, held, strayed = _search(manifold, guess, free)
+        if found is None:
+            raise SceneError(list(contradictions.of_values(manifold, guess)))
         if not held:
-            strayed = True
-            found, held = manifold.descend(guess, free, strict=False)
-        if not held or found is None:
-            raise SceneError(list(contradictions.of_positions(manifold, free, found or place)))
+            if _half_turned(manifold, found):
+                _refuse_wrong_rotations(system)
+            raise SceneError(list(contradictions.of_positions(manifold, free, found)))
         found = manifold.nearest(found, guess, free)
         q, _ = manifold.polished(found, free)
         rounded = np.where(free, _rounded(found, q), guess)
@@ -135,8 +139,42 @@ def _start(manifold: Manifold) -> Start:
     return Start(place, q, _rates(manifold, place, q, rates), strayed)
 
 
-def _off(manifold: Manifold, q: Vector, free: Flags) -> bool:
+def _search(manifold: Manifold, guess: Vector, free: Flags) -> tuple[Place | None, bool, bool]:
+    """A place near a guess, whether the rows hold there, and whether it may be on another branch.
+
+    By small ways from the guess, by longer ones, and then from random starts around it, ever
+    further away: at the guess itself rows may have no slope, or rotations be half a turn off.
+    """
+    first: Place | None = None
+    for strict in (True, False):
+        found, held = manifold.descend(guess, free, strict=strict)
+        if held:
+            return found, True, not strict
+        first = found or first
+    random = np.random.default_rng(41)
+    for reach in np.geomspace(NEAREST, FARTHEST, STARTS):
+        start = guess + np.where(free, reach * random.uniform(-1, 1, len(guess)), 0.0)
+        found, held = manifold.descend(start, free, strict=False)
+        if held:
+            return found, True, True
+        first = first or found
+    return first, False, True
+
+
+def _half_turned(manifold: Manifold, place: Place) -> bool:
+    """Whether some loop stands half a turn off at a place, and elsewhere too."""
+    axes = [k for rows in manifold.rotations for k in rows]
+    random = np.random.default_rng(43)
+    beside = manifold.place(place.q + random.uniform(-1, 1, len(place.q)), place.t)
+    both = [p.phi[axes] >= AWAY for p in (place, beside) if p is not None]
+    return bool(np.any(np.all(both, axis=0)))
+
+
+def _off(manifold: Manifold, place: Place, free: Flags) -> bool:
     """Whether some row is further from zero than doubles can tell: a rounding where it can move."""
+    q, axes = place.q, [k for rows in manifold.rotations for k in rows]
+    if np.any(np.abs(place.phi[axes]) > ROTATED):
+        return True
     exact = manifold.exactly("constraints", q.tolist(), [0.0] * len(q), 0.0)
     off = np.abs([float(x) for x in exact])[manifold.holonomic]
     rounding = manifold.rounding(q, 0 * q, 0.0)[manifold.holonomic]
@@ -239,14 +277,19 @@ def _remarks(manifold: Manifold, start: Start, found: Ranks) -> Iterator[str]:
         )
 
 
-def _otherwise(system: System) -> Iterator[Problem]:
-    """Loops that are closed by another turn than is meant."""
-    for name in loops.closed_otherwise(system):
-        why = (
-            "is closed at the start as its rows allow, but turned: axes that are to be alike are "
-            "not. Guess a start that is nearer, or change axis or rotation"
+def _refuse_wrong_rotations(system: System) -> None:
+    """Raise SceneError for loops whose frames stand in a wrong rotation wherever they move."""
+    start = [c.start for c in system.coordinates]
+    found = [
+        system.problem(
+            f"loop.{name}",
+            "can't close as is meant: wherever its bodies move, the second frame stands in another "
+            "rotation, such as half a turn off. Reverse an axis, or correct rotation",
         )
-        yield system.problem(f"loop.{name}", why, severity="warning")
+        for name in loops.find_wrong_rotations(system)(start, 0.0, {})
+    ]
+    if found:
+        raise SceneError(found)
 
 
 def _warnings(manifold: Manifold, found: Ranks, closure: Closure) -> Iterator[Problem]:

@@ -66,6 +66,10 @@ def of_rows(derived: Derivation) -> Iterator[Function]:
     yield lower("constraint_jacobian", e.tape, jacobian, system.names)
     labels = [f"{name}_rate" for name in names]
     yield lower("constraint_rates", e.tape, e.rows.rates, system.names, labels=labels)
+    if errors := e.rows.rotation_errors:
+        slopes = [x for error, _ in errors for x in e.tape.gradient([(error, S.One)], system.q)]
+        values = [*(error for error, _ in errors), *(half for _, half in errors)]
+        yield lower("rotation_errors", e.tape, [*values, *slopes], system.names)
 
 
 def _equations(derived: Derivation) -> Equations:

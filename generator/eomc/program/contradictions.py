@@ -271,9 +271,19 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
         yield system.problem("constraints", message)
 
 
-def of_inertia(system: System, unresisted: Sequence[int]) -> Problem:
+def of_inertia(manifold: Manifold, unresisted: Sequence[int], start: Place) -> Problem:
     """Report coordinates that move without inertia and without a constraint that fixes them."""
+    system, random = manifold.system, np.random.default_rng(7)
     names = [system.coordinates[k].name for k in unresisted]
+    nearby = manifold.place(start.q + SAMPLE_DISTANCE * random.normal(size=len(start.q)), start.t)
+    if nearby is not None and not nearby.singular:
+        at = _values_text(manifold, unresisted, start.q)
+        message = (
+            f"the rows lead to {at}, where the mass matrix is singular, though it is not nearby: "
+            "three angles of a spherical or free joint are singular at a pitch of pi/2. Turn the "
+            "body's own frame, or describe the rotation by a unit quaternion"
+        )
+        return system.problem(f"coordinates.{names[0]}", message)
     message = (
         f"{listed(names)} {'can move' if len(names) == 1 else 'can move together'} without moving "
         "anything that has mass or inertia, and no row holds "

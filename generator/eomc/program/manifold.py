@@ -1,11 +1,13 @@
 """The positions at which constraints hold, in numbers: values, steps onto them, forty digits.
 
 Lengths are in the metric of D; a row is in units of sqrt(A D^-1 A^T), its own inverse inertia.
+Rows of a loop's axes are replaced by the rotation vector by which they are out: it has the same
+zero and slope where the joint is closed, no other zero, and a slope everywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +26,8 @@ Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 RANK_TOLERANCE = 1e-7  # singular values below are zero, where rows hold to rounding
+HALF_TURN = 1e-8  # the square of the cosine of half an angle: it counts as half a turn
+AWAY = 4.0  # rad: what a row of axes lacks there
 LINEAR = 0.25  # of a step: what rows may differ by from their tangent at its end
 LEAP = 0.5  # of a coordinate or rad: a step, at most
 SHORTEST = 2.0**-13  # part of a step
@@ -44,7 +48,10 @@ def _most(x: Vector) -> float:
 
 @dataclass(frozen=True)
 class Place:
-    """Rows at q (nq,) and t: phi (m,), 0 for rows of rates; A (m, nq); D (nq, nq)."""
+    """Rows at q (nq,) and t: phi (m,), 0 for rows of rates; A (m, nq); D (nq, nq).
+
+    Of rows that have rotation errors phi is the rotation vector, and A its slope.
+    """
 
     q: Vector
     t: float
@@ -181,6 +188,7 @@ class Manifold:
         self._names = [x.name for x in (*system.q, *system.qd)]
         self._fixed = {**self.parameters, **dict.fromkeys((u.name for u in system.u), 0.0)}
         self.holonomic = [k for k, c in enumerate(system.constraints) if c.holonomic]
+        self.rotations = system.rotations
         self.rows = range(len(system.constraints))
         self.timed = any(t.name in made[name].uses for name in ("constraints", "constraint_rates"))
         self._plain: dict[str, Callable[..., Any]] = {}
@@ -213,10 +221,17 @@ class Manifold:
         found: list[Any] = self._exact[name](self._values(q, qd, time))
         return found
 
+    def has_values(self, q: Vector, time: float = 0.0) -> bool:
+        """Whether the constraints, their slopes and D are finite."""
+        names = ("constraints", "constraint_jacobian", "D")
+        return all(np.all(np.isfinite(self.value(name, q, 0 * q, time))) for name in names)
+
     def place(self, q: Vector, time: float = 0.0) -> Place | None:
         """The rows there; None where something has no value."""
         n, rest, phi = len(q), np.zeros(len(q)), self._off(q, time)
         A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
+        for rows, vector, slopes in self._rotation_vectors(q, time):
+            phi[rows], A[rows] = vector, slopes
         D = self.value("D", q, rest, time).reshape(n, n)
         if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
             return None
@@ -245,7 +260,35 @@ class Manifold:
         """(m,): what the rows of positions are there, 0 for the others."""
         phi = self.value("constraints", q, np.zeros(len(q)), time)
         phi[len(self.holonomic) :] = 0
+        for rows, vector, _ in self._rotation_vectors(q, time):
+            phi[rows] = vector
         return phi
+
+    def _rotation_vectors(
+        self, q: Vector, time: float
+    ) -> Iterator[tuple[list[int], Vector, Vector]]:
+        """The rows of axes of each loop, the rotation vector a n that they lack, and its slopes.
+
+        From e = 2 tan(a/2) n, whose own slope along n grows as 1/cos(a/2)^2.
+        """
+        if not self.rotations:
+            return
+        count = sum(map(len, self.rotations))
+        found = self.value("rotation_errors", q, np.zeros(len(q)), time)
+        errors, halves, first = found[:count], found[count : 2 * count], 0
+        slopes = found[2 * count :].reshape(count, -1)
+        for rows in self.rotations:
+            part = slice(first, first := first + len(rows))
+            e, J = errors[part], slopes[part]
+            tangent = float(np.linalg.norm(e)) / 2
+            if not halves[part.start] > HALF_TURN:  # no direction leads back
+                e, J = np.full(len(rows), AWAY), np.zeros_like(J)
+            elif tangent > 0:
+                n, scale = e / (2 * tangent), np.arctan(tangent) / tangent
+                along = np.outer(n, n @ J)
+                J = scale * (J - along) + along / (1 + tangent**2)
+                e = scale * e
+            yield list(rows), e, J
 
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
         """(m,): the rounding error of each row, to first order; 0 where a row has no value."""

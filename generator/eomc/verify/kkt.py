@@ -21,6 +21,7 @@ Vector = NDArray[np.float64]
 CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 RANK_TOLERANCE = 1e-9  # of the largest singular value: a row that is none here
 MOST = 60  # sweeps of Newton's method
+NEARER = 200  # sweeps towards the nearest place
 HELD = 1e-10  # of the terms of a row: what it may still be
 SETTLED = 16 * 2.0**-52  # of the state: what a correction may still be when it is rounding
 
@@ -140,11 +141,39 @@ def inert(D: Vector, A: Vector) -> bool:
 def onto(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
-    """The nearest q by Newton's method in the metric of D, and its last correction, in sizes of q.
+    """The x nearest to q on the rows, in the metric of D, and its last correction, in its sizes.
 
-    rows: D, A and what is to be zero, at q. Long corrections are halved until what is to be zero
-    gets less. The last correction is more than rounding where none is found, inf where the nearest
-    is not on the rows.
+    rows: D, A and what is to be zero, at x. There D (x - q) is a sum of rows of A: after Newton's
+    method x becomes q plus the least change with A (x - q) = A (x_k - q) - off, again and again, by
+    part where that does not converge. The last correction is more than rounding where none is
+    found.
+    """
+    x, last = _onto(q, rows)
+    part, before = 1.0, np.inf
+    if not last < 1e-10:
+        return x, last
+    for _ in range(NEARER):
+        D, A, off = rows(x)
+        by, _ = solve(D, A, np.zeros(len(q)), -(off + A @ (q - x)))
+        by += q - x
+        size = float(np.max(np.abs(by) / (np.abs(x) + np.max(np.abs(x)) + 1), initial=0))
+        if not np.isfinite(size) or part < 1e-2:
+            return x, np.inf
+        x = x + part * by
+        if size <= SETTLED or (size < 1e-12 and size > before / 2):
+            return x, size
+        part /= 1 + (size > before / 2)
+        before = size
+    return x, np.inf
+
+
+def _onto(
+    q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
+) -> tuple[Vector, float]:
+    """A q by Newton's method in the metric of D, and its last correction, in sizes of q.
+
+    Long corrections are halved until what is to be zero gets less. The last correction is inf where
+    the last q is not on the rows.
     """
     D, A, off = rows(q)
     last = np.inf

@@ -70,6 +70,8 @@ class Projection:
             near = self._near(s, held)
             if not np.all(np.isfinite(near.q)) or not of.sampler.regular(near):
                 return None
+            if of.sampler.wrong_rotations(near):
+                return None
             expected = of.sampler.expected(near)
             if expected is None:
                 return None

@@ -12,12 +12,13 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from sympy import Symbol
 
+from eomc.model.loops import find_wrong_rotations
 from eomc.verify import kkt
 from eomc.verify.oracle import Answer, Vector
 
@@ -304,9 +305,20 @@ class Sampler:
             self.reach(partial(self.reference.evaluate, name), found)
             for name in ("constraints", "constraint_rates")
         ]
-        if all(np.all(np.abs(off) <= HOLDS * size + TINY) for off, size in rows):
+        holds = all(np.all(np.abs(off) <= HOLDS * size + TINY) for off, size in rows)
+        if holds and not self.wrong_rotations(found):
             return found
         return replace(s, q=np.full_like(q, np.nan), qd=np.full_like(q, np.nan))
+
+    @cached_property
+    def _find_wrong_rotations(self) -> Callable[..., list[str]]:
+        return find_wrong_rotations(self.system)
+
+    def wrong_rotations(self, s: State) -> list[str]:
+        """The loops that are closed by another rotation than is meant, though their rows hold."""
+        if not (self.system.reactions and np.all(np.isfinite(s.q))):
+            return []
+        return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
     def rows(self, name: str, s: State) -> Vector:
         """Of the constraints that are solved for."""

@@ -85,6 +85,19 @@ class Project(Named):
         Initialisers of sums of constraints, and the constraints that they replace.
     pinned
         Whether coordinates may have neither inertia nor a holonomic constraint.
+    errors
+        The function of the rotation errors of loops, if there are any.
+    error_rows, error_ends
+        Constraints that have a rotation error, and the ends of each loop's part of them.
+    rotated, call_rotated, call_turn
+        The function that replaces these residuals by rotation vectors, its call, and its call
+        without gradients.
+    searched, starts
+        Whether random starts are tried if the search from a state fails, and their number.
+    settled
+        Square of the last change towards the nearest state, relative to that of its distance.
+    half_turn
+        The squared cosine of half an angle, below which a rotation counts as half a turn.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"
@@ -108,3 +121,14 @@ class Project(Named):
     sum_places: tuple[int, ...]
     pinned: bool
     tiny: str
+    errors: Computed | None
+    error_rows: str
+    error_ends: tuple[int, ...]
+    rotated: CFunction | None
+    call_rotated: str
+    call_turn: str
+    atan: str
+    searched: bool
+    starts: int
+    settled: str
+    half_turn: str
