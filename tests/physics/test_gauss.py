@@ -112,7 +112,9 @@ def test_coefficients(name: str) -> None:
         for j in range(s):
             off = m.b[i] * m.a[i][j] + m.b[j] * m.a[j][i] - m.b[i] * m.b[j]
             assert abs(off) < exact
-    for row, c in zip(m.ahead, m.c, strict=True):  # a polynomial of degree s - 1 goes on exactly
+    for row, c in zip(
+        m.extrapolation, m.c, strict=True
+    ):  # a polynomial of degree s - 1 goes on exactly
         found = sum((e * node ** (s - 1) for e, node in zip(row, m.c, strict=True)), Fraction(0))
         assert abs(found - (1 + c) ** (s - 1)) < exact
 

@@ -70,7 +70,9 @@ def test_the_sums_over_the_step_before() -> None:
     c, exact = GAUSS16.c, Fraction(1, 10**35)
     for j in range(8):
         power = [x**j for x in c]
-        for at, once, twice in zip(c, GAUSS16.a_ahead, GAUSS16.a_squared_ahead, strict=True):
+        for at, once, twice in zip(
+            c, GAUSS16.a_extrapolated, GAUSS16.a_squared_extrapolated, strict=True
+        ):
             end = 1 + at
             integral = (end ** (j + 1) - 1) / (j + 1)
             again = (end ** (j + 2) - 1) / ((j + 1) * (j + 2)) - at / (j + 1)
@@ -84,7 +86,7 @@ def test_five_sweeps_are_stable_where_they_suffice() -> None:
 
     Long before that the last sweep moves more than is let pass, and others follow.
     """
-    A, AA, E = (np.array(x, float) for x in (GAUSS16.a, GAUSS16.a_squared, GAUSS16.ahead))
+    A, AA, E = (np.array(x, float) for x in (GAUSS16.a, GAUSS16.a_squared, GAUSS16.extrapolation))
     b, bA, c = (np.array(x, float) for x in (GAUSS16.b, GAUSS16.b_a, GAUSS16.c))
 
     def radius(of_q: float, of_qd: float) -> float:

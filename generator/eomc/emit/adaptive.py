@@ -180,7 +180,7 @@ class Stepping:
         """The constant arguments, and those that the public functions of steps take."""
         rest = self.constant_arguments
         present = {a.name for a in rest}
-        return [*rest, *(a for a in self.functions.usual("u", "p") if a.name not in present)]
+        return [*rest, *(a for a in self.functions.arguments("u", "p") if a.name not in present)]
 
     @cached_property
     def fixed(self) -> CFunction:

@@ -298,7 +298,7 @@ def body(
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             angles.setdefault(a.value.args, {})[a.value.function] = a.name
     sincos = real.reach > 0 and bool(angles)
-    side_by_side, numbers = several(function) if together else {}, count(1)
+    side_by_side, numbers = group_angles(function) if together else {}, count(1)
     lines: dict[Stage, list[str]] = {stage: [] for stage in _STAGE_COMMENTS}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
@@ -372,7 +372,7 @@ def _sincos(
     ]
 
 
-def several(function: Function) -> Mapping[Operand, Sequence[Operand]]:
+def group_angles(function: Function) -> Mapping[Operand, Sequence[Operand]]:
     """Group the angles that come from outside by stage, in groups of at least MIN_SIMD_ANGLES."""
     computed = {a.name for a in (*function.early, *function.body)}
     by_stage: dict[Stage, dict[Operand, None]] = {}

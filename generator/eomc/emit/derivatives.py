@@ -24,7 +24,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
     if not run.discretize:
         return
     inputs, suffix = bool(target.system.inputs), real.function_suffix
-    state = plain.usual("q", "qd", *plain.state[2:], "u", "p")
+    state = plain.arguments("q", "qd", *plain.state[2:], "u", "p")
     J = c.filled(plain.real, "J")
     rates = c.static(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
     feedback = ""
@@ -76,6 +76,6 @@ def _moved(plain: Functions) -> CFunction:
     arguments_read = plain.read(plain.target.program["projection_along"])
     other_arguments = (
         plain.argument("q"),
-        *plain.usual(*(n for n in ("t", "p") if n in arguments_read)),
+        *plain.arguments(*(n for n in ("t", "p") if n in arguments_read)),
     )
     return c.static(f"{plain.prefix}_derivative_projected", plain.status, *state, *other_arguments)

@@ -47,7 +47,7 @@ class Kind:
         return "u" in self.takes.split()
 
     @property
-    def given(self) -> str:
+    def extra_argument(self) -> str:
         """The additional argument that the function has in every scene: qdd, wrenches or lambda."""
         return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
 

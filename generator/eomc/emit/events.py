@@ -101,7 +101,9 @@ def views(
     arguments = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
     again = arguments | {"reached": "reached"}
     start_view = (
-        _begun(stepping, event_view.restart) if "begins" in functions.target.program else None
+        _start_events(stepping, event_view.restart)
+        if "begins" in functions.target.program
+        else None
     )
     if start_view:
         yield start_view
@@ -119,7 +121,7 @@ def views(
     )
 
 
-def _begun(stepping: Stepping, restart: CFunction) -> Begun:
+def _start_events(stepping: Stepping, restart: CFunction) -> Begun:
     """Return the view of events at the start of a motion."""
     functions, x = stepping.functions, stepping.state.name
     values, record = (
@@ -127,7 +129,7 @@ def _begun(stepping: Stepping, restart: CFunction) -> Begun:
         functions.public.adaptive_events,
     )
     arguments_taken = {a.name for f in (values, restart) for a in f.arguments}
-    extra = [a for a in functions.usual("u", "p") if a.name in arguments_taken]
+    extra = [a for a in functions.arguments("u", "p") if a.name in arguments_taken]
     arguments = (stepping.state, *extra, *record, stepping.workspace)
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
     return Begun(
@@ -150,7 +152,7 @@ def _events(stepping: Stepping) -> Events:
     values, number, k = evaluated[0], stepping.number, CArgument("int", "k")
     read = c.given(f"{method}_adaptive_state", "x")
     # arguments of the formulas besides the state
-    extra = [a for a in functions.usual("u", "p") if a.name in argument_names]
+    extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
 
     looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *extra)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
@@ -167,7 +169,7 @@ def _events(stepping: Stepping) -> Events:
     changed = c.static(f"{method}_changed", "int", stepping.state, *extra)
     calls = [*evaluated, *([public.project] if stepping.form.project else ())]
     taken_by_calls = {a.name for f in calls for a in f.arguments}
-    after_event = [a for a in functions.usual("u", "p") if a.name in taken_by_calls]
+    after_event = [a for a in functions.arguments("u", "p") if a.name in taken_by_calls]
     restart = c.static(
         f"{method}_restarted", functions.status, stepping.state, number("reached"), *outputs[1:],
         *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),

@@ -12,7 +12,7 @@ from functools import cached_property
 
 from eomc.emit import c_function as c
 from eomc.emit import heading
-from eomc.emit.c_expression import REALS, Block, Body, Real, several
+from eomc.emit.c_expression import REALS, Block, Body, Real, group_angles
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, rename_reserved, sentence
 from eomc.emit.evaluations import KINDS, c_array_size, doc, refuses, source
@@ -64,7 +64,7 @@ class Functions:
         """Fields that most views have."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
-    def together(self, function: Function) -> bool:
+    def groups_angles(self, function: Function) -> bool:
         """Return True if sines of several angles are computed in vector registers.
 
         Not in D, with which selftest.c verifies the sines that steps use.
@@ -72,10 +72,10 @@ class Functions:
         return self.target.real.reach > 0 and function.name not in ("D", "D_column")
 
     @property
-    def several(self) -> bool:
+    def has_grouped_angles(self) -> bool:
         """Whether some function computes sines of several angles in vector registers."""
         functions = self.target.program.functions.values()
-        return any(self.together(f) and several(f) for f in functions)
+        return any(self.groups_angles(f) and group_angles(f) for f in functions)
 
     @property
     def NQ(self) -> str:
@@ -122,7 +122,7 @@ class Functions:
             return c.given(f"{self.prefix}_params", name)
         return CArgument(self.real, name)
 
-    def usual(self, *names: str) -> tuple[CArgument, ...]:
+    def arguments(self, *names: str) -> tuple[CArgument, ...]:
         """Return those of the usual arguments that this scene has: u with inputs, p with
         parameters.
         """
@@ -163,7 +163,7 @@ class Functions:
         state = STATE if self.target.signal_state else ()
         names = (*(["t"] if self.target.signal_t else []), *state)
         out = c.filled(self.real, "u", self.NU)
-        arguments = (out, *map(self.argument, names), *self.usual("p"))
+        arguments = (out, *map(self.argument, names), *self.arguments("p"))
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
     def signals(self, function: Function) -> tuple[Block, ...]:
@@ -196,11 +196,11 @@ class Functions:
             "", tuple(self.target.loads(function, self.target.element, self.target.element))
         )
 
-    def straight(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
+    def straight_line_body(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
         """Return the statements of a function, with results in `out`, or returned where `out` is
         empty.
         """
-        body = self.target.body(function, together=self.together(function))
+        body = self.target.body(function, together=self.groups_angles(function))
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
         last = Block("", ends if out else (c.result(body.results[0]),))
         return (*self.statements(function, body), last), body
@@ -229,7 +229,7 @@ class Functions:
             f, P = part.function, f"{self.prefix}_{name}_{k}"
             body = self.target.body(
                 f, {n: shared[n] for n in part.reads}, stored={n: shared[n] for n in part.keeps},
-                pivots=len(function.checks), together=self.together(function),
+                pivots=len(function.checks), together=self.groups_angles(function),
             )  # fmt: skip
             failures = c.unless(body.failures, self.singular)
             results = zip(part.outputs, body.results, strict=True)
@@ -293,7 +293,7 @@ class Functions:
                 calls = (declarations, calls[1], last)
             body = (*self.signals(function), *calls)
             return Computed(replace(public, body=body), parts, values)
-        (*blocks, last), statements_ = self.straight(function, kind.out)
+        (*blocks, last), statements_ = self.straight_line_body(function, kind.out)
         if refuses(target, name):
             array = c.listed(self.real, "a", c_array_size(target, kind.shape), statements_.results)
             blocks.append(Block("", (array, *c.unless(statements_.failures, self.singular))))
@@ -343,7 +343,7 @@ class Functions:
         if outline.is_large(function):
             values, parts, blocks = self.outlined(function, name, out, ("along", *READ))
         else:
-            blocks, body = self.straight(function, out)
+            blocks, body = self.straight_line_body(function, out)
             failures = c.unless(body.failures, self.singular)
         if fails:
             blocks += (Block("", (*failures, c.result(self.ok))),)
@@ -425,7 +425,7 @@ class Functions:
         """The arguments of a projection: the state to be changed, and the others."""
         arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
         state = tuple(c.filled(self.real, n) for n in "rv")
-        return state, self.usual(*(n for n in ("t", "p") if n in arguments))
+        return state, self.arguments(*(n for n in ("t", "p") if n in arguments))
 
     @cached_property
     def acceleration(self) -> Computed:
@@ -444,7 +444,7 @@ class Functions:
             first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
-            body = self.target.body(function, together=self.together(function))
+            body = self.target.body(function, together=self.groups_angles(function))
             array = c.listed(self.real, "a", self.NQ, body.results)
             failures = c.unless(body.failures, self.singular)
             *leading, last = self.statements(function, body)
@@ -461,7 +461,7 @@ class Functions:
         return Computed(result, parts, values)
 
 
-def of(program: Program, real: Real | None = None) -> Functions:
+def portable_functions(program: Program, real: Real | None = None) -> Functions:
     """Return a program as portable C, with sine and cosine of libm for any element type."""
     return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
 

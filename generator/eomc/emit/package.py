@@ -96,8 +96,8 @@ def _bound(target: Target) -> tuple[Bound, ...]:
         kind = KINDS[name]
         extents = {a.name: a.extent for a in function.arguments}
         rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
-        if kind.given:  # passed in place of the inputs
-            rows[kind.given] = f"u + {member('own', 'u')}*k"
+        if kind.extra_argument:  # passed in place of the inputs
+            rows[kind.extra_argument] = f"u + {member('own', 'u')}*k"
         call = function.call(**(state_arguments | rows))
         solve = (
             Public(target).acceleration.call(**state_arguments) if takes_qdd(target, name) else ""

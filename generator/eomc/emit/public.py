@@ -18,7 +18,7 @@ class Public:
 
     target: Target
 
-    def usual(self, *names: str) -> tuple[CArgument, ...]:
+    def arguments(self, *names: str) -> tuple[CArgument, ...]:
         """Return those of the usual arguments q, qd, t, h, u, p that this scene has."""
         target, real = self.target, self.target.real.name
         arguments = {
@@ -51,11 +51,11 @@ class Public:
             (
                 *([filled(real, kind.out, c_array_size(target, kind.shape))] if kind.out else []),
                 *(t if signal else ()),
-                *(self.usual(*state) if not signal or target.signal_state else ()),
-                *(self.usual("qdd") if takes_qdd(target, name) else ()),
-                *(self.usual(kind.given) if kind.given else ()),
+                *(self.arguments(*state) if not signal or target.signal_state else ()),
+                *(self.arguments("qdd") if takes_qdd(target, name) else ()),
+                *(self.arguments(kind.extra_argument) if kind.extra_argument else ()),
                 *(() if signal else t),
-                *self.usual(*(["u"] if kind.takes_u else []), "p"),
+                *self.arguments(*(["u"] if kind.takes_u else []), "p"),
             ),
         )
 
@@ -64,7 +64,7 @@ class Public:
         """The function for qdd, which returns a status."""
         target = self.target
         qdd = filled(target.real.name, "qdd", f"{target.PREFIX}_NQ")
-        return self._status("acceleration", qdd, *self.usual(*STATE, "t", "u", "p"))
+        return self._status("acceleration", qdd, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
     def linearization(self) -> CFunction:
@@ -78,19 +78,19 @@ class Public:
             filled(target.real.name, name, f"{NQ}*{w}" if w == NQ else f"(int){NQ}*{w}")
             for name, w in widths.items()
         )
-        return self._status("linearization", *out, *self.usual(*STATE, "t", "u", "p"))
+        return self._status("linearization", *out, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
     def project(self) -> CFunction:
         """The function that projects a state onto the constraints, which returns a status."""
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
-        t = self.usual(*["t"] if any(takes_t(self.target, n) for n in names) else [])
+        t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
         held = given("int", "held")
-        return self._status("project", *self._state, *t, held, *self.usual("p"))
+        return self._status("project", *self._state, *t, held, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
         """Return the function for one step, which overwrites the state."""
-        return self._status(f"{method}_step", *self._state, *self.usual("t", "h", "u", "p"))
+        return self._status(f"{method}_step", *self._state, *self.arguments("t", "h", "u", "p"))
 
     @property
     def fixed_step(self) -> CFunction:
@@ -108,7 +108,9 @@ class Public:
         out = [filled(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
         if target.system.inputs:
             out.append(filled(target.real.name, "Gamma", f"2*{NQ}*{target.PREFIX}_NU"))
-        return self._status(f"{method}_derivative", *out, *self.usual(*STATE, "t", "h", "u", "p"))
+        return self._status(
+            f"{method}_derivative", *out, *self.arguments(*STATE, "t", "h", "u", "p")
+        )
 
     def run(self, method: str) -> CFunction:
         """Return the function for many steps, which overwrites the state."""
@@ -118,8 +120,8 @@ class Public:
             f"{P}_{method}_run",
             "long",
             (
-                *self._state, *self._steps, *self.usual("u"), *strides, *self._row_output,
-                *self.usual("p"), CArgument(f"{P}_{method}_memory *", "memory"),
+                *self._state, *self._steps, *self.arguments("u"), *strides, *self._row_output,
+                *self.arguments("p"), CArgument(f"{P}_{method}_memory *", "memory"),
                 CArgument(f"{P}_status *", "status"),
             ),
         )  # fmt: skip
@@ -133,8 +135,8 @@ class Public:
             "void",
             (
                 CArgument("long", "count"), filled(real, "q"), filled(real, "qd"), *self._steps,
-                *self.usual("u"), *(strides[:2] if target.system.inputs else []), *self._row_output,
-                CArgument("long", "row_count"), *self.usual("p"),
+                *self.arguments("u"), *(strides[:2] if target.system.inputs else []),
+                *self._row_output, CArgument("long", "row_count"), *self.arguments("p"),
                 *(strides[2:] if target.needs_p else []),
                 CArgument("long *", "done"), CArgument("int *", "status"),
             ),
@@ -149,10 +151,10 @@ class Public:
             "long",
             (
                 *self._state, filled(real, "t"), *(CArgument(real, n) for n in LIMITS),
-                *self.usual("u"), CArgument("long", "steps"), given(real, "times"),
+                *self.arguments("u"), CArgument("long", "steps"), given(real, "times"),
                 CArgument("long", "count"), *(filled(real, f"{n}_rows") for n in ("t", *STATE)),
                 *(self.adaptive_events if self.target.system.events else ()),
-                *self.usual("p"), CArgument(f"{name}_memory *", "memory"),
+                *self.arguments("p"), CArgument(f"{name}_memory *", "memory"),
                 CArgument(f"{P}_status *", "status"),
             ),
         )  # fmt: skip
@@ -168,10 +170,10 @@ class Public:
             (
                 CArgument("long", "count"), *(filled(real, n) for n in (*STATE, "t")),
                 *(CArgument(real, n) for n in LIMITS),
-                *self.usual("u"), *(strides[:1] if target.system.inputs else []),
+                *self.arguments("u"), *(strides[:1] if target.system.inputs else []),
                 CArgument("long", "steps"), given(real, "times"), CArgument("long", "row_count"),
                 *(filled(real, f"{n}_rows") for n in STATE),
-                *(self.adaptive_events if target.system.events else ()), *self.usual("p"),
+                *(self.adaptive_events if target.system.events else ()), *self.arguments("p"),
                 *(strides[1:] if target.needs_p else []),
                 CArgument(f"{name}_memory *", "memory"), CArgument("long *", "kept"),
                 CArgument("int *", "status"),

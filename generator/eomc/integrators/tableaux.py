@@ -89,7 +89,7 @@ class Method:
         return self.end or _times(self.b, self.a)
 
     @cached_property
-    def ahead(self) -> tuple[Row, ...]:
+    def extrapolation(self) -> tuple[Row, ...]:
         """E: extrapolates accelerations to the next step's nodes by the polynomial through this
         step's.
         """
@@ -140,14 +140,14 @@ class Method:
         return tuple(mu), tuple(there), tuple(back)
 
     @cached_property
-    def a_ahead(self) -> tuple[Row, ...]:
+    def a_extrapolated(self) -> tuple[Row, ...]:
         """A E: A applied to accelerations that are extrapolated from the previous step."""
-        return tuple(_times(row, self.ahead) for row in self.a)
+        return tuple(_times(row, self.extrapolation) for row in self.a)
 
     @cached_property
-    def a_squared_ahead(self) -> tuple[Row, ...]:
+    def a_squared_extrapolated(self) -> tuple[Row, ...]:
         """A A E: A A applied to accelerations that are extrapolated from the previous step."""
-        return tuple(_times(row, self.ahead) for row in self.a_squared)
+        return tuple(_times(row, self.extrapolation) for row in self.a_squared)
 
 
 def _times(row: Row, a: tuple[Row, ...]) -> Row:

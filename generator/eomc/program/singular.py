@@ -81,7 +81,7 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
             neighbours = values[k - 1], values[k + 1]
             if values[k] <= min(neighbours) and values[k] < FLAT_RATIO * max(neighbours):
                 ends = (way[k - 1].q - way[k].q, way[k + 1].q - way[k].q)
-                candidates.append((k, *_least(manifold, sigma, way[k], ends, free)))
+                candidates.append((k, *_minimise(manifold, sigma, way[k], ends, free)))
     least = max(min(value for _, value, _ in candidates), ZERO_TOLERANCE)
     _, least_sigma, closest = min(
         (x for x in candidates if x[1] <= TIE_RATIO * least), key=lambda x: x[0]
@@ -92,7 +92,7 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
     return ClosestSingularity(least_sigma if least_sigma > ZERO_TOLERANCE else 0.0, coordinates)
 
 
-def _least(
+def _minimise(
     manifold: Manifold, sigma: Callable[[Place | None], float], middle: Place,
     ends: tuple[Vector, Vector], free: Flags,
 ) -> tuple[float, Place]:  # fmt: skip

@@ -43,7 +43,7 @@ def apart(function: Function, coordinates: Collection[str]) -> tuple[tuple[Angle
         terms, offset = _terms(args[0], values, coordinates) or ((), S.Zero)
         angles.append(Angle(terms, offset, *names_of_pair(names)))
     separated = {name for names in by_argument.values() for name in names.values()}
-    return tuple(angles), _without(function, separated)
+    return tuple(angles), _remove_values(function, separated)
 
 
 def names_of_pair(names: Mapping[str, str]) -> tuple[str, str]:
@@ -67,7 +67,7 @@ def _terms(
     return tuple((k * c, name) for c, name in definition.terms), k * definition.constant
 
 
-def _without(function: Function, separated: Collection[str]) -> Function:
+def _remove_values(function: Function, separated: Collection[str]) -> Function:
     """Return the function without the given values, which become inputs, and values that only they
     need.
     """

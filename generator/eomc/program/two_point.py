@@ -45,7 +45,7 @@ class Parts:
         return weight <= MAX_INLINED_OPERATIONS
 
 
-def apart(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
+def split(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
     """Split an acceleration that reads the sines of `angles`; None where a split has no advantage.
 
     fixed: names of values that depend on parameters only.

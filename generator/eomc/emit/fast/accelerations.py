@@ -112,7 +112,7 @@ class Accelerations:
         if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
             return None
         early = {a.name for a in self.function.early}
-        return two_point.apart(
+        return two_point.split(
             self.rotated[1], self.angles, target.system, {*self.parameter_names, *early}
         )
 

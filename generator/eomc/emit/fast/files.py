@@ -85,7 +85,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
     if steppers.two_point:
         lanes += [("two", str(2 * size), False)]
     simd = steppers.accelerations.simd_angles
-    angles = steppers.functions.several or simd
+    angles = steppers.functions.has_grouped_angles or simd
     if angles:
         lanes += [("four", str(4 * size), simd)]
     if RK4 in steppers.methods and steppers.predicted:
@@ -190,7 +190,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
             sincos=lane.sincos,
             signal=signal,
             signal_call=""
-            if signal is None or steppers.given_signals
+            if signal is None or steppers.signals_supplied
             else signal.function.call(u="now"),
             rates=rates,
             rates_call=lane.velocity.function.call(k="&k", point="0")

@@ -71,7 +71,7 @@ class Steppers:
         return "signal" in target.program and not target.signal_state
 
     @property
-    def given_signals(self) -> bool:
+    def signals_supplied(self) -> bool:
         """Whether all callers of the accelerations supply the signals."""
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
@@ -274,7 +274,7 @@ class Steppers:
             notes=m.notes,
             stages=m.stages,
             **tableau(m, real),
-            extrapolation=matrix(m.ahead, real),
+            extrapolation=matrix(m.extrapolation, real),
             width=slopes.width,
             factor=factor,
             factor_unread=tuple(
@@ -320,7 +320,7 @@ class Steppers:
         def by_stage(rows: Sequence[Row]) -> tuple[str, ...]:
             return c.in_braces(numbers(column, real) for column in zip(*rows, strict=True))
 
-        before = (by_stage(m.a_ahead), by_stage(m.a_squared_ahead)) if fixed else None
+        before = (by_stage(m.a_extrapolated), by_stage(m.a_squared_extrapolated)) if fixed else None
         return views.Stages(
             **self.extended(lane),
             inputs=bool(lane.target.system.inputs),

@@ -32,17 +32,17 @@ class Dependencies:
     @cached_property
     def accelerations(self) -> Sequence[Names]:
         """Dependencies of each acceleration."""
-        return self._of("acceleration")
+        return self._results_of("acceleration")
 
     @cached_property
     def outputs(self) -> Sequence[Names]:
         """Dependencies of each output."""
-        return self._of("outputs")
+        return self._results_of("outputs")
 
     @cached_property
     def events(self) -> Sequence[Names]:
         """Dependencies of each event function."""
-        return self._of("events")
+        return self._results_of("events")
 
     @cached_property
     def _signals(self) -> Mapping[str, Names]:
@@ -52,13 +52,13 @@ class Dependencies:
             return {}
         return dict(zip(names, read(self.program["signal"]), strict=True))
 
-    def _of(self, name: str) -> Sequence[Names]:
+    def _results_of(self, name: str) -> Sequence[Names]:
         """Return the dependencies of each result of a function; [] where the program does not have
         it.
         """
-        return [self._whole(x) for x in read(self.program[name])] if name in self.program else []
+        return [self._resolved(x) for x in read(self.program[name])] if name in self.program else []
 
-    def _whole(self, names: Names) -> Names:
+    def _resolved(self, names: Names) -> Names:
         """Return names with accelerations and signals replaced by their dependencies."""
         qdd = [x.name for x in self.program.system.qdd]
         result = set(names)

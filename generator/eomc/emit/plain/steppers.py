@@ -15,7 +15,7 @@ from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
-from eomc.emit.functions import Functions, handshake, indexed, of, parameters
+from eomc.emit.functions import Functions, handshake, indexed, parameters, portable_functions
 from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
     AdaptiveDeclared,
@@ -46,7 +46,7 @@ def files(
 
     real: the type of numbers, the scene's by default. rooms: see `header`.
     """
-    plain = of(program, real)
+    plain = portable_functions(program, real)
     name = plain.prefix
     methods = [METHODS[m] for m in plain.target.system.run.methods]
     loops = [loop(plain, m) for m in methods]
@@ -174,7 +174,7 @@ def linearization(plain: Functions) -> Slopes | None:
             loop_function, (*one.parts, one.function), one.values, one.function.call()
         )
         cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"
-    arguments = plain.usual(*plain.state, "u", "p")
+    arguments = plain.arguments(*plain.state, "u", "p")
     arguments_read = plain.read(function)
     reads_u = plain.reads_u(function) and plain.signal is not None
     return Slopes(
@@ -276,7 +276,7 @@ def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
             f"{plain.prefix}_differences",
             plain.status,
             c.filled(plain.real, "slopes"),
-            *plain.usual(*plain.state, "u", "p"),
+            *plain.arguments(*plain.state, "u", "p"),
         ),
         here=accelerate(qdd="here"),
         near=accelerate(qdd="near", q="x", qd="x + NQ"),
@@ -287,7 +287,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     """Return the view of a Gauss method."""
     accelerate = plain.acceleration.function.call
     method = f"{plain.prefix}_{m.name}"
-    state_arguments = plain.usual(*plain.state, "h", "u", "p")
+    state_arguments = plain.arguments(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
     onto = plain.moves_stages if m.sweeps else ()
     out = (c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
@@ -332,7 +332,7 @@ def _adaptive(plain: Functions) -> list[View]:
     if plain.target.system.run.tolerance is None:
         return []
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
-    state_arguments = plain.usual(*plain.state, "h", "u", "p")
+    state_arguments = plain.arguments(*plain.state, "h", "u", "p")
     values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
     sweep = c.static(f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages)
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
