@@ -101,7 +101,7 @@ def trusted(case: Case) -> tuple[Error, float]:
         system = eomc.read(peers.write(case, Path(root)))
         given = zip(system.coordinates, case.x0[:n], case.x0[n:], strict=True)
         starts = tuple(replace(c, start=float(q), rate=float(v)) for c, q, v in given)
-        own = reference_solution.of(replace(system, coordinates=starts), END, 16, root)
+        own = reference_solution.solve(replace(system, coordinates=starts), END, 16, root)
     high, low = own.halves
     scale = np.abs(motion(np.linspace(0, END, 1000, dtype=np.longdouble))).max(axis=0)
 

@@ -51,7 +51,7 @@ from eomc.emit.plain import steppers
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text
-from eomc.report.equations import written
+from eomc.report.equations import write_equations
 from eomc.scene import schema
 from eomc.scene.read import parse
 
@@ -336,9 +336,9 @@ def test_systems_made_in_python(given: str) -> None:
         if name.endswith(".py"):
             ast.parse(text)
     namespace: dict[str, Any] = {}
-    exec(written(made, "python"), namespace)
+    exec(write_equations(made, "python"), namespace)
     assert namespace["__doc__"].startswith(texts.line(given) + ": D qdd")
-    text, latex = (written(made, form) for form in ("text", "latex"))
+    text, latex = (write_equations(made, form) for form in ("text", "latex"))
     ours = {"begin", "end", "ddot", "dot", "frac", "left", "mathrm", "quad", "right"}
     # names only, and those are plain
     assert {*re.findall(r"\\([A-Za-z]+)", latex)} <= ours and not re.search("[$#%]", latex)

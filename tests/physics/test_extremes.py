@@ -228,10 +228,10 @@ def test_accelerations_lose_what_the_condition_of_D_takes(m1: str, m2: str) -> N
 def test_motions_of_mass_ratios(m1: str, m2: str, duration: float, steps: int, most: float) -> None:
     """Against 25 digits, all along. Inner: a mode of 1,000 rad/s grows and dies, cond D = 1e5."""
     text = double_pendulum(m1, m2, duration)
-    exact = reference_solution.of(from_scene(parse(text, "ratio.toml")), root=BUILDS)
+    exact = reference_solution.solve(from_scene(parse(text, "ratio.toml")), root=BUILDS)
     assert exact.digits[-1] > 25
     run = with_methods(text, "rk4", "gauss8").simulate(
         h=duration / steps, steps=steps, every=steps // 256, method="gauss8"
     )
     assert run.status == "ok"
-    assert np.max(np.abs(exact.off(run.q, run.qd)) / exact.scale) < most
+    assert np.max(np.abs(exact.error_of(run.q, run.qd)) / exact.scale) < most

@@ -16,8 +16,8 @@ from eomc.base.errors import EomcError
 from eomc.report import animation
 from eomc.report.drawing import drawing
 from eomc.report.labels import html_name
-from eomc.report.origin import system_of
 from eomc.report.reel import Reel, part, which
+from eomc.report.system_of_run import system_of
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 

@@ -12,8 +12,8 @@ import pytest
 from report.pictures import chain, humanoid, motion, scene, system
 
 from eomc.report import animation
-from eomc.report.origin import system_of
 from eomc.report.reel import Instances, Reel
+from eomc.report.system_of_run import system_of
 
 pytestmark = [
     pytest.mark.slow,

@@ -45,9 +45,9 @@ def test_equations_have_the_force_of_the_constraint_and_the_constraint(winch: Pa
     assert "D q̈ + C q̇ + g = Aᵀλ" in text and "= 2⋅λ_rod⋅x" in text
     assert "rod: of positions" in text
     namespace: dict[str, object] = {}
-    exec(equations.written(found.system, "python"), namespace)  # our own text
-    assert namespace["scalar"][0] == equations.of(found.system).scalar[0]  # type: ignore[index]
-    assert r"\lambda_{\mathrm{rod}} x" in equations.written(found.system, "latex")
+    exec(equations.write_equations(found.system, "python"), namespace)  # our own text
+    assert namespace["scalar"][0] == equations.derive(found.system).scalar[0]  # type: ignore[index]
+    assert r"\lambda_{\mathrm{rod}} x" in equations.write_equations(found.system, "latex")
 
 
 def test_multipliers_are_shown_by_their_rows_names(winch: Path) -> None:
@@ -69,7 +69,7 @@ def test_what_is_generated_says_that_constraints_have_forces(winch: Path) -> Non
 
 @pytest.mark.slow
 def test_a_reference_solution_is_that_of_the_plain_equations(winch: Path, tmp_path: Path) -> None:
-    found = reference_solution.of(eomc.read(winch), 0.5, 4, tmp_path)
+    found = reference_solution.solve(eomc.read(winch), 0.5, 4, tmp_path)
     assert found.plain is not None
     accelerations, motion, until = found.plain
     assert accelerations > 30 and motion > 24 and until > 0

@@ -227,7 +227,7 @@ def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
         monkeypatch.setitem(sys.modules, name, None)
-    mathml._made.cache_clear()
+    mathml._convert.cache_clear()
     monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measured())
     scene = tmp_path / "oscillating.toml"
     scene.write_text(OSCILLATING)
@@ -355,6 +355,6 @@ def test_progress_begins_before_the_reference_is_computed(monkeypatch: pytest.Mo
         assert told == [(0, len(METHODS) + 3)]
         raise EomcError("seen")
 
-    monkeypatch.setattr(cost_of_digits.reference_solution, "of", of)
+    monkeypatch.setattr(cost_of_digits.reference_solution, "solve", of)
     with pytest.raises(EomcError, match="seen"):
         cost_of_digits.measure(SCENES / "cartpole.toml", progress=lambda *how: told.append(how))

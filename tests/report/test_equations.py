@@ -23,7 +23,7 @@ from eomc import pipeline
 from eomc.cli.main import main
 from eomc.model.symbols import symbol
 from eomc.report import equations_text
-from eomc.report.equations import of, written
+from eomc.report.equations import derive, write_equations
 from eomc.report.typeset import Typesetter
 from eomc.runtime.labels import tex
 from eomc.verify import symbolic
@@ -61,13 +61,13 @@ def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
         forces={"x": "F - k_3*x**3"}, inputs={"F": 0},
         parameters=dict.fromkeys(("m", "k", "c", "k_3"), 1),
     )  # fmt: skip
-    (found,) = of(made).scalar
+    (found,) = derive(made).scalar
     m, k, c, k_3, F = symbols("m k c k_3 F", real=True)
     x, v, a = symbols("x x_dot x_ddot", real=True)
     assert sympy.expand(found.lhs - (m * a + c * v + k * x)) == 0
     assert sympy.expand(found.rhs - (F - k_3 * x**3)) == 0
-    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in equations_text.latex(of(made))
-    text = unicodedata.normalize("NFC", str(of(made)))
+    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in equations_text.latex(derive(made))
+    text = unicodedata.normalize("NFC", str(derive(made)))
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
 
 
@@ -81,19 +81,19 @@ def test_decimals_of_a_scene_stay_decimals() -> None:
     """0.028, not 7/250; a third and an eighth stay fractions."""
     potential = "0.0125*x**2/2 + 0.007*x*(1 + m) - m*sin(x)/400 + x**3/8"
     made = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
-    text, latex = (form(of(made)) for form in (str, equations_text.latex))
+    text, latex = (form(derive(made)) for form in (str, equations_text.latex))
     assert "- 0.0025⋅m⋅cos(x) = 0" in text and "0.007 + 0.007⋅m + 0.0125⋅x" in text
     assert r"- 0.0025 m \cos {x} = 0" in latex and r"\frac{3 x^{2}}{8}" in latex
     found = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
     assert found and "- 0.0025 m \\sin {x}" in found[1] and "+ 0.0025 m \\sin {x}" in found[2]
     assert "000" not in text + latex
-    assert not of(made).g.atoms(sympy.Float)  # shown only
+    assert not derive(made).g.atoms(sympy.Float)  # shown only
 
 
 @pytest.mark.parametrize("file", scenes(SMALL))
 def test_terms_are_what_they_are_terms_of(file: Path) -> None:
     """With their signs: a sum behind a minus would lose all but its first."""
-    found = of(pipeline.read(file))
+    found = derive(pipeline.read(file))
     write = Typesetter(found.system)
     rng = np.random.default_rng(3)
     names = sorted(found.system.names | {"t"})
@@ -112,7 +112,7 @@ def test_terms_are_what_they_are_terms_of(file: Path) -> None:
 @pytest.mark.parametrize("file", scenes(SMALL))
 def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
     system = pipeline.read(file)
-    found, reference = of(system), symbolic.derive(system)
+    found, reference = derive(system), symbolic.derive(system)
     rng = np.random.default_rng(1)
     values = [p.value for p in system.parameters]
     for _ in range(3):
@@ -135,7 +135,7 @@ def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
 
 
 def test_terms_stand_as_a_textbook_has_them() -> None:
-    latex = equations_text.latex(of(pipeline.read(SCENES / "spring_pendulum.toml")))
+    latex = equations_text.latex(derive(pipeline.read(SCENES / "spring_pendulum.toml")))
     assert (
         r"& m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
         in latex
@@ -211,7 +211,7 @@ def test_of_four_links_each_entry_stands_by_itself(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("file", scenes(ALL))
 def test_text_is_mathematics_of_at_most_100_columns(file: Path) -> None:
-    text = written(pipeline.read(file))
+    text = write_equations(pipeline.read(file))
     assert not re.search(r"\*\*|;$|\bdouble\b|\bw\d+ =|\w\[", text, re.M), text
     assert max(stringPict(line).width() for line in text.splitlines()) <= 100
 
@@ -221,7 +221,7 @@ def test_what_is_too_wide_for_a_line_is_broken() -> None:
         "wide", ["x"], "m*x_dot**2/2", f"k*sqrt({' + '.join(f'(x - a_{i})**2' for i in range(9))})",
         parameters={"m": 1, "k": 1, **{f"a_{i}": 1 for i in range(9)}},
     )  # fmt: skip
-    text = str(of(made))
+    text = str(derive(made))
     assert max(stringPict(line).width() for line in text.splitlines()) <= 100
     write = Typesetter(made)
     terms = write.terms(sum(symbols("a:z")))
@@ -381,6 +381,6 @@ def test_equations_take_numbers_for_parameters(pendulum: Path) -> None:
 
 def test_a_fraction_that_a_double_does_not_tell_from_the_number_is_shown() -> None:
     made = eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0.3333333333333*x")
-    text = str(of(made))
+    text = str(derive(made))
     assert "2.6666" not in text and "[8/3]" in text
     assert "0.3333333333333" in text  # which is not a third

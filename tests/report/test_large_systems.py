@@ -25,7 +25,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.model.tree import Tree
 from eomc.report import large_system
-from eomc.report.equations import Equations, of, written
+from eomc.report.equations import Equations, derive, write_equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 
@@ -147,7 +147,7 @@ def test_long_equations_say_where() -> None:
 def test_abbreviations_keep_clear_of_names_of_the_scene() -> None:
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bb\b", "s_3", text).replace('"m"', '"D_12"').replace("\nm =", "\nD_12 =")
-    found = of(from_scene(parse(text.replace('"m*', '"D_12*'), "chain.toml"))).set_out
+    found = derive(from_scene(parse(text.replace('"m*', '"D_12*'), "chain.toml"))).set_out
     names = {str(s) for s, _ in found.named}
     assert {"h_1", "h_2"} <= names and not any(name.startswith("s") for name in names)
     rows = {str(s) for terms in found.left for _, c in terms for s in c.free_symbols}
@@ -158,11 +158,11 @@ def test_abbreviations_keep_clear_of_names_of_the_scene() -> None:
 
 def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
     system = pipeline.read(SCENES / "bricard.toml")
-    text = written(system)
+    text = write_equations(system)
     assert "would fill many pages" in text and "bar2 on bar1: turns about y by q₂" in text
     assert "hinge_rv: of positions, implied by others" in text and "bar5_r32 = 0" in text
     assert re.search(r"acceleration +\d+ flops", text)
-    for refused in (lambda: written(system, "python"), lambda: eomc.equations(system)):
+    for refused in (lambda: write_equations(system, "python"), lambda: eomc.equations(system)):
         with pytest.raises(EomcError, match="would fill many pages"):
             refused()
 
@@ -274,7 +274,7 @@ def test_latex_of_every_scene_compiles_in_katex(which: str, tmp_path: Path) -> N
         systems += [large(), from_scene(parse(EVERYTHING, "test.toml"))]
     else:
         systems = [from_scene(pictures.scene(name)) for name in pictures.ROBOTS]
-    parts = {s.name: written(s, "latex").split(r"\end{align*}")[:-1] for s in systems}
+    parts = {s.name: write_equations(s, "latex").split(r"\end{align*}")[:-1] for s in systems}
     file = tmp_path / "parts.json"
     file.write_text(json.dumps(parts), encoding="utf-8")
     script = """

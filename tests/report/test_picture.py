@@ -39,7 +39,7 @@ def test_earlier_instants_are_lighter():
     _, on, _ = drawn("double_pendulum")
     shades = [line.get_color() for line in on.get_lines() if line.get_zorder() == 1]
     greys = [float(shade) for shade in shades]
-    assert greys == sorted(greys, reverse=True) and len({*greys}) == picture.INSTANTS - 1
+    assert greys == sorted(greys, reverse=True) and len({*greys}) == picture.MAX_GHOSTS - 1
 
 
 def test_space_is_seen_along_three_arrows_of_a_stated_length():
@@ -47,20 +47,20 @@ def test_space_is_seen_along_three_arrows_of_a_stated_length():
     texts = [text.get_text() for text in on.texts]
     assert [t for t in texts if t][:3] == ["$x$", "$y$", "$z$"]
     assert any(t.endswith(" m") for t in texts) and not on.axison
-    right, above, near = picture.basis(2)
+    right, above, near = picture.view_basis(2)
     assert np.allclose(np.cross(right, above), near) and above[2] > 0.9 * np.hypot(*above[:2])
-    assert np.allclose(picture.basis(1) @ picture.basis(1).T, np.eye(3))
-    assert picture.basis(1)[1].argmax() == 1  # y upwards
-    assert picture.seen(shown.drawing).shape[2] == 2
+    assert np.allclose(picture.view_basis(1) @ picture.view_basis(1).T, np.eye(3))
+    assert picture.view_basis(1)[1].argmax() == 1  # y upwards
+    assert picture.project_points(shown.drawing).shape[2] == 2
 
 
 @pytest.mark.parametrize("name", ["suspension", "satellite", "crane", "heavy_top", "kepler_orbit"])
 def test_every_mark_is_drawn(name):
     """As many lines and symbols as the drawing has at its last instant."""
     made = drawn(name)[0].drawing
-    flat = picture.seen(made)[-1]
+    flat = picture.project_points(made)[-1]
     again = axes()
-    picture.still(again, made, flat)
+    picture.draw_marks(again, made, flat)
     lines = sum(
         len([*picture.outline(m, flat[list(m.points)], 0.1, 0.0)])
         for m in made.marks
@@ -77,13 +77,15 @@ def test_the_dot_of_a_path_is_where_the_mechanism_is():
     (dot,) = [line.get_xydata()[0] for line in on.get_lines() if line.get_zorder() == 6]
     rods = [line.get_xydata() for line in on.get_lines() if line.get_zorder() == 3]
     assert any(np.allclose(rod[-1], dot) for rod in rods if len(rod) == 2)
-    assert not np.allclose(dot, picture.seen(shown.drawing)[-1, shown.drawing.paths[0].point])
+    assert not np.allclose(
+        dot, picture.project_points(shown.drawing)[-1, shown.drawing.paths[0].point]
+    )
 
 
 def test_a_planet_is_drawn_once():
     """What is points alone is shown at the end of its path."""
     shown, on, _ = drawn("kepler_orbit")
-    flat = picture.seen(shown.drawing)
+    flat = picture.project_points(shown.drawing)
     dots = [line.get_xydata()[0] for line in on.get_lines() if len(line.get_xydata()) == 1]
     at = {tuple(np.round(dot, 9)) for dot in dots}
     assert at == {tuple(np.round(x, 9)) for x in flat[-1]}

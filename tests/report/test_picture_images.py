@@ -25,13 +25,13 @@ def drawn(made):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    flat = picture.seen(made)
+    flat = picture.project_points(made)
     figure = Figure(figsize=(2, 2), dpi=SIZE / 2)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
     for path in made.paths:
         axes.plot(*flat[:, path.point].T, linewidth=1.0)
-    picture.still(axes, made, flat[-1])
+    picture.draw_marks(axes, made, flat[-1])
     axes.update_datalim(flat.reshape(-1, 2))
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_axis_off()

@@ -50,7 +50,7 @@ def digits_right(name: str, made: reference_solution.Reference) -> float:
 
 
 def agrees(name: str) -> None:
-    made = reference_solution.of(case_system(name), root=REFERENCES)
+    made = reference_solution.solve(case_system(name), root=REFERENCES)
     assert made.digits[-1] >= 25
     # what it promises is right, as far as the case's 30 digits tell
     assert digits_right(name, made) > min(made.digits[-1], 29) - 0.5
@@ -87,7 +87,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def made(folder: Path) -> reference_solution.Reference:
     """That of the oscillator."""
-    return reference_solution.of(oscillator(), rows=8, root=folder)
+    return reference_solution.solve(oscillator(), rows=8, root=folder)
 
 
 def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> None:
@@ -103,7 +103,7 @@ def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> N
 
 def test_differences_are_right_below_double_precision(made: reference_solution.Reference) -> None:
     nearest = made.q.astype(float)
-    off = made.off(nearest, made.qd.astype(float))[:, 0]
+    off = made.error_of(nearest, made.qd.astype(float))[:, 0]
     expected = [float(Fraction(float(x)) - Fraction(str(s))) for x, s in zip(
         nearest[:, 0], made.q[:, 0], strict=True)]  # fmt: skip
     np.testing.assert_allclose(off, expected, rtol=1e-9, atol=1e-33)
@@ -115,39 +115,39 @@ def test_it_is_kept_until_start_or_parameters_change(
 ) -> None:
     system = oscillator()
     with monkeypatch.context() as patch:
-        patch.setattr(reference_solution, "_computed", lambda *a: pytest.fail("computed again"))
-        again = reference_solution.of(system, rows=8, root=folder)
+        patch.setattr(reference_solution, "_compute", lambda *a: pytest.fail("computed again"))
+        again = reference_solution.solve(system, rows=8, root=folder)
     np.testing.assert_array_equal(made.q, again.q)
     np.testing.assert_array_equal(made.digits, again.digits)
-    other = reference_solution.of(system.at({"k": 4.0}), rows=8, root=folder)
+    other = reference_solution.solve(system.at({"k": 4.0}), rows=8, root=folder)
     assert float(other.q[-1, 0]) == pytest.approx(np.cos(4.0), abs=1e-14)
 
 
 def test_accelerations_that_are_not_the_plain_ones_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wrong = reference_solution._compiled
-    monkeypatch.setattr(reference_solution, "_compiled", lambda s, f: wrong(s.at({"k": 9.0}), f))
+    wrong = reference_solution._compile
+    monkeypatch.setattr(reference_solution, "_compile", lambda s, f: wrong(s.at({"k": 9.0}), f))
     right = reference_solution._run
     monkeypatch.setattr(
         reference_solution, "_run", lambda e, s, *how: right(e, s.at({"k": 9.000000001}), *how)
     )
     with pytest.raises(EomcError, match="agree to 10 digits only"):
-        reference_solution.of(oscillator(), rows=4, root=tmp_path)
+        reference_solution.solve(oscillator(), rows=4, root=tmp_path)
 
 
 def test_what_it_can_not_do_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(EomcError, match="power of two"):
-        reference_solution.of(oscillator(), rows=100, root=tmp_path)
+        reference_solution.solve(oscillator(), rows=100, root=tmp_path)
     with pytest.raises(EomcError, match="number of seconds"):
-        reference_solution.of(oscillator(), duration=-1.0, root=tmp_path)
+        reference_solution.solve(oscillator(), duration=-1.0, root=tmp_path)
     with monkeypatch.context() as patch, pytest.raises(EomcError, match="shorter duration"):
-        patch.setattr(reference_solution, "SECONDS", 0.05)
-        reference_solution.of(oscillator(1e6), root=tmp_path)
+        patch.setattr(reference_solution, "MAX_SECONDS", 0.05)
+        reference_solution.solve(oscillator(1e6), root=tmp_path)
     monkeypatch.setattr(shutil, "which", lambda name: None if name == "gcc" else f"/bin/{name}")
     monkeypatch.setattr(reference_solution.builds, "key", lambda *a: "another")
     with pytest.raises(EomcError, match="libquadmath"):
-        reference_solution.of(oscillator(), rows=4, root=tmp_path)
+        reference_solution.solve(oscillator(), rows=4, root=tmp_path)
 
 
 @pytest.mark.parametrize(("status", "words"), [(3, "got to t = 1 s of 2 s"), (1, "t = 1 s: D is")])
@@ -166,7 +166,7 @@ def test_a_jump_costs_digits(tmp_path: Path) -> None:
     x, v = sympy.symbols("x x_dot")
     rubbed = System.make("rubbed", {x: (1.0, 0.0)}, v**2 / 2, 9 * x**2 / 2,
                          forces={x: -sympy.sign(v) / 2}, duration=2.0)  # fmt: skip
-    made = reference_solution.of(rubbed, rows=8, root=tmp_path)
+    made = reference_solution.solve(rubbed, rows=8, root=tmp_path)
     assert corners(rubbed) == "sign"
     assert made.digits[-1] < 20
     # half a swing about x = 1/18 until pi/3, then about -1/18
@@ -177,7 +177,7 @@ def test_a_jump_costs_digits(tmp_path: Path) -> None:
 
 def test_a_motion_that_sticks_at_a_jump_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EomcError, match=r"a force that jumps \(sign\) holds the motion there"):
-        reference_solution.of(case_system("coulomb_friction"), rows=4, root=tmp_path)
+        reference_solution.solve(case_system("coulomb_friction"), rows=4, root=tmp_path)
 
 
 @pytest.mark.slow
@@ -220,7 +220,7 @@ def test_gauss_coefficients_integrate_polynomials() -> None:
 
 def test_the_scene_file_itself_will_do(tmp_path: Path) -> None:
     scene = ROOT / "scenes" / "mass_spring.toml"
-    made = reference_solution.of(scene, duration=1.0, rows=2, root=tmp_path)
+    made = reference_solution.solve(scene, duration=1.0, rows=2, root=tmp_path)
     system = replace(eomc.read(scene))
     assert made.q.shape == (3, len(system.coordinates))
     assert (tmp_path / "mass_spring" / "reference_1.0_2.json").exists()

@@ -183,7 +183,7 @@ def test_no_other_formula_has_them() -> None:
 
 def test_equations_show_them() -> None:
     system = from_scene(parse(BALL, "test.toml"))
-    assert "tension = -2⋅λ_rod⋅l" in equations_text.text(equations.of(system))
+    assert "tension = -2⋅λ_rod⋅l" in equations_text.text(equations.derive(system))
 
 
 @pytest.mark.slow

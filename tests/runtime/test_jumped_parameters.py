@@ -168,7 +168,7 @@ def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
     core = constant(system)
     assert [c.name for c in core.coordinates] == ["x", "theta"]
     assert {p.name: p.value for p in core.parameters}["l"] == 0.5
-    assert "q = (x, theta)" in equations.written(system)
+    assert "q = (x, theta)" in equations.write_equations(system)
 
 
 MARKED = """eomc = 1

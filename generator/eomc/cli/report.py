@@ -32,7 +32,7 @@ def command(
     eomc report scenes/cartpole.toml
     eomc report scenes/cartpole.toml --digits 8
     """
-    from eomc.report import cost_of_digits, presented
+    from eomc.report import cost_of_digits, overview
     from eomc.report import page as pages
     from eomc.report.plot import without_pictures
 
@@ -56,7 +56,7 @@ def command(
             say(pages.table(made))
         page = root / made.scene / "report.html"
         with status_line(f"writing {shown(page)}", quiet):
-            text = pages.page(made, presented.of(system, made, root))
+            text = pages.page(made, overview.describe_scene(system, made, root))
         files.write_text(page, text)
         if not quiet:
             say(f"\nwrote {shown(page)}\n")

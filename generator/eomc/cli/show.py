@@ -43,7 +43,7 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         if form == "cost":
             text = equations_text.cost(system)
         else:
-            text = equations.written(system, form or "text")
+            text = equations.write_equations(system, form or "text")
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):

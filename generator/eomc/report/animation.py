@@ -21,8 +21,8 @@ from eomc.base.errors import EomcError, writing
 from eomc.emit.render import environment
 from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
-from eomc.report.origin import Source, system_of
 from eomc.report.reel import Instances, Panel, Reel
+from eomc.report.system_of_run import Source, system_of
 from eomc.runtime.written import replacing
 
 Array = NDArray[np.float64]
@@ -201,9 +201,9 @@ class _Shown:
         return {
             "title": texts.html(self.reel.title),
             "drawn": bool(made),
-            "plane": bool(made and made.plane),
+            "plane": bool(made and made.is_planar),
             "description": texts.html(
-                f"{self.reel.title}, {'in the plane' if made and made.plane else 'in space'}: "
+                f"{self.reel.title}, {'in the plane' if made and made.is_planar else 'in space'}: "
                 + ", ".join([*kinds, *([f"of {many} instances"] if many else [])])
             ),
             "key": [texts.html(words) for words in self.reel.key],
@@ -257,15 +257,15 @@ def _drawn(made: Drawing) -> dict[str, Any]:
         "labels": [name.replace("_", " ") for name in made.labels],
         "unit": made.unit,
         "up": made.up,
-        "follow": made.extent if made.travels else 0,
+        "follow": made.max_extent if made.travels else 0,
         "count": int(moves.sum()),
         "moving": _packed(moving) if moving.size else None,
         "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
                   for p in points[0, ~moves]],
         "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in made.marks],
-        "whose": [mark.whose for mark in made.marks if mark.whose is not None],
+        "whose": [mark.instance for mark in made.marks if mark.instance is not None],
         "paths": [
-            [p.name.replace("_", " "), int(place[p.point]), k if p.whose is None else p.whose]
+            [p.name.replace("_", " "), int(place[p.point]), k if p.instance is None else p.instance]
             for k, p in enumerate(made.paths)
         ],
     }  # fmt: skip

@@ -1,9 +1,10 @@
-"""What every digit of a scene costs: speed against error, and where each stepper breaks.
+"""Measure the cost of accuracy: computing time against error for every stepper of a scene.
 
-Every stepper that a scene can use runs at steps h = T/2^k, adaptive steps by tolerances, and is
-compared with the scene's reference solution. Errors are those of the worst of x = [q; qd], relative
-to its largest value along the motion; energy errors are jacobi's, relative to what K and P change
-by. Steppers' stability limits are compared with the eigenvalues of the linearised motion.
+Every stepper runs with steps h = T/2^k, and adaptive steps with a series of tolerances; each run is
+compared with the scene's reference solution. The error is the largest over x = [q; q̇], relative to
+the largest value of each component along the motion. The energy error is that of Jacobi's integral,
+relative to the change of K and P. Stability limits are computed from the eigenvalues of the
+linearised motion.
 """
 
 from __future__ import annotations
@@ -41,25 +42,26 @@ from eomc.report.linearised import (
 from eomc.report.reference_solution import Reference
 from eomc.verify.oracle import Vector
 
-ROWS = 256  # at which runs are compared with the reference
+ROW_COUNT = 256  # rows at which runs are compared with the reference
 DIGITS = range(3, 16)
-ADAPTIVE = "adaptive"  # among methods: steps that a tolerance chooses
+ADAPTIVE = "adaptive"  # name of adaptive steps among the methods
 TOLERANCES = tuple(10.0**-k for k in range(3, 16))
-LONGEST = 0.5  # s of computing of one run: no finer step after it
-REPEATS = 5
-LOST = 1.0  # an error as large as the motion
-ROUNDED = 0.7  # halving h leaves more of the error: rounding or the reference's digits decide
-CONDITION = 1e8  # of D with its diagonal scaled to 1: as many digits are lost
+MAX_RUN_SECONDS = 0.5  # computing time of one run, after which no finer run is made
+TIMING_REPEATS = 5
+USELESS_ERROR = 1.0  # an error as large as the motion
+ROUNDING_RATIO = 0.7  # halving h reduces the error by less where rounding limits it
+LARGE_CONDITION = 1e8  # condition number of D, diagonal scaled to 1, above which a remark is made
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One run: N steps of h, or by a tolerance tol, h on the average; tol is nan of fixed steps.
+    """One run, by fixed steps h or adaptive steps with a tolerance.
 
-    Errors are relative; inf where it did not get to the end.
+    Errors are relative, and inf if the run did not reach its end.
 
-    q, qd, end: of the last state, positions and velocities apart and together; along: the largest
-    at any row; energy: likewise, energies: over time. evaluations: of accelerations.
+    q, qd, end: error of the last positions, velocities, and both. along: largest error at any row.
+    energy: largest energy error; energies: its values over time. evaluations: number of evaluations
+    of the accelerations. tol: the tolerance, nan for fixed steps; then h is the mean step size.
     """
 
     method: str
@@ -78,7 +80,7 @@ class Point:
 
     @property
     def adaptive(self) -> bool:
-        """Whether its steps are chosen by a tolerance."""
+        """True if the steps are adaptive."""
         return not math.isnan(self.tol)
 
 
@@ -86,14 +88,12 @@ class Point:
 class Line:
     """One stepper: its runs from coarse to fine, and what follows from them.
 
-    Of adaptive steps order is the method's, the rest nan.
-
-    observed: the order, nan where too few errors are clear of rounding. usable_h: the largest h
-    measured that kept its error below 1 and so did all finer ones; stable_to: the one that
-    eigenvalues allow, inf for any. Up to it a small difference does not grow by the method's
-    doing (`check` tests that), but errors add up over the whole motion: usable_h is 0.4 to 0.8 of
-    it for regular motions, a tenth or less where differences grow or the fast part is short.
-    rounding: h from which on finer steps don't help, or nan.
+    observed: observed order, nan if too few errors are above rounding. usable_h: the largest
+    measured h for which the error of its run and of all finer ones is below 1. stable_to: largest
+    stable h by the eigenvalues, inf for any. Below it the method amplifies no perturbation (`check`
+    tests that), but errors accumulate: usable_h is 0.4 to 0.8 of it for regular motions, and a
+    tenth or less where perturbations grow or the fast part is short. rounding: h below which finer
+    steps do not help, or nan. For adaptive steps, all but `order` are nan.
     """
 
     method: str
@@ -107,7 +107,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Report:
-    """What was measured. digits: of the reference; skipped: steppers the scene can't use, why."""
+    """Results for one scene. digits: of the reference; skipped: unusable steppers, and why."""
 
     scene: str
     title: str
@@ -129,13 +129,13 @@ class Report:
         return tuple(p for line in self.lines for p in line.points)
 
     def best(self, digits: float) -> Point | None:
-        """The quickest run with that many digits all along the motion."""
+        """Return the fastest run with at least `digits` digits along the whole motion, or None."""
         good = (p for p in self.points if p.along <= 10.0**-digits)
         return min(good, key=lambda p: p.seconds, default=None)
 
     @property
     def finest(self) -> Point:
-        """The run with the smallest error."""
+        """Run with the smallest error."""
         return min(self.points, key=lambda p: p.along)
 
 
@@ -143,33 +143,50 @@ def measure(
     scene: System | str | os.PathLike[str],
     root: str | os.PathLike[str] = "build",
     *,
-    longest: float = LONGEST,
+    longest: float = MAX_RUN_SECONDS,
     methods: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """The measurement of one scene, from its start to its duration.
+    """Measure the cost of accuracy for one scene, from its initial state over its duration.
 
-    methods: all steppers where None, "adaptive" among them. longest: s of computing of a run,
-    after which no finer one is made. progress: called with (done, total). Raises EomcError as
-    `reference_solution.of` does.
+    Parameters
+    ----------
+    scene : System or path
+    root : path, optional
+        Build directory.
+    longest : float, optional
+        Computing time of a run in s, after which no finer run is made.
+    methods : sequence of str, optional
+        Steppers, "adaptive" among them; all by default.
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    EomcError
+        If the reference solution can't be computed (see `reference_solution.solve`).
     """
     system = scene if isinstance(scene, System) else pipeline.read(scene)
-    wanted = (*METHODS, ADAPTIVE) if methods is None else tuple(methods)
-    total = len(wanted) + 2  # the reference and the building besides, which take their time
+    names = (*METHODS, ADAPTIVE) if methods is None else tuple(methods)
+    total = len(names) + 2  # the reference and the building besides, which take their time
     progress(0, total)
-    reference = reference_solution.of(system, rows=ROWS, root=root)
+    reference = reference_solution.solve(system, rows=ROW_COUNT, root=root)
     progress(1, total)
-    module, skipped = variant(system, wanted, Path(root) / system.name / "report")
+    module, skipped = variant(system, names, Path(root) / system.name / "report")
     values, at, place = spectrum(module, reference)
-    against = _Against(
+    baseline = _Baseline(
         reference, at_rows(module.jacobi, reference), _energy_scale(module, reference)
     )
     lines = []
     for k, name in enumerate(module.methods):
         progress(k + 2, total)
-        lines.append(_line(module, against, name, values, system.run.duration, longest))
+        lines.append(_line(module, baseline, name, values, system.run.duration, longest))
     if module._model.tolerance:
-        lines.append(_adaptive(module, against, system.run.duration, longest))
+        lines.append(_adaptive(module, baseline, system.run.duration, longest))
     progress(total, total)
     points = [p for line in lines for p in line.points]
     finest = min((p for p in points if not p.adaptive), key=lambda p: p.along)
@@ -191,13 +208,14 @@ def measure(
     )
 
 
-def variant(system: System, wanted: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
-    """The scene with all steppers that it can use, and why it can't use the others.
+def variant(system: System, names: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
+    """Build the scene with all steppers in `names` that it can use.
 
-    Without its events, which fixed steps and the reference pass over.
+    Returns the module and the reasons why other steppers can't be used. The scene's events are
+    removed, since neither fixed steps nor the reference solution detect them.
     """
 
-    def made(methods: Sequence[str]) -> System:
+    def with_methods(methods: Sequence[str]) -> System:
         # another digest, since it is another module than the scene's own
         digest = hashlib.sha256(f"{system.digest} report {methods}".encode()).hexdigest()
         fixed = tuple(name for name in methods if name != ADAPTIVE) or ("rk4",)
@@ -206,13 +224,13 @@ def variant(system: System, wanted: Sequence[str], root: Path) -> tuple[ModuleTy
         return replace(system, run=run, digest=digest, events=())
 
     try:
-        return pipeline.load(made(wanted), root), {}
+        return pipeline.load(with_methods(names), root), {}
     except EomcError:
         pass
     usable, skipped = [], {}
-    for name in wanted:
+    for name in names:
         try:
-            pipeline.sources(made((name,)))
+            pipeline.sources(with_methods((name,)))
             usable.append(name)
         except SceneError as fault:
             skipped[name] = "; ".join(p.message for p in fault.problems)
@@ -220,15 +238,15 @@ def variant(system: System, wanted: Sequence[str], root: Path) -> tuple[ModuleTy
             skipped[name] = str(fault)
     if not set(usable) - {ADAPTIVE}:
         raise EomcError(f"{system.name}: no stepper can be used: {next(iter(skipped.values()))}")
-    return pipeline.load(made(usable), root), skipped
+    return pipeline.load(with_methods(usable), root), skipped
 
 
 # --- runs ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Against:
-    """The reference, Jacobi's integral along it, and what K and P change by."""
+class _Baseline:
+    """Reference solution, Jacobi's integral along it, and the scale of energy errors in J."""
 
     reference: Reference
     jacobi: Vector
@@ -236,10 +254,10 @@ class _Against:
 
 
 def _line(
-    module: ModuleType, against: _Against, name: str, values: Complex, duration: float,
+    module: ModuleType, baseline: _Baseline, name: str, values: Complex, duration: float,
     longest: float,
 ) -> Line:  # fmt: skip
-    """All runs of one stepper, from steps too long to steps that rounding or time forbids."""
+    """Run one stepper with decreasing h, from unstable steps to the limit of rounding or time."""
     method = METHODS[name]
     stable_to = stable_step(values, method.limits)
     speed = float(np.max(np.abs(values), initial=0.0)) or 1.0 / duration
@@ -247,14 +265,14 @@ def _line(
     power = max(3, math.floor(math.log2(duration / coarse)) - 1)
     points: list[Point] = []
     while power <= 26:
-        p = _point(module, against, name, duration, 2**power)
+        p = _point(module, baseline, name, duration, 2**power)
         points.append(p)
         power += 1
         if p.seconds > longest:
             break
         best = min(x.along for x in points[:-2]) if len(points) > 2 else math.inf
         # twice in a row no better than before: rounding; or an error that no step mends
-        if best < 1e-9 and min(x.along for x in points[-2:]) > ROUNDED * best:
+        if best < 1e-9 and min(x.along for x in points[-2:]) > ROUNDING_RATIO * best:
             break
     errors = [p.along for p in points]
     finest = int(np.argmin(errors))
@@ -263,12 +281,12 @@ def _line(
         math.log2(a / b) for a, b in pairwise(errors) if a < 0.01 and b > 300 * floor > 0 and b < a
     ]
     # the first that no finer step makes much better, and how many were tried
-    knee = next((k for k, e in enumerate(errors) if ROUNDED * e <= floor), finest)
+    knee = next((k for k, e in enumerate(errors) if ROUNDING_RATIO * e <= floor), finest)
     tried = len(points) - 1 - knee
-    settled = math.isfinite(floor) and (tried > 1 or (tried == 1 and floor < 1e-9))
+    saturated = math.isfinite(floor) and (tried > 1 or (tried == 1 and floor < 1e-9))
     usable_h = math.nan
     for p in reversed(points):
-        if not p.along < LOST:
+        if not p.along < USELESS_ERROR:
             break
         usable_h = p.h
     return Line(
@@ -278,78 +296,83 @@ def _line(
         observed=statistics.median(clear) if clear else math.nan,
         usable_h=usable_h,
         stable_to=stable_to,
-        rounding=points[knee].h if settled else math.nan,
+        rounding=points[knee].h if saturated else math.nan,
     )
 
 
-def _adaptive(module: ModuleType, against: _Against, duration: float, longest: float) -> Line:
-    """All runs by tolerances, from loose to tight."""
+def _adaptive(module: ModuleType, baseline: _Baseline, duration: float, longest: float) -> Line:
+    """Run adaptive steps with all tolerances, from loose to tight."""
     points: list[Point] = []
     for tol in TOLERANCES:
-        points.append(_point_of_tolerance(module, against, duration, tol))
+        points.append(_point_of_tolerance(module, baseline, duration, tol))
         if points[-1].seconds > longest:
             break
     order = 2 * len(GAUSS16.c)  # whose sweeps go to the end
     return Line(ADAPTIVE, order, tuple(points), math.nan, math.nan, math.nan, math.nan)
 
 
-def _point(module: ModuleType, against: _Against, name: str, duration: float, steps: int) -> Point:
-    """A run by fixed steps."""
-    h, rows = duration / steps, len(against.reference.t) - 1
+def _point(
+    module: ModuleType, baseline: _Baseline, name: str, duration: float, steps: int
+) -> Point:
+    """Return the result of a run with fixed steps."""
+    h, rows = duration / steps, len(baseline.reference.t) - 1
     every = max(1, steps // rows)
     run = simulate(module, method=name, h=h, steps=steps, every=every)
-    again = partial(simulate, module, method=name, h=h, steps=steps, every=steps)
-    return replace(_judged(module, against, run, again, max(1, rows // steps)), h=h, steps=steps)
+    repeat = partial(simulate, module, method=name, h=h, steps=steps, every=steps)
+    return replace(_compare(module, baseline, run, repeat, max(1, rows // steps)), h=h, steps=steps)
 
 
 def _point_of_tolerance(
-    module: ModuleType, against: _Against, duration: float, tol: float
+    module: ModuleType, baseline: _Baseline, duration: float, tol: float
 ) -> Point:
-    """A run by a tolerance."""
-    run = simulate(module, tol=tol, times=against.reference.t)
-    again = partial(simulate, module, tol=tol, duration=duration)  # a row a step, which are few
-    return replace(_judged(module, against, run, again, 1), method=ADAPTIVE, tol=tol)
+    """Return the result of a run with adaptive steps."""
+    run = simulate(module, tol=tol, times=baseline.reference.t)
+    repeat = partial(simulate, module, tol=tol, duration=duration)  # a row a step, which are few
+    return replace(_compare(module, baseline, run, repeat, 1), method=ADAPTIVE, tol=tol)
 
 
-def _judged(
-    module: ModuleType, against: _Against, run: Any, again: Callable[[], Any], stride: int
+def _compare(
+    module: ModuleType, baseline: _Baseline, run: Any, repeat: Callable[[], Any], stride: int
 ) -> Point:
-    """A run compared with every so many rows of the reference, and its time.
+    """Compare a run with every `stride`-th row of the reference, and time it.
 
-    That is the median of some runs `again` without rows.
+    The time is the median of several runs by `repeat`, which store no intermediate rows.
     """
-    reference = against.reference
+    reference = baseline.reference
     n, energies = len(module.coordinates), np.full(0, math.inf)
     q = qd = along = energy = math.inf
     if run.status == "ok":
         with np.errstate(all="ignore"):
-            off = np.abs(reference.off(run.q, run.qd, slice(None, None, stride))) / reference.scale
-            q, qd = float(np.max(off[-1, :n])), float(np.max(off[-1, n:]))
+            error = (
+                np.abs(reference.error_of(run.q, run.qd, slice(None, None, stride)))
+                / reference.scale
+            )
+            q, qd = float(np.max(error[-1, :n])), float(np.max(error[-1, n:]))
             # what the reference does not know counts as error
             unknown = np.max(10.0**-reference.digits)
-            along = float(max(np.max(off), unknown))
-            energies = np.abs(run.jacobi - against.jacobi[::stride]) / against.energy
+            along = float(max(np.max(error), unknown))
+            energies = np.abs(run.jacobi - baseline.jacobi[::stride]) / baseline.energy
             energy = float(np.max(energies))
-    spent = []
-    for _ in range(REPEATS):
-        begun = time.perf_counter()
-        timed = again()
-        spent.append(time.perf_counter() - begun)
-        if sum(spent) > 0.5:
+    durations = []
+    for _ in range(TIMING_REPEATS):
+        started_at = time.perf_counter()
+        timed = repeat()
+        durations.append(time.perf_counter() - started_at)
+        if sum(durations) > 0.5:
             break
 
-    def known(x: float) -> float:
+    def finite(x: float) -> float:
         return x if math.isfinite(x) else math.inf
 
     return Point(
-        method=run.method, h=run.h, steps=run.steps, status=run.status, q=known(q), qd=known(qd),
-        end=known(max(q, qd)), along=known(along), energy=known(energy), energies=energies,
-        seconds=statistics.median(spent), evaluations=timed.evaluations,
+        method=run.method, h=run.h, steps=run.steps, status=run.status, q=finite(q), qd=finite(qd),
+        end=finite(max(q, qd)), along=finite(along), energy=finite(energy), energies=energies,
+        seconds=statistics.median(durations), evaluations=timed.evaluations,
     )  # fmt: skip
 
 
 def _energy_scale(module: ModuleType, reference: Reference) -> float:
-    """What K and P change by along the motion, J; 1 where nothing moves."""
+    """Return the largest K plus the range of P along the motion, in J; 1 if nothing moves."""
     K = at_rows(module.kinetic_energy, reference)
     P = at_rows(module.potential_energy, reference, velocities=False)
     return float(np.max(np.abs(K)) + np.ptp(P)) or 1.0

@@ -17,9 +17,9 @@ Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its 
 
 @dataclass(frozen=True)
 class Derived:
-    """The expressions of `equations.Equations`, which says what each is.
+    """Expressions of the equations of motion; `equations.Equations` documents the fields.
 
-    symbols: by name the symbols that the expressions have in place of the system's own.
+    `symbols` maps names to the symbols that the expressions contain instead of the system's own.
     """
 
     system: System
@@ -35,50 +35,56 @@ class Derived:
     jacobi: Expr | None
     power: Expr | None
     linear_potential: Expr | None
-    left: tuple[Terms, ...]  # of each scalar equation
-    named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, in their order
+    left: tuple[Terms, ...]  # left-hand side of each scalar equation
+    named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, each over earlier ones
     symbols: Mapping[str, Expr] = field(default_factory=dict)
 
     @property
     def multipliers(self) -> tuple[Expr, ...]:
-        """The Lagrange multipliers, one a constraint."""
+        """Lagrange multipliers, one per constraint."""
         names = (f"lambda_{c.name}" for c in self.system.constraints)
         return tuple(self.symbols.get(name, symbol(name)) for name in names)
 
-    def replaced(self, values: Mapping[Expr, Expr], form: Callable[[Expr], Expr]) -> Self:
-        """Return the equations with `values` in place of symbols, each result in a `form`."""
+    def substitute(self, values: Mapping[Expr, Expr], form: Callable[[Expr], Expr]) -> Self:
+        """Return the equations with symbols replaced by `values`, and `form` applied to each."""
 
-        def new(e: Expr) -> Expr:
+        def substituted(e: Expr) -> Expr:
             return form(e.xreplace(values))
 
         matrices = ("D", "C", "g", "tau", "forces", "zero", "A")
         scalars = ("kinetic", "potential", "linear_potential", "jacobi", "power")
-        changed: dict[str, Any] = {name: getattr(self, name).applyfunc(new) for name in matrices}
-        changed |= {name: new(e) for name in scalars if (e := getattr(self, name)) is not None}
+        changed: dict[str, Any] = {
+            name: getattr(self, name).applyfunc(substituted) for name in matrices
+        }
+        changed |= {
+            name: substituted(e) for name in scalars if (e := getattr(self, name)) is not None
+        }
         return replace(
             self,
             **changed,
-            left=tuple([(e.xreplace(values), new(c)) for e, c in terms] for terms in self.left),
-            named=tuple((s.xreplace(values), new(e)) for s, e in self.named),
+            left=tuple(
+                [(e.xreplace(values), substituted(c)) for e, c in terms] for terms in self.left
+            ),
+            named=tuple((s.xreplace(values), substituted(e)) for s, e in self.named),
         )
 
     @property
     def right(self) -> ImmutableMatrix:
-        """The right sides of the scalar equations: forces, and A^T lambda."""
+        """Right-hand sides of the scalar equations: generalized forces plus Aᵀλ."""
         if not self.multipliers:
             return self.forces
         return self.forces + self.A.T * sympy.Matrix(self.multipliers)
 
     @property
     def L(self) -> Expr:
-        """The Lagrangian K - P - U, U the potential that is linear in the velocities."""
+        """Lagrangian K - P - U; U is the part of the potential linear in the velocities."""
         return self.kinetic - self.potential - (self.linear_potential or 0)
 
     @cached_property
     def scalar(self) -> tuple[sympy.Eq, ...]:
-        """d/dt dL/dqd - dL/dq + friction = forces, one equation a coordinate, unevaluated.
+        """Scalar equations d/dt ∂L/∂q̇ - ∂L/∂q + friction = forces, one per coordinate.
 
-        Under constraints the right side has A^T lambda besides.
+        They are not evaluated. With constraints, the right-hand side also contains Aᵀλ.
         """
         sides = zip(self.left, self.right, strict=True)
         return tuple(

@@ -1,8 +1,8 @@
-"""What is drawn of a mechanism: points that move and marks on them. Geometry only, no matplotlib.
+"""Drawings of a mechanism: moving points and the marks on them, without matplotlib.
 
-The one value from which pictures, pages and films are made. It holds what a scene declares: bodies,
-joints, points and springs, what its [picture] says (sketch.py has both), else the paths of
-points whose x and y it names. Nothing is guessed: where a scene says none of it, there is no
+Still figures, pages and films are all made from a `Drawing`. It contains what the scene declares:
+bodies, joints, points, springs and the shapes of [picture] (see sketch.py); without any of these,
+the paths of points whose x and y the scene names. A scene that declares nothing of the kind has no
 drawing.
 """
 
@@ -20,85 +20,89 @@ from eomc.model.numeric import compiled
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.report import sketch
-from eomc.report.marks import Drawing, Marks, together
+from eomc.report.marks import Drawing, Marks, superpose
 
 Array = NDArray[np.float64]
-FLAT = 1e-9  # of the size of a drawing: what moves out of a plane by less stays in it
+PLANE_TOLERANCE = 1e-9  # relative to the size of the drawing
 
 
 def drawing(system: System, t: Array, q: Array) -> Drawing | None:
-    """What is drawn of a system at some states; None where it says nothing about its shape.
+    """Return the drawing of a system at times `t` (n,) in s and positions `q` (n, nq).
 
-    t: (n,), s; q: (n, nq).
+    Returns None if the scene does not describe the shape of the mechanism.
     """
-    made = _made(system, t, q) if len(t) else None
-    return _flattened(made) if made else None
+    result = _draw(system, t, q) if len(t) else None
+    return _flatten(result) if result else None
 
 
 def drawings(systems: Sequence[System], t: Array, q: Array, names: Sequence[str]) -> Drawing | None:
-    """What is drawn of instances of one scene, over each other, as `drawing` of one.
+    """Return one drawing of several instances of a scene, drawn over each other.
 
-    q: (batch, n, nq). names: of the instances.
+    `q` has shape (batch, n, nq); `names` are the names of the instances. None as for `drawing`.
     """
     if not len(t):
         return None
-    each = [_made(system, t, own) for system, own in zip(systems, q, strict=True)]
-    made = together(each, names)
-    return _flattened(made) if made else None
+    each = [
+        _draw(system, t, values_of_one) for system, values_of_one in zip(systems, q, strict=True)
+    ]
+    result = superpose(each, names)
+    return _flatten(result) if result else None
 
 
-def _made(system: System, t: Array, q: Array) -> Drawing | None:
+def _draw(system: System, t: Array, q: Array) -> Drawing | None:
     values: dict[str, Any] = {p.name: p.value for p in system.parameters}
     columns = zip(system.coordinates, q.T, strict=True)
     values |= {c.name: own for c, own in columns if c.name in system.discrete}
     scene = system.scene or system.pictured
-    made = sketch.declared(scene, values, t, q) if scene else None
-    return made or _named(system, t, q)
+    declared = sketch.draw_declared(scene, values, t, q) if scene else None
+    return declared or _draw_named_points(system, t, q)
 
 
-def _flattened(made: Drawing) -> Drawing:
-    """In the plane, where a drawing in space never leaves x-z, y-z or x-y."""
-    if made.axes != "xyz":
-        return made
-    points = made.points[np.isfinite(made.points).all(axis=(1, 2))]
+def _flatten(original: Drawing) -> Drawing:
+    """Return a drawing that never leaves one of the planes x-z, y-z, x-y as a plane drawing."""
+    if original.axes != "xyz":
+        return original
+    points = original.points[np.isfinite(original.points).all(axis=(1, 2))]
     if not len(points):
-        return made
+        return original
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
-    for out in (1, 0, 2):  # seen from the front, from the side, from above
-        if high[out] - low[out] <= FLAT * (high - low).max():
-            kept = [k for k in range(3) if k != out]
-            kept.sort(key=lambda k: k == made.up)
-            axes = "".join("xyz"[k] for k in kept)
-            return Drawing(made.points[:, :, kept], made.marks, made.paths, axes, made.unit)
-    return made
+    for normal in (1, 0, 2):  # seen from the front, from the side, from above
+        if high[normal] - low[normal] <= PLANE_TOLERANCE * (high - low).max():
+            in_plane = [k for k in range(3) if k != normal]
+            in_plane.sort(key=lambda k: k == original.up)
+            axes = "".join("xyz"[k] for k in in_plane)
+            return Drawing(
+                original.points[:, :, in_plane], original.marks, original.paths, axes, original.unit
+            )
+    return original
 
 
 # --- points that a scene only names ---------------------------------------------------------------
 
 
-def _named(system: System, times: Array, q: Array) -> Drawing | None:
-    """The paths of points whose x and y are definitions or coordinates: x_p and y_p, x1 and y1."""
+def _draw_named_points(system: System, times: Array, q: Array) -> Drawing | None:
+    """Draw the paths of points whose x and y are named, such as x_p and y_p, or x1 and y1."""
     known = [c.name for c in system.coordinates] + [s.name for s, _ in system.definitions]
-    found = _positions(system, times, q, _pairs(known))
-    if not found:
+    paths = _positions(system, times, q, _pairs(known))
+    if not paths:
         return None
     marks = Marks(len(times))
-    for pair, path in found.items():
-        at = marks.point(np.column_stack([path, np.zeros(len(times))]))
-        marks.add("dot", at)
-        marks.path("(" + ", ".join(pair) + ")", at)
-    x, y = next(iter(found))
+    for pair, path in paths.items():
+        index = marks.point(np.column_stack([path, np.zeros(len(times))]))
+        marks.add("dot", index)
+        marks.path("(" + ", ".join(pair) + ")", index)
+    x, y = next(iter(paths))
     units = {c.unit for c in system.coordinates} | {p.unit for p in system.parameters}
-    names = (x, y) if len(found) == 1 else ("x", "y")
+    names = (x, y) if len(paths) == 1 else ("x", "y")
     return marks.drawing("xy", "m" if "m" in units else "", names)
 
 
 def _pairs(known: Sequence[str]) -> list[tuple[str, str]]:
-    """Names such as x_p and y_p, x1 and y1, tip_x and tip_y; not those that have a z as well."""
+    """Return pairs of names such as (x_p, y_p), (x1, y1), (tip_x, tip_y) without a matching z."""
     pairs = []
     for name in known:
-        if found := re.fullmatch(r"(|.*_)x(|_.*|\d+)", name):
-            before, after = found.groups()
+        if match := re.fullmatch(r"(|.*_)x(|_.*|\d+)", name):
+            before, after = match.groups()
             if f"{before}y{after}" in known and f"{before}z{after}" not in known:
                 pairs.append((name, f"{before}y{after}"))
     return pairs
@@ -107,26 +111,26 @@ def _pairs(known: Sequence[str]) -> list[tuple[str, str]]:
 def _positions(
     system: System, times: Array, q: Array, pairs: Sequence[tuple[str, str]]
 ) -> dict[tuple[str, str], Array]:
-    """The paths (n, 2) of the pairs that are functions of q and t and move with q."""
+    """Return the paths (n, 2) of those pairs that are functions of q and t only and depend on q."""
     if not pairs:
         return {}
     body = _bodies(system)
-    of = {s.name: body[s] for s in (*system.q, *(s for s, _ in system.definitions))}
+    expression = {s.name: body[s] for s in (*system.q, *(s for s, _ in system.definitions))}
     coordinates = set(system.q)
     chosen = []
     for pair in pairs:
-        used = of[pair[0]].free_symbols | of[pair[1]].free_symbols
-        rates = of[pair[0]].has(dot) or of[pair[1]].has(dot)
+        used = expression[pair[0]].free_symbols | expression[pair[1]].free_symbols
+        rates = expression[pair[0]].has(dot) or expression[pair[1]].has(dot)
         if not rates and used & coordinates and used <= coordinates | {time}:
             chosen.append(pair)
-    flat = [of[name] for pair in chosen for name in pair]
+    flat = [expression[name] for pair in chosen for name in pair]
     values = compiled((time, *system.q), flat, "numpy")(times, *q.T)
     columns = [np.broadcast_to(v, times.shape).astype(float) for v in values]
     return {pair: np.column_stack(columns[2 * k : 2 * k + 2]) for k, pair in enumerate(chosen)}
 
 
 def _bodies(system: System) -> dict[sympy.Symbol, sympy.Expr]:
-    """Every name as an expression in t, q and qd alone, parameters at their values."""
+    """Return each name's expression in t, q and q̇, at the values of the parameters."""
     body: dict[sympy.Symbol, sympy.Expr] = {s: s for s in system.q}
     body |= {p.symbol: sympy.Float(p.value) for p in system.parameters}
     for s, expr in system.definitions:

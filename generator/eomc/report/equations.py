@@ -1,4 +1,4 @@
-"""The equations of a system as they are taught: L, the scalar equations, D, C, g and tau."""
+"""Symbolic equations of motion in textbook form: L, the scalar equations, D, C, g and tau."""
 
 from __future__ import annotations
 
@@ -23,51 +23,69 @@ from eomc.scene.formulas import suggest
 from eomc.verify import symbolic
 from eomc.verify.shorter import coefficients, shorter
 
-EXPANDED = 30_000  # as symbolic.is_small counts: seconds for K without definitions
-DERIVED = 8_000  # operations of D, C and bias as they are derived, up to which they are simplified
-WRITTEN_OUT = 1_000  # operations of what is set out, which then fills a page or two
+MAX_EXPANDED_SIZE = 30_000  # size by symbolic.is_small; simplification then takes seconds
+MAX_DERIVED_OPERATIONS = 8_000  # in D, C and bias before simplification
+MAX_WRITTEN_OPERATIONS = 1_000  # in the printed equations, which then fill a page or two
 
 
 @dataclass(frozen=True, repr=False)
 class Equations(Derived):
-    """D q̈ + C q̇ + g = tau and what it comes from, as SymPy expressions over the scene's names.
+    """D q̈ + C q̇ + g = τ and its parts, as SymPy expressions over the scene's names.
 
-    With constraints, zero = 0 (m, 1), it is tau + A^T lambda, A (m, nq) and lambda (m,) symbols.
-    D, C: (nq, nq); g, tau: (nq, 1), tau = forces - friction. kinetic, potential: K and P;
-    linear_potential: the part of a generalized potential that is linear in the velocities, or None;
-    jacobi, power: Jacobi's integral and its rate, None where they say nothing more. `str` prints
-    them, at most 100 columns wide; a notebook shows them typeset; long ones with names for what
-    they share, `named` in those that are `set_out`.
+    Attributes
+    ----------
+    D, C : Matrix (nq, nq)
+        Mass matrix and Coriolis matrix (Christoffel form).
+    g, tau : Matrix (nq, 1)
+        Potential forces and generalized forces, tau = forces - friction.
+    zero, A : Matrix (m, 1) and (m, nq)
+        Constraints zero = 0 and their Jacobian. With constraints, the right-hand side is tau + A^T
+        lambda.
+    kinetic, potential : Expr
+        Energies K and P.
+    linear_potential : Expr or None
+        Part of a generalized potential that is linear in the velocities.
+    jacobi, power : Expr or None
+        Jacobi's integral and its rate, None if equal to the energy or zero.
+    symbols : mapping from names to symbols
+        For a scene these are plain symbols, `sympy.Symbol("m_c")`; for a System they are the
+        symbols and functions of time that were passed to `System.make`.
+    named : tuple of (symbol, Expr)
+        Abbreviations; only equations that are `set_out` have any.
 
-    The symbols of a scene's equations are plain ones, `sympy.Symbol("m_c")`; those of a System are
-    the symbols and functions of time that `System.make` was given. `symbols` has them by name.
+    Notes
+    -----
+    `str` returns text at most 100 columns wide, and a notebook shows the equations typeset. Long
+    equations are printed with names for shared subexpressions.
 
+    Examples
+    --------
     >>> import eomc
-    >>> found = eomc.equations("scenes/simple_pendulum.toml")   # doctest: +SKIP
-    >>> found.scalar                                            # doctest: +SKIP
+    >>> equations = eomc.equations("scenes/simple_pendulum.toml")  # doctest: +SKIP
+    >>> equations.scalar                                           # doctest: +SKIP
     (Eq(g*l*m*sin(theta) + l**2*m*theta_ddot, 0),)
-    >>> found.D.subs({"m": 2, "l": 0.5})                        # doctest: +SKIP
+    >>> equations.D.subs({"m": 2, "l": 0.5})                       # doctest: +SKIP
     Matrix([[0.5]])
     """
 
-    _internal: Equations | None = None  # the same over the system's own symbols, which are printed
+    _internal: Equations | None = None  # equations over the system's own symbols, for printing
 
     @cached_property
     def set_out(self) -> Equations:
-        """The same as they are printed: long ones by abbreviations."""
+        """The equations as they are printed: abbreviated if they are long."""
         if self._internal is not None:
-            return self._internal.set_out.in_symbols_of_the_user()
-        long = not self.named and _operations(self) > WRITTEN_OUT
-        return abbreviations.of(self) if long else self
+            return self._internal.set_out.with_user_symbols()
+        long = not self.named and _operations(self) > MAX_WRITTEN_OPERATIONS
+        return abbreviations.abbreviate(self) if long else self
 
-    def in_symbols_of_the_user(self) -> Equations:
-        """Return the equations over the symbols that the user has or can make by name."""
+    def with_user_symbols(self) -> Equations:
+        """Return the equations over symbols that the user has, or can create by name."""
         s = self.system
         names = [x.name for x in (*s.q, *s.qd, *s.qdd, *s.u, *(p.symbol for p in s.parameters))]
         names += [*(x.name for x in self.multipliers), *(x.name for x, _ in self.named), "t"]
         plain = {name: sympy.Symbol(name) for name in names}
         symbols = {name: s.own_symbols.get(name, plain[name]) for name in names}
-        changed = self.replaced({symbol(n): new for n, new in symbols.items()}, lambda e: e)
+        changed = self.substitute({symbol(n): new for n, new in symbols.items()}, lambda e: e)
         return replace(changed, symbols=symbols, _internal=self)
 
     def with_values(self, values: Mapping[Any, Any] | None = None, /, **by_name: Any) -> Equations:
@@ -91,7 +109,7 @@ class Equations(Derived):
             If a name is not one of a parameter, or a value not a finite real number.
         """
         if self._internal is None:
-            return self.in_symbols_of_the_user().with_values(values, **by_name)
+            return self.with_user_symbols().with_values(values, **by_name)
         parameters = {p.name: p.symbol for p in self.system.parameters}
         names = {self.symbols[name]: name for name in parameters}
         new = dict[Expr, Expr]()
@@ -104,7 +122,7 @@ class Equations(Derived):
                     + (f"there are {', '.join(known)}" if known else "there are none")
                 )
             new[parameters[name]] = _exact(value, f"with_values: {name}")
-        return self._internal.replaced(new, readable).in_symbols_of_the_user()
+        return self._internal.substitute(new, readable).with_user_symbols()
 
     def __repr__(self) -> str:
         s = self.system
@@ -138,17 +156,23 @@ def equations(scene: System | ScenePath) -> Equations:
         If the equations would fill many pages.
     """
     system = scene if isinstance(scene, System) else pipeline.read(scene)
-    return of(system).in_symbols_of_the_user()
+    return derive(system).with_user_symbols()
 
 
-def of(system: System) -> Equations:
-    """The equations of a system, simplified. Raises EomcError where they would fill many pages."""
+def derive(system: System) -> Equations:
+    """Return the simplified equations of a system, over its own symbols.
+
+    Raises EomcError if they would fill many pages.
+    """
     system = constant(system)
-    if not symbolic.is_small(system, EXPANDED):
-        raise too_long(system)
+    if not symbolic.is_small(system, MAX_EXPANDED_SIZE):
+        raise too_long_error(system)
     plain = symbolic.derive(symbolic.written_out(system))
-    if sum(e.count_ops() for name in ("D", "C", "bias") for e in getattr(plain, name)) > DERIVED:
-        raise too_long(system)
+    if (
+        sum(e.count_ops() for name in ("D", "C", "bias") for e in getattr(plain, name))
+        > MAX_DERIVED_OPERATIONS
+    ):
+        raise too_long_error(system)
 
     @cache
     def short(e: Expr) -> Expr:
@@ -160,20 +184,20 @@ def of(system: System) -> Equations:
     conserved = sympy.expand(plain.jacobi - plain.energy) == 0
     jacobi, power = None if conserved else short(plain.jacobi), short(plain.power)
     linear = readable(_energy(plain.linear_potential, system))
-    left = tuple(_left(system, D, plain.bias[i], friction[i], i) for i in range(len(system.q)))
-    made = Equations(
+    left = tuple(_left_side(system, D, plain.bias[i], friction[i], i) for i in range(len(system.q)))
+    result = Equations(
         system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
         plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
         readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
         jacobi, power if power != 0 else None, linear if linear != 0 else None, left,
     )  # fmt: skip
-    if _operations(made.set_out) > WRITTEN_OUT:
-        raise too_long(system)
-    return made
+    if _operations(result.set_out) > MAX_WRITTEN_OPERATIONS:
+        raise too_long_error(system)
+    return result
 
 
 def _exact(value: Any, what: str) -> Expr:
-    """Return a number as SymPy has it, a decimal one as a fraction. Raises EomcError."""
+    """Return a real, finite number in SymPy, a decimal as a fraction. Raises EomcError."""
     try:
         number = sympy.Rational(repr(float(value))) if not isinstance(value, Expr) else value
         number = sympy.nsimplify(number, rational=True) if number.has(sympy.Float) else number
@@ -184,33 +208,44 @@ def _exact(value: Any, what: str) -> Expr:
     return number
 
 
-def _operations(found: Equations) -> int:
-    """Of the scalar equations, and of what is named in them."""
-    rows = sum(b.count_ops() + 2 for terms in found.left for _, b in terms)
-    return int(rows + sum(e.count_ops() for _, e in found.named))
+def _operations(derived: Equations) -> int:
+    """Return the number of operations in the scalar equations and their abbreviations."""
+    rows = sum(b.count_ops() + 2 for terms in derived.left for _, b in terms)
+    return int(rows + sum(e.count_ops() for _, e in derived.named))
 
 
-def written(system: System, form: str = "text") -> str:
-    """L, the scalar equations, D, C, g and what else there is of D qdd + C qd + g = tau.
+def write_equations(system: System, form: str = "text") -> str:
+    """Return the equations of motion as text.
 
-    form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified, as
-    a textbook has them: written out, or by abbreviations. Those of a large system would be of no
-    use to anyone: what they come from is shown; "python" raises EomcError.
+    L, the scalar equations, D, C, g and all other parts are simplified and printed as in a
+    textbook. If they would fill many pages, the text states from what they are computed, and at
+    which cost.
+
+    Parameters
+    ----------
+    system : System
+    form : {"text", "latex", "python"}
+        "text" is Unicode for a terminal.
+
+    Raises
+    ------
+    EomcError
+        If the form is "python" and the equations would fill many pages.
     """
     try:
-        found = of(system)
+        derived = derive(system)
     except EomcError:
         if form == "python":
             raise
         system = constant(system)
         return large_system.latex(system) if form == "latex" else large_system.text(system)
     if form == "python":
-        return equations_text.python(found)
-    return found._repr_latex_() if form == "latex" else str(found)
+        return equations_text.python(derived)
+    return derived._repr_latex_() if form == "latex" else str(derived)
 
 
-def too_long(system: System) -> EomcError:
-    """What to say of a system whose equations nobody would read."""
+def too_long_error(system: System) -> EomcError:
+    """Return the error for equations that would fill many pages."""
     return EomcError(
         f"{system.name}: written out, its equations would fill many pages: 'eomc show' without "
         "--python says what they come from and how they are computed"
@@ -218,13 +253,13 @@ def too_long(system: System) -> EomcError:
 
 
 def _energy(e: Expr, system: System) -> Expr:
-    """A sum of products of rates, each with its own coefficient; what has none is a sum itself."""
+    """Return `e` as a sum of products of velocities, each with its collected coefficient."""
     terms = coefficients(e, system.qd)
     return e if terms is None else sympy.Add(*(a * b for a, b in terms))
 
 
-def _left(system: System, D: ImmutableMatrix, bias: Expr, friction: Expr, i: int) -> Terms:
-    """Row i of D q̈ + bias + friction, in terms: accelerations first, then by rates."""
+def _left_side(system: System, D: ImmutableMatrix, bias: Expr, friction: Expr, i: int) -> Terms:
+    """Return row i of D q̈ + bias + friction: terms in accelerations, in velocities, the rest."""
     terms = [(qdd, D[i, j]) for j, qdd in enumerate(system.qdd) if D[i, j] != 0]
     last: Terms = []
     for part in (bias, friction):

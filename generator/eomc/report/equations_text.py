@@ -1,4 +1,4 @@
-"""Equations and costs as text: for a terminal, for LaTeX, for Python."""
+"""Equations and operation counts as text for terminals, LaTeX and Python."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from eomc.model.system import Constraint, System, t
 from eomc.program import program
 from eomc.program.routes import ROUTES
 from eomc.report.derived import Derived, Terms
-from eomc.report.typeset import WIDE, Typesetter, spread
+from eomc.report.typeset import WIDE, Typesetter, distribute_decimal
 from eomc.runtime.labels import tex
 
-LENGTH = 3_000  # characters of one environment, about: KaTeX takes no more than a page
-GOES_ON = r"  & \quad "  # how a line begins that goes on with the last
+MAX_ENVIRONMENT_LENGTH = 3_000  # characters: KaTeX accepts about a page
+CONTINUATION = r"  & \quad "  # prefix of a line that continues the previous one
 
 _MEANING = {
     "kinetic": "kinetic energy",
@@ -43,16 +43,16 @@ _SYMBOL = {
 _LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 
 
-def _values(found: Derived) -> dict[str, Expr | MatrixBase]:
-    """What is shown, by its name."""
-    values = {name: getattr(found, name) for name in _MEANING}
-    if found.named:
+def _values(equations: Derived) -> dict[str, Expr | MatrixBase]:
+    """Return the expressions to be printed, by name."""
+    values = {name: getattr(equations, name) for name in _MEANING}
+    if equations.named:
         values["L"] = sympy.Symbol("K") - sympy.Symbol("P")
-        if found.linear_potential is not None:
+        if equations.linear_potential is not None:
             values["L"] -= sympy.Symbol("U")
-    if not found.system.constraints:
+    if not equations.system.constraints:
         del values["A"]
-    if all(e == 0 for e in found.tau):
+    if all(e == 0 for e in equations.tau):
         del values["tau"]
     return {name: value for name, value in values.items() if value is not None}
 
@@ -60,80 +60,80 @@ def _values(found: Derived) -> dict[str, Expr | MatrixBase]:
 # --- text -----------------------------------------------------------------------------------------
 
 
-def text(found: Derived) -> str:
-    """For a terminal, WIDE columns and an indent."""
-    system, write = found.system, Typesetter(found.system)
-    values, made = _values(found), list[str]()
-    parts = [wrapped(f"{title_of(system)}: {form_of('tau' in values, system)}")]
+def text(equations: Derived) -> str:
+    """Return the equations for a terminal, at most WIDE columns plus an indent."""
+    system, write = equations.system, Typesetter(equations.system)
+    values, section_lines = _values(equations), list[str]()
+    parts = [wrap(f"{title_line(system)}: {equation_form('tau' in values, system)}")]
     lines = []
-    for left, force in zip(found.left, found.right, strict=True):
+    for left, force in zip(equations.left, equations.right, strict=True):
         lines += [
             *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
             "",
         ]
     parts.append(section("equations of motion", lines[:-1]))
     if system.constraints:
-        made = []
-        for c, zero in zip(system.constraints, found.zero, strict=True):
-            made += [*write.text_lines(write.terms(zero), []), *told(c)]
-        parts.append(section("constraints", made))
-    if found.named:
-        made = [line for s, e in found.named for line in named_lines(write, s.name, e)]
-        parts.append(section("where, here and below", made))
+        section_lines = []
+        for c, zero in zip(system.constraints, equations.zero, strict=True):
+            section_lines += [*write.text_lines(write.terms(zero), []), *constraint_note(c)]
+        parts.append(section("constraints", section_lines))
+    if equations.named:
+        section_lines = [line for s, e in equations.named for line in named_lines(write, s.name, e)]
+        parts.append(section("where, here and below", section_lines))
     for name, value in values.items():
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
-        if name == "L" and found.linear_potential is not None:
+        if name == "L" and equations.linear_potential is not None:
             head += " - U"
         parts.append(section(head, list(_value_lines(write, name, value))))
     if system.outputs:
-        made = []
+        section_lines = []
         for name, formula in _outputs(system):
-            made += named_lines(write, name, formula)
-        parts.append(section("outputs", made))
+            section_lines += named_lines(write, name, formula)
+        parts.append(section("outputs", section_lines))
     return "\n\n".join(parts)
 
 
 def section(head: str, lines: list[str]) -> str:
-    """A heading and what stands under it."""
+    """Return a heading followed by indented lines."""
     return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
 
 
-def title_of(system: System) -> str:
-    """Of one line."""
+def title_line(system: System) -> str:
+    """Return the title of a system on one line."""
     return texts.line(system.title or system.name)
 
 
-def form_of(driven: bool, system: System) -> str:
-    """The form of the equations, and the order of q."""
-    return f"D q̈ + C q̇ + g = {right_of(driven, system)}, q = ({_order(system)})"
+def equation_form(driven: bool, system: System) -> str:
+    """Return the form of the equations and the order of q, as one line."""
+    return f"D q̈ + C q̇ + g = {right_hand_side(driven, system)}, q = ({_order(system)})"
 
 
-def right_of(driven: bool, system: System) -> str:
-    """What stands on their right side."""
+def right_hand_side(driven: bool, system: System) -> str:
+    """Return the right-hand side of the equations: τ, Aᵀλ, their sum, or 0."""
     return " + ".join([*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]) or "0"
 
 
-def told(c: Constraint) -> list[str]:
-    """What is to be said of a constraint beside its formula."""
-    said = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
-    said += ["implied by others, its multiplier 0"] if c.redundant else []
-    return [f"    {', '.join(said)}"]
+def constraint_note(c: Constraint) -> list[str]:
+    """Return a line with the name and kind of a constraint; also whether it is redundant."""
+    parts = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
+    parts += ["implied by others, its multiplier 0"] if c.redundant else []
+    return [f"    {', '.join(parts)}"]
 
 
 def _order(system: System) -> str:
     return ", ".join(c.name for c in system.coordinates)
 
 
-def wrapped(words: str) -> str:
-    """In lines of WIDE columns."""
+def wrap(words: str) -> str:
+    """Wrap text to WIDE columns."""
     return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
 
 
 def _flat(terms: Terms) -> Iterator[tuple[Expr, Expr]]:
-    """Sums that stand alone as terms of their own."""
+    """Yield the terms of an equation, with sums without velocities split into their terms."""
     for monomial, c in terms:
         if monomial == 1:
-            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(spread(c)))
+            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(distribute_decimal(c)))
         else:
             yield monomial, c
 
@@ -143,7 +143,7 @@ def _terms(write: Typesetter, e: Expr) -> list[tuple[bool, Expr]]:
 
 
 def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iterator[str]:
-    """An energy, or a matrix: by its entries that are not 0, where it is too wide."""
+    """Yield the lines of an energy or matrix; of a matrix that is too wide, the nonzero entries."""
     if not isinstance(value, MatrixBase):
         yield from _sum_lines(write, value)
         return
@@ -160,12 +160,12 @@ def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
 
 
 def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
-    """name = sum, its lines broken."""
+    """Return the lines of the equation name = e."""
     return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
 
 
 def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Expr]]:
-    """Entries that are not 0, by row and column from 1; of a symmetric matrix a half."""
+    """Yield ((row, column), entry) of the nonzero entries, from 1; of D the upper half only."""
     comma = "," if value.rows > 9 else ""
     for i in range(value.rows):
         for j in range(value.cols):
@@ -174,7 +174,7 @@ def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Ex
 
 
 def _outputs(system: System) -> list[tuple[str, Expr]]:
-    """The outputs' formulas over coordinates, without definitions."""
+    """Return the outputs as (name, formula) with all definitions substituted."""
     known = resolved(system.definitions)
     known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
     return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
@@ -183,38 +183,41 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
 # --- LaTeX ----------------------------------------------------------------------------------------
 
 
-def latex(found: Derived) -> str:
-    """Environments of amsmath: the equations of motion, then what is in them."""
-    return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(found))
+def latex(equations: Derived) -> str:
+    """Return the equations as amsmath environments: the equations of motion, then their parts."""
+    return "\n".join(
+        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}"
+        for body in environment_bodies(equations)
+    )
 
 
-def bodies(found: Derived) -> list[str]:
-    """What stands in each environment: equations of motion, or of the rest, as many as fit."""
-    made: list[str] = []
-    for lines in latex_lines(found):
-        made.append("")
+def environment_bodies(equations: Derived) -> list[str]:
+    """Return the contents of each environment, at most about MAX_ENVIRONMENT_LENGTH long."""
+    results: list[str] = []
+    for lines in latex_lines(equations):
+        results.append("")
         for line in lines:
-            if len(made[-1]) > LENGTH and not line.startswith(GOES_ON):
-                made.append("")
-            made[-1] += (" \\\\\n" if made[-1] else "") + line
-    return made
+            if len(results[-1]) > MAX_ENVIRONMENT_LENGTH and not line.startswith(CONTINUATION):
+                results.append("")
+            results[-1] += (" \\\\\n" if results[-1] else "") + line
+    return results
 
 
-def latex_lines(found: Derived) -> tuple[list[str], list[str]]:
-    """The lines of the equations of motion; those of energies, matrices and outputs."""
-    system, write = found.system, Typesetter(found.system)
+def latex_lines(equations: Derived) -> tuple[list[str], list[str]]:
+    """Return the lines of the equations of motion, and those of energies, matrices and outputs."""
+    system, write = equations.system, Typesetter(equations.system)
     motion = []
-    for left, force in zip(found.left, found.right, strict=True):
+    for left, force in zip(equations.left, equations.right, strict=True):
         terms = [write.term(a, b) for a, b in _flat(left)]
         first, *more = write.latex_lines(terms, _terms(write, force))
-        motion += [f"  & {first}", *(GOES_ON + line for line in more)]
-    for zero in found.zero:
+        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
+    for zero in equations.zero:
         first, *more = write.latex_lines(write.terms(zero), [])
-        motion += [f"  & {first}", *(GOES_ON + line for line in more)]
-    for name, value in found.named:
+        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
+    for name, value in equations.named:
         motion += latex_sum(write, tex(name.name), value)
     lines = []
-    for name, value in _values(found).items():
+    for name, value in _values(equations).items():
         symbol = _LATEX.get(name, name)
         if isinstance(value, MatrixBase):
             if write.text(write.ordered(value)).width() <= WIDE:
@@ -230,18 +233,18 @@ def latex_lines(found: Derived) -> tuple[list[str], list[str]]:
 
 
 def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
-    """The lines of symbol = sum."""
+    """Return the lines of the equation symbol = value."""
     first, *more = write.latex_lines(write.terms(value))
-    return [f"  {symbol} &= {first}", *(GOES_ON + line for line in more)]
+    return [f"  {symbol} &= {first}", *(CONTINUATION + line for line in more)]
 
 
 # --- Python ---------------------------------------------------------------------------------------
 
 
 class _Exact(StrPrinter):  # type: ignore[misc]
-    """Fractions that stand alone as Rational(1, 10): for Python 1/10 is 0.1.
+    """Prints rational numbers as Rational(1, 10), since 1/10 is a float in Python.
 
-    names: the variables of symbols whose own names are those of functions.
+    `names` maps symbols that are named like functions to the names of their variables.
     """
 
     def __init__(self, names: Mapping[str, str]) -> None:
@@ -260,27 +263,27 @@ class _Exact(StrPrinter):  # type: ignore[misc]
         return self.names.get(one.name, one.name)
 
 
-def python(found: Derived) -> str:
-    """Source that makes them again, exactly."""
-    system = found.system
+def python(equations: Derived) -> str:
+    """Return Python source that defines the same SymPy matrices exactly."""
+    system = equations.system
     symbols = [
         *system.q,
         *system.qd,
         *system.qdd,
         *system.u,
-        *found.multipliers,
+        *equations.multipliers,
         *(p.symbol for p in system.parameters),
         t,
     ]
-    values = _values(found)
-    called = {f.func.__name__ for e in (*values.values(), *found.right) for f in _functions(e)}
+    values = _values(equations)
+    called = {f.func.__name__ for e in (*values.values(), *equations.right) for f in _functions(e)}
     reserved = {"Matrix", "Eq", "Rational", "symbols", "exp", "sqrt", *called}
     variables = {s.name: s.name for s in symbols}
     for name in variables.keys() & reserved:
         while variables[name] in reserved | (variables.keys() - {name}):
             variables[name] += "_"
     written = _Exact(variables).doprint
-    names, title = ", ".join(s.name for s in symbols), texts.docstring(title_of(system))
+    names, title = ", ".join(s.name for s in symbols), texts.docstring(title_line(system))
     force = "tau + A^T lambda" if system.constraints else "tau"
     lines = [
         f'"""{title}: D qdd + C qd + g = {force}, as SymPy matrices."""',
@@ -292,10 +295,10 @@ def python(found: Derived) -> str:
     taken = {*variables.values()}
     for name, value in values.items():
         is_matrix = isinstance(value, MatrixBase)
-        made = written(value.tolist() if is_matrix else value)
-        made = f"Matrix({made})" if is_matrix else made
-        lines.append(f"{name + '_' if name in taken else name} = {made}")
-    pairs = ", ".join(f"Eq({written(e.lhs)}, {written(e.rhs)})" for e in found.scalar)
+        printed = written(value.tolist() if is_matrix else value)
+        printed = f"Matrix({printed})" if is_matrix else printed
+        lines.append(f"{name + '_' if name in taken else name} = {printed}")
+    pairs = ", ".join(f"Eq({written(e.lhs)}, {written(e.rhs)})" for e in equations.scalar)
     lines.append(f"{'scalar_' if 'scalar' in taken else 'scalar'} = [{pairs}]")
     return "\n".join(lines)
 
@@ -308,20 +311,20 @@ def _functions(value: Expr | MatrixBase) -> set[Expr]:
 
 
 def cost(system: System) -> str:
-    """The operations of each generated function, by each route, and why one was taken."""
-    head = f"{title_of(system)}: operations of one call, those on parameters alone left out"
+    """Return the operation counts of each generated function by each of its routes."""
+    head = f"{title_line(system)}: operations of one call, those on parameters alone left out"
     return f"{head}\n\n{costs(system)}"
 
 
 def costs(system: System) -> str:
-    """The table of `cost`, without its heading."""
-    made = program.build(lagrange.derive(system))
+    """Return the table of `cost` without its heading."""
+    lowered = program.build(lagrange.derive(system))
     lines = []
-    wide = max(map(len, made.functions))
+    wide = max(map(len, lowered.functions))
     routes: dict[str, None] = {}
-    for name, function in made.functions.items():
+    for name, function in lowered.functions.items():
         others = [f"{r} {c.flops}" for r, c in function.routes if r != function.route]
-        others += [f"{r} {why}" for r, why in made.passed_over.items() if name == "acceleration"]
+        others += [f"{r} {why}" for r, why in lowered.passed_over.items() if name == "acceleration"]
         lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}")
         if others:
             choice = f"({function.route}; {', '.join(others)})"

@@ -15,10 +15,10 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.report.drawing import drawing
 from eomc.report.marks import Drawing
-from eomc.report.origin import Source, system_of
-from eomc.report.picture import frame, seen, shapes, still
+from eomc.report.picture import draw_marks, frame, project_points, shapes
 from eomc.report.reel import Reel
 from eomc.report.style import COLOURS, INK, colours
+from eomc.report.system_of_run import Source, system_of
 from eomc.runtime.columns import imported
 from eomc.runtime.written import replacing
 
@@ -172,16 +172,18 @@ class _Moving:
     """What moves of one run: the marks, the paths so far and the time in the title."""
 
     def __init__(self, axes: Axes, made: Drawing, times: Array, instances: int, words: str) -> None:
-        self.axes, self.times, self.words, self.flat = axes, times, words, seen(made)
+        self.axes, self.times, self.words, self.flat = axes, times, words, project_points(made)
         hues = colours(instances or len(COLOURS))
         self.title = axes.set_title(self._title(0), fontsize=10, color=INK)
         pairs = [*zip(made.paths, hues, strict=False)]
         self.points = [path.point for path, _ in pairs]
         self.paths = [
-            axes.plot([], [], color=own if path.whose is None else hues[path.whose], linewidth=1.0)
+            axes.plot(
+                [], [], color=own if path.instance is None else hues[path.instance], linewidth=1.0
+            )
             for path, own in pairs
         ]
-        self.marks = still(axes, made, self.flat[0], hues=hues)
+        self.marks = draw_marks(axes, made, self.flat[0], hues=hues)
         self.shapes = [[line for line, _ in shapes(made, at, hues=hues)] for at in self.flat]
         for each in self.shapes:
             axes.update_datalim(np.concatenate(each))  # the view has room for all

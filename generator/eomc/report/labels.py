@@ -12,12 +12,12 @@ __all__ = ["html_name", "label", "mathtext", "rate_unit", "with_unit"]
 
 
 def label(coordinate: Coordinate | Output, rate: bool = False) -> str:
-    """A name with its unit, or that of its rate."""
+    """Return the label with unit of a coordinate or output, or of its time derivative (`rate`)."""
     return with_unit(mathtext(coordinate.name, rate), rate_unit(coordinate.unit, rate))
 
 
 def html_name(name: str, rate: bool = False) -> str:
-    """A plain name as it is printed in a page: theta_1 as θ with a subscript, words as words.
+    """Return a name as HTML: theta_1 as θ with a subscript; names of whole words stay words.
 
     >>> html_name("theta_1"), html_name("wrist_1_joint")
     ('θ<sub>1</sub>', 'wrist 1 joint')

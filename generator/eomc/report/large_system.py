@@ -1,6 +1,7 @@
-"""What is shown of a system whose equations would fill many pages, as text and as LaTeX.
+"""Text and LaTeX for a system whose written-out equations would fill many pages.
 
-The recursion over its joints, or its energies over their definitions, and what else acts.
+Instead of the equations, it shows the Newton-Euler recursion over the joints or the energies over
+their definitions, together with the other forces and constraints.
 """
 
 from __future__ import annotations
@@ -16,53 +17,53 @@ from eomc.model.symbols import needed
 from eomc.model.system import System, t
 from eomc.model.tree import Link, Tree
 from eomc.report.equations_text import (
-    GOES_ON,
+    CONTINUATION,
+    constraint_note,
     costs,
-    form_of,
+    equation_form,
     latex_sum,
     named_lines,
-    right_of,
+    right_hand_side,
     section,
-    title_of,
-    told,
-    wrapped,
+    title_line,
+    wrap,
 )
 from eomc.report.typeset import Typesetter, readable
 from eomc.runtime.labels import tex
 
-DECLARED = 60  # definitions, at most, that are shown
-LINES = 40  # of joints in one environment, which fill a page
+MAX_DEFINITIONS = 60  # definitions that are shown
+LINES_PER_ENVIRONMENT = 40  # joints that fill a page
 T, DQ = r"^{\mathsf{T}}", r"\dot{q}"
 
 
 def text(system: System) -> str:
-    """What the equations of a large system come from, and what it costs to compute them."""
+    """Return how the equations of a large system are formed, and what it costs to compute them."""
     write = Typesetter(system)
     parts = [
-        wrapped(f"{title_of(system)}: {form_of(_driven(system), system)}"),
+        wrap(f"{title_line(system)}: {equation_form(_driven(system), system)}"),
         "Written out, these equations would fill many pages. They are those of L = K - P,\n"
-        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_of(_driven(system), system)}.",
+        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_hand_side(_driven(system), system)}.",
     ]
     if system.tree is not None:
         parts.append(_recursion(system.tree, write))
-    known = _declared(system)
+    known = _shown_definitions(system)
     if known is not None and (known or _energies(system)):
-        made: list[str] = []
+        section_lines: list[str] = []
         for name, e in [*((str(s), e) for s, e in known), *_energies(system)]:
-            made += named_lines(write, name, e)
-        parts.append(section("energies, over definitions; a dot is d/dt", made))
+            section_lines += named_lines(write, name, e)
+        parts.append(section("energies, over definitions; a dot is d/dt", section_lines))
     if system.constraints:
-        made = []
+        section_lines = []
         for c in system.constraints:
             if known is not None:
-                made += write.text_lines(write.terms(c.formula), [])
-            made += told(c)
-        parts.append(section("constraints", made))
+                section_lines += write.text_lines(write.terms(c.formula), [])
+            section_lines += constraint_note(c)
+        parts.append(section("constraints", section_lines))
     return "\n\n".join([*parts, "What computes them:", costs(system)])
 
 
 def _recursion(tree: Tree, write: Typesetter) -> str:
-    """The recursion of Newton and Euler (Featherstone, 2008, table 5.1)."""
+    """Return the Newton-Euler recursion (Featherstone, 2008, table 5.1) and the list of joints."""
     lines = [
         "outward from parent p; S is the joint's axis, v a twist, a its rate, f a wrench:",
         "    v = X v_p + S q̇",
@@ -80,47 +81,52 @@ def _recursion(tree: Tree, write: Typesetter) -> str:
     return section(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
 
 
-def _declared(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
-    """The definitions that what is shown depends on, None where they are too many to read."""
-    along = (e for pair in system.applied for e in pair)
-    shown = [*(c.formula for c in system.constraints), *along, system.dissipation, *system.forces]
+def _shown_definitions(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
+    """Return the definitions that the shown formulas depend on; None if they are too many."""
+    applied = (e for pair in system.applied for e in pair)
+    shown = [*(c.formula for c in system.constraints), *applied, system.dissipation, *system.forces]
     shown += [e for _, e in _energies(system)]
     known = needed(system.definitions, shown)
-    return known if len(known) <= DECLARED else None
+    return known if len(known) <= MAX_DEFINITIONS else None
 
 
 def _energies(system: System) -> list[tuple[str, Expr]]:
-    """Those that no recursion accounts for."""
+    """Return the energies (name, formula) that the recursion over the tree does not include."""
     linear = [("U", system.linear_potential)] if system.linear_potential != 0 else []
     if system.tree is None:
         return [("K", system.kinetic), ("P", system.potential), *linear]
-    beside = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential), *linear)
-    return [(name, e) for name, e in beside if e != 0]
+    remaining = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential), *linear)
+    return [(name, e) for name, e in remaining if e != 0]
 
 
 # --- LaTeX ----------------------------------------------------------------------------------------
 
 
 def latex(system: System) -> str:
-    """Environments of amsmath: the form of the equations, and what they come from."""
-    return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(system))
+    """Return amsmath environments: the form of the equations, and how they are computed."""
+    return "\n".join(
+        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in environment_bodies(system)
+    )
 
 
-def bodies(system: System) -> list[str]:
-    """What stands in each environment."""
-    write, tree, known = Typesetter(system), system.tree, _declared(system)
+def environment_bodies(system: System) -> list[str]:
+    """Return the contents of each environment."""
+    write, tree, known = Typesetter(system), system.tree, _shown_definitions(system)
     parts = [_latex_form(system)]
     if tree is not None:
         parts[0] += _latex_recursion(tree, write)
         links = [line for k in range(len(tree.links)) for line in _latex_link(k, tree, write)]
-        parts += [links[k : k + LINES] for k in range(0, len(links), LINES)]
+        parts += [
+            links[k : k + LINES_PER_ENVIRONMENT]
+            for k in range(0, len(links), LINES_PER_ENVIRONMENT)
+        ]
     if known is not None:
         parts.append(_latex_rest(system, known, write))
     return [" \\\\\n".join(lines) for lines in parts if lines]
 
 
 def _latex_form(system: System) -> list[str]:
-    """The equations, and D, C, g by what they are derivatives of."""
+    """Return the lines of the equation of motion, and of D, C and g as derivatives."""
     force = " + ".join(
         [*([r"\tau"] * _driven(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
     )
@@ -142,43 +148,43 @@ def _latex_form(system: System) -> list[str]:
 
 
 def _driven(system: System) -> bool:
-    """Whether anything acts besides potentials and constraints."""
+    """True if anything acts besides potentials and constraint forces."""
     return bool(system.applied) or any(e != 0 for e in (system.dissipation, *system.forces))
 
 
 def _quadratic(system: System) -> bool:
-    """Whether K is surely of second degree in the rates alone, and C Christoffel's."""
+    """True if K is known to be homogeneous quadratic in the velocities."""
     tree = system.tree
     timed = any(e.has(t) for _, e in system.definitions)
     return tree is not None and not timed and tree.beside_kinetic == 0
 
 
 def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
-    """As in `_recursion`: twists (angular, linear) and wrenches (moment, force) of joint k."""
+    """Return `_recursion` in LaTeX, with twists (angular, linear) and wrenches (moment, force)."""
     K, P = "K'", "P'"
     wrench, energy = rf"S_{{k}}{T} f_{{k}}", rf"v_{{k}}{T} I_{{k}} \, v_{{k}}"
     if any(link.armature != 0 for link in tree.links):
         wrench = rf"\left({wrench} + \alpha_{{k}} \ddot{{s}}_{{k}}\right)"
         energy = rf"\left({energy} + \alpha_{{k}} \dot{{s}}_{{k}}^{{2}}\right)"
-    beside = f" + {_slope(P, 'q')}" * (tree.beside_potential != 0)
+    other_terms = f" + {_slope(P, 'q')}" * (tree.beside_potential != 0)
     if tree.beside_kinetic != 0:
-        beside += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
+        other_terms += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
     turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
     X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
     return [
         r"  & \text{Joint } k \text{ on } p \text{ moves by } s_{k} \text{ along } S_{k}; "
         r"\; r_{k}, R_{k} \text{: its frame in that of } p;",
-        rf"{GOES_ON}v_{{k}}, a_{{k}} \text{{: its twist (angular, linear) and the rate; }} "
+        rf"{CONTINUATION}v_{{k}}, a_{{k}} \text{{: its twist (angular, linear) and the rate; }} "
         r"f_{k} \text{: its wrench;}",
-        rf"{GOES_ON}m_{{k}}, c_{{k}}, J_{{k}} \text{{: mass, mass times its centre, inertia about "
-        r"the frame's origin.}",
+        rf"{CONTINUATION}m_{{k}}, c_{{k}}, J_{{k}} \text{{: mass, mass times its centre, inertia "
+        r"about the frame's origin.}",
         r"  v_{k} &= X_{k} \, v_{p} + S_{k} \, \dot{s}_{k}, \quad v_{0} = 0",
         r"  a_{k} &= X_{k} \, a_{p} + S_{k} \, \ddot{s}_{k} + v_{k} \times S_{k} \, \dot{s}_{k}, "
         rf"\quad a_{{0}} = \left(0, -\gamma\right), \; \gamma = {_vector(tree.gravity, write)}",
         r"  f_{k} &= I_{k} \, a_{k} + v_{k} \times^{*} I_{k} \, v_{k} + "
         rf"\sum_{{p(c) = k}} X_{{c}}{T} f_{{c}}",
         rf"  D \, \ddot{{q}} + C \, {DQ} + g &= \sum_{{k}} {_slope('s_{k}', 'q')} "
-        rf"{wrench}{beside}",
+        rf"{wrench}{other_terms}",
         rf"  K &= \frac{{1}}{{2}} \sum_{{k}} {energy}"
         + f" + {K}" * (tree.beside_kinetic != 0)
         + r", \quad "
@@ -191,7 +197,7 @@ def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
 
 
 def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
-    """Where joint k stands, how it moves, and the mass that moves with it."""
+    """Return the frame of joint k, its motion, and the mass and inertia that move with it."""
     link = tree.links[k]
     parent = "the world" if link.parent < 0 else tree.links[link.parent].name
     n, axis = k + 1, "xyz"[link.axis]
@@ -214,27 +220,27 @@ def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
         if (xy, xz, yz) == ("0", "0", "0"):
             J = rf"\operatorname{{diag}}\left({xx}, {yy}, {zz}\right)"
         lines.append(
-            rf"{GOES_ON}m_{{{n}}} = {_formula(link.mass, write)}, \; c_{{{n}}} = "
+            rf"{CONTINUATION}m_{{{n}}} = {_formula(link.mass, write)}, \; c_{{{n}}} = "
             rf"{_vector(link.moment, write)}, \; J_{{{n}}} = {J}"
         )
     if link.armature != 0:
-        lines.append(rf"{GOES_ON}\alpha_{{{n}}} = {_formula(link.armature, write)}")
+        lines.append(rf"{CONTINUATION}\alpha_{{{n}}} = {_formula(link.armature, write)}")
     return lines
 
 
 def _latex_rest(
     system: System, known: list[tuple[sympy.Symbol, Expr]], write: Typesetter
 ) -> list[str]:
-    """Energies, friction and forces over definitions, and the rows of constraints."""
+    """Return the energies, friction, forces and constraints over their definitions."""
     lines = [line for s, e in known for line in latex_sum(write, write.latex(s), e)]
     for name, e in _energies(system):
         lines += latex_sum(write, name, e)
     friction = f" - {_slope('R', DQ)}" * (system.dissipation != 0)
-    along = "".join(
+    applied_forces = "".join(
         f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in range(1, len(system.applied) + 1)
     )
     if _driven(system):
-        lines.append(rf"  \tau &= Q{friction}{along}")
+        lines.append(rf"  \tau &= Q{friction}{applied_forces}")
     if friction:
         lines += latex_sum(write, "R", system.dissipation)
     for i, force in enumerate(system.forces, 1):
@@ -244,12 +250,12 @@ def _latex_rest(
         lines += latex_sum(write, f"y_{{{k}}}", y) + latex_sum(write, f"F_{{{k}}}", force)
     for c in system.constraints:
         first, *more = write.latex_lines(write.terms(c.formula), [])
-        lines += [f"  & {first}", *(GOES_ON + line for line in more)]
+        lines += [f"  & {first}", *(CONTINUATION + line for line in more)]
     return lines
 
 
-def _slope(of: str, along: str) -> str:
-    return rf"\frac{{\partial {of}}}{{\partial {along}}}"
+def _slope(numerator: str, denominator: str) -> str:
+    return rf"\frac{{\partial {numerator}}}{{\partial {denominator}}}"
 
 
 def _formula(e: Expr, write: Typesetter) -> str:
@@ -261,7 +267,7 @@ def _vector(v: Vector, write: Typesetter) -> str:
 
 
 def _rotation(link: Link, write: Typesetter) -> str:
-    """That of the frame before its joint moves; nothing where it is none."""
+    """Return the rotation of the joint's frame before the joint moves; "" for the identity."""
     if sympy.Matrix(link.rotation) == sympy.eye(3):
         return ""
     return _matrix([[_formula(e, write) for e in row] for row in link.rotation])

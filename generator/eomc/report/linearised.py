@@ -1,6 +1,7 @@
-"""The linearised motion along a reference solution: eigenvalues, and how differences grow.
+"""The linearised motion along a reference solution: eigenvalues and growth of perturbations.
 
-Eigenvalues are those of d[qd; qdd]/dx, x = [q; qd], by central differences of the module.
+The eigenvalues are those of ∂[q̇; q̈]/∂x, x = [q; q̇], by central differences of the module's
+accelerations.
 """
 
 from __future__ import annotations
@@ -21,19 +22,21 @@ from eomc.verify.oracle import Vector
 
 Complex = NDArray[np.complex128]
 
-SEGMENTS = 64  # over which the growth of differences is put together
-NUDGE = 1e-6  # of each scale, for differences
-WILD = 30.0  # growth over the second half of the motion; regular motions grow by 2 to 4
+SEGMENT_COUNT = 64  # of the motion, each with one transition matrix
+DIFFERENCE_STEP = 1e-6  # relative to the scale of each coordinate and velocity
+CHAOS_GROWTH = (
+    30.0  # over the second half of the motion; perturbations of regular motions grow 2 to 4 times
+)
 EPSILON = 2.0**-53
 
 
 @dataclass(frozen=True)
 class Growth:
-    """The growth of a difference of the start, amplification (n,) at t (n,).
+    """Growth of a perturbation of the initial state: `amplification` (n,) at the times `t` (n,).
 
-    rate: of its growth over the second half beside that of the motion itself, 1/s; wild: whether
-    that is exponential. horizon: when a rounding has become a tenth of the motion, inf where it
-    does not.
+    rate: mean exponential rate over the second half of the motion, relative to the growth of the
+    motion itself, 1/s. wild: True if that growth is exponential (chaos). horizon: time at which
+    rounding errors have amplification to a tenth of the motion; inf if they do not.
     """
 
     t: Vector
@@ -43,41 +46,46 @@ class Growth:
     horizon: float
 
 
-def simulate(module: ModuleType, **how: Any) -> Any:
-    """A run of the module, whatever its end, without a word."""
+def simulate(module: ModuleType, **options: Any) -> Any:
+    """Simulate with the module, with all warnings suppressed."""
     # failures and advice are what is measured here
     quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
     with quiet, np.errstate(all="ignore"):
-        return module.simulate(**how)
+        return module.simulate(**options)
 
 
 def at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> Vector:
-    """A function of the module at the reference's states, each at its time."""
+    """Evaluate a function of the module at each state and time of the reference."""
     n = reference.q.shape[1]
     x = reference.halves[0]
-    given = (
+    states = (
         ((row[:n], row[n:]) if velocities else (row[:n],), t)
         for row, t in zip(x, reference.t, strict=True)
     )
-    return np.array([function(*state, t=float(t)) for state, t in given])
+    return np.array([function(*state, t=float(t)) for state, t in states])
 
 
 def stable_step(values: Complex, limits: tuple[float, float]) -> float:
-    """The largest stable h for eigenvalues l: (h Im l/limit_1)^2 + (h Re l/limit_2)^2 <= 1.
+    """Return the largest stable step for eigenvalues λ: (h Im λ/limit_1)² + (h Re λ/limit_2)² <= 1.
 
-    limits: of h omega, undamped, and h lambda, decaying; the ellipse through both lies close to
-    most methods' regions. What grows by itself does not count. inf: any h.
+    `limits` are the limits of h ω for undamped and of h |λ| for decaying solutions; the ellipse
+    through both approximates the stability region of most methods. Eigenvalues with a positive real
+    part count by their imaginary part only. Returns inf if any step is stable.
     """
     turn = np.abs(values.imag) / limits[0]
     decay = np.maximum(-values.real, 0.0) / limits[1]
-    most = float(np.max(np.hypot(turn, decay), initial=0.0))
-    return 1 / most if most > 0 else math.inf
+    fastest = float(np.max(np.hypot(turn, decay), initial=0.0))
+    return 1 / fastest if fastest > 0 else math.inf
 
 
 def spectrum(
     module: ModuleType, reference: Reference
 ) -> tuple[Complex, float, tuple[float, Vector]]:
-    """Eigenvalues of d[qd; qdd]/d[q; qd] along the reference; the largest condition of D, t, q."""
+    """Return the eigenvalues of ∂[q̇; q̈]/∂[q; q̇] along the reference.
+
+    The second value is the largest condition number of D (diagonal scaled to 1), the third its (t,
+    q).
+    """
     n, scale = reference.q.shape[1], reference.scale
     worst, place = 0.0, (0.0, reference.halves[0][0, :n])
     values: list[Complex] = []
@@ -89,22 +97,22 @@ def spectrum(
         )
         if condition > worst:
             worst, place = condition, (float(t), x[:n].copy())
-        by = np.diag(scale * NUDGE)
-        states = np.vstack([x + by, x - by])
+        displacement = np.diag(scale * DIFFERENCE_STEP)
+        states = np.vstack([x + displacement, x - displacement])
         try:
             a = module.acceleration(states[:, :n], states[:, n:], t=float(t))
         except ArithmeticError:  # MotionError: no linearisation where there is no motion
             continue
         A = np.zeros((2 * n, 2 * n))
         A[:n, n:] = np.eye(n)
-        A[n:] = ((a[: 2 * n] - a[2 * n :]) / (2 * NUDGE * scale[:, None])).T
+        A[n:] = ((a[: 2 * n] - a[2 * n :]) / (2 * DIFFERENCE_STEP * scale[:, None])).T
         if np.all(np.isfinite(A)):
             values.append(np.asarray(np.linalg.eigvals(A), complex))
     return np.concatenate(values) if values else np.zeros(0, complex), worst, place
 
 
-def _on_rows(module: ModuleType, x: Vector, t: float) -> Vector:
-    """The state nearest to [q; qd] that obeys the constraints, if there are; nothing is held."""
+def _project(module: ModuleType, x: Vector, t: float) -> Vector:
+    """Project the state x = [q; q̇] onto the constraints, if the module has any."""
     if not module._model.constraint_names:
         return x
     n = len(x) // 2
@@ -112,54 +120,62 @@ def _on_rows(module: ModuleType, x: Vector, t: float) -> Vector:
 
 
 def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
-    """The norm of the product of transition matrices from row to row of the reference.
+    """Return the growth of a perturbation: the norm of the product of transition matrices.
 
-    By runs of a method, of so many steps in all; the norm is that of `runtime.growth`.
+    Each matrix is computed by differences of runs with `method` over one segment of the reference;
+    `steps` is the number of steps over the whole motion. The norm is that of `runtime.growth`.
     """
     n, scale = reference.q.shape[1], reference.scale
-    stride = (len(reference.t) - 1) // SEGMENTS
-    steps = max(1, min(steps, 2**16) // SEGMENTS)
+    stride = (len(reference.t) - 1) // SEGMENT_COUNT
+    steps = max(1, min(steps, 2**16) // SEGMENT_COUNT)
     products = [np.eye(2 * n)]
     duration = float(reference.t[-1])
-    for k in range(SEGMENTS):
+    for k in range(SEGMENT_COUNT):
         x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
         ends = []
-        for by in (np.zeros(2 * n), *np.diag(scale * NUDGE)):
-            y = _on_rows(module, x + by, t0)
+        for displacement in (np.zeros(2 * n), *np.diag(scale * DIFFERENCE_STEP)):
+            y = _project(module, x + displacement, t0)
             run = simulate(
-                module, method=method, q0=y[:n], qd0=y[n:], h=duration / SEGMENTS / steps,
+                module, method=method, q0=y[:n], qd0=y[n:], h=duration / SEGMENT_COUNT / steps,
                 steps=steps, every=steps, t0=t0,
             )  # fmt: skip
             ends.append(np.hstack([run.q[-1], run.qd[-1]]) / scale)
         with np.errstate(all="ignore"):
-            products.append(((np.array(ends[1:]) - ends[0]).T / NUDGE) @ products[-1])
+            products.append(((np.array(ends[1:]) - ends[0]).T / DIFFERENCE_STEP) @ products[-1])
     x, t = reference.halves[0][::stride], reference.t[::stride]
     D = mean_mass_matrix(module, x[:, :n], t)
     moved = np.moveaxis(np.array(products), 2, 0) * scale  # by one scale of each at the start
     root = norm_root(D, [*moved], duration)
     start = np.diag(scale)
     factors = [multiplied(root, start, (scale * P.T).T) for P in products]
-    grown = np.maximum.accumulate(np.maximum(factors, 1.0))
+    amplification = np.maximum.accumulate(np.maximum(factors, 1.0))
     sizes = np.linalg.norm((x - x[0]) @ root.T, axis=1)  # of the motion itself
-    return _judged(t, grown, np.maximum.accumulate(sizes), np.linalg.norm(x @ root.T, axis=1))
+    return _judged(
+        t, amplification, np.maximum.accumulate(sizes), np.linalg.norm(x @ root.T, axis=1)
+    )
 
 
-def _judged(t: Vector, grown: Vector, sizes: Vector, values: Vector) -> Growth:
-    """Growth, and whether it is exponential beside that of the motion, which may run away itself.
+def _judged(t: Vector, amplification: Vector, sizes: Vector, values: Vector) -> Growth:
+    """Return the growth, which counts as exponential relative to that of the motion only.
 
-    sizes: how far the motion has come until each time, values: how large the state is, in the norm.
+    sizes: largest distance of the motion from its start so far; values: size of the state; both in
+    the norm.
     """
     half, duration = len(t) // 2, float(t[-1])
-    own = grown[-1] / max(sizes[-1] / sizes[half], 1.0) if sizes[half] > 0 else grown[-1]
-    rise = math.log(own / grown[half]) if math.isfinite(own) else math.inf
-    rate, wild = rise / (duration / 2), rise > math.log(WILD)
+    own = (
+        amplification[-1] / max(sizes[-1] / sizes[half], 1.0)
+        if sizes[half] > 0
+        else amplification[-1]
+    )
+    rise = math.log(own / amplification[half]) if math.isfinite(own) else math.inf
+    rate, wild = rise / (duration / 2), rise > math.log(CHAOS_GROWTH)
     # of a rounding at any time on the way
-    carried = EPSILON * grown * np.maximum.accumulate(values / grown)
+    carried = EPSILON * amplification * np.maximum.accumulate(values / amplification)
     most = 0.1 * (sizes[-1] or values.max() or 1.0)
-    lost = np.flatnonzero(~(carried <= most))
+    unreliable = np.flatnonzero(~(carried <= most))
     horizon = math.inf
-    if len(lost):
-        horizon = float(t[lost[0]])
+    if len(unreliable):
+        horizon = float(t[unreliable[0]])
     elif wild and rate > 0:
         horizon = float(duration + math.log(most / carried[-1]) / rate)
-    return Growth(t=t, amplification=grown, rate=rate, wild=wild, horizon=horizon)
+    return Growth(t=t, amplification=amplification, rate=rate, wild=wild, horizon=horizon)

@@ -1,4 +1,4 @@
-"""Points that move, and marks on them: what every drawing is made of."""
+"""Moving points and the marks on them, from which drawings are made."""
 
 from __future__ import annotations
 
@@ -10,29 +10,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-FAR = 8.0  # times its own extent
+TRAVEL_LIMIT = 8.0  # times its own extent: how far a mechanism may move in one picture
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One thing drawn on some of a drawing's points.
-
-    kind: what it is, and how many points it has.
+    """One mark, drawn on some of a drawing's points. The kind determines how many points it has.
 
     =========  ============================================================================
     line       of a [picture], through two points or more
-    rod        two points of one body
+    rod        between two points of one body
     arm        from a body's frame to its centre of mass
-    rail       what a slide travels along
+    rail       along the path of a sliding body
     spring     a coil between two points
     damper     a dashpot between two points
     box        a centre and the tips of its half axes: two in the plane, three in space
-    inertia    a box of the same mass and moments of inertia as a body
+    inertia    a box with the mass and moments of inertia of a body
     circle     a centre and the tips of two radii
-    joint      where a body turns; spiral: with a spring that turns
+    joint      a revolute joint; spiral: one with a torsion spring
     slide      a body on a rail
-    ground     what is fixed to the world
-    mass       a centre of mass, and in the plane another point to show how it is turned
+    ground     a point fixed to the world
+    mass       a centre of mass, and in the plane a second point that shows the rotation
     point      a [[point]]
     dot        a point of a [picture]
     =========  ============================================================================
@@ -40,25 +38,26 @@ class Mark:
 
     kind: str
     points: tuple[int, ...]
-    whose: int | None = None  # of which instance, where several are drawn over each other
+    instance: int | None = None  # index, if several instances are drawn over each other
 
 
 @dataclass(frozen=True)
 class Path:
-    """The path of a point that has a name."""
+    """The path of a named point."""
 
     name: str
     point: int
-    whose: int | None = None
+    instance: int | None = None
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """What is drawn at n instants.
+    """A drawing of a mechanism at n instants.
 
-    points: (n, points, 2 or 3), in `unit`; not finite where a formula has no value. marks: from the
-    back to the front in the plane. axes: "xy", "xz", "yz" in the plane, "xyz" in space, seen with
-    axis `up` upwards. names: of the axes, where a scene has names for them.
+    points: (n, points, 2 or 3), in `unit`, not finite where a formula has no value. marks: in the
+    plane in drawing order, from back to front. axes: "xy", "xz" or "yz" in the plane, "xyz" in
+    space, where the axis with index `up` points upwards. names: the scene's names of the axes, if
+    it has any.
     """
 
     points: Array
@@ -70,27 +69,27 @@ class Drawing:
     up: int = 2
 
     @property
-    def plane(self) -> bool:
-        """Whether it lies in a plane."""
+    def is_planar(self) -> bool:
+        """True if the drawing is in a plane."""
         return len(self.axes) == 2
 
     @property
-    def extent(self) -> float:
-        """The largest extent that all its points have at an instant; 0 where none is known."""
+    def max_extent(self) -> float:
+        """Largest extent of all points at one instant; 0 if no position is finite."""
         with np.errstate(invalid="ignore"):
             sizes = np.ptp(self.points, axis=1).max(axis=1, initial=0.0)
         return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
     @property
     def travels(self) -> bool:
-        """Whether it goes so far that it would be a dot in a picture of all of it."""
-        still = self.points[np.isfinite(self.points).all(axis=(1, 2))]
-        whole = float(np.ptp(still, axis=(0, 1)).max(initial=0.0)) if len(still) else 0.0
-        return whole > FAR * self.extent > 0
+        """True if the mechanism moves too far for one picture of its whole motion."""
+        finite = self.points[np.isfinite(self.points).all(axis=(1, 2))]
+        range_ = float(np.ptp(finite, axis=(0, 1)).max(initial=0.0)) if len(finite) else 0.0
+        return range_ > TRAVEL_LIMIT * self.max_extent > 0
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the axes are called."""
+        """Names of the axes."""
         return self.names or tuple(self.axes)
 
 
@@ -100,7 +99,7 @@ _ORDER = ("rail", "inertia", "box", "circle", "arm", "line", "rod", "spring", "d
 
 @dataclass
 class Marks:
-    """Collects points and marks of a drawing at `count` instants; equal points are one."""
+    """Collects the points and marks of a drawing at `count` instants; merges equal points."""
 
     count: int
     points: list[Array] = field(default_factory=list)
@@ -109,7 +108,7 @@ class Marks:
     _index: dict[bytes, int] = field(default_factory=dict)
 
     def point(self, at: ArrayLike) -> int:
-        """The index of a point that moves, (n, 3), or stands, (3,)."""
+        """Add a moving point (n, 3) or a fixed one (3,), and return its index."""
         path = np.ascontiguousarray(np.broadcast_to(np.asarray(at, dtype=float), (self.count, 3)))
         path = path + 0.0  # no zero has a sign
         key = blake2b(path.tobytes()).digest()
@@ -119,7 +118,7 @@ class Marks:
         return self._index[key]
 
     def add(self, kind: str, *points: int) -> None:
-        """A mark, unless it is there already or would have no length."""
+        """Add a mark, unless it exists already or has zero length."""
         if len(points) > 1 and len(set(points)) == 1:
             return
         mark = Mark(kind, points)
@@ -127,7 +126,7 @@ class Marks:
             self.marks.append(mark)
 
     def path(self, name: str, point: int) -> None:
-        """The path of a point, where it moves."""
+        """Add the path of a point if the point moves."""
         moves = np.ptp(self.points[point], axis=0).max(initial=0.0) > 0
         if moves and point not in [p.point for p in self.paths]:
             self.paths.append(Path(name, point))
@@ -135,7 +134,7 @@ class Marks:
     def drawing(
         self, axes: str, unit: str = "m", names: tuple[str, ...] = (), up: int = 2
     ) -> Drawing | None:
-        """The whole; None where there is nothing in it."""
+        """Return the drawing; None if it is empty."""
         if not self.marks and not self.paths:
             return None
         ordered = sorted(self.marks, key=lambda mark: _ORDER.index(mark.kind))
@@ -149,21 +148,18 @@ class Marks:
         return Drawing(points, marks, paths, axes, unit, names, up)
 
 
-def together(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Drawing | None:
-    """Instances of one scene over each other, with a path of each under its name.
-
-    None where nothing is drawn of any.
-    """
+def superpose(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Drawing | None:
+    """Return one drawing of several instances, with one named path each; None if all are None."""
     points, marks, paths = list[Array](), list[Mark](), list[Path]()
-    made = [each for each in drawings if each]
-    for whose, (each, name) in enumerate(zip(drawings, names, strict=True)):
+    nonempty = [each for each in drawings if each]
+    for instance, (each, name) in enumerate(zip(drawings, names, strict=True)):
         if each is None:
             continue
-        at = sum(some.shape[1] for some in points)
-        marks += [Mark(m.kind, tuple(at + k for k in m.points), whose) for m in each.marks]
-        paths += [Path(name, at + p.point, whose) for p in each.paths[:1]]
+        offset = sum(some.shape[1] for some in points)
+        marks += [Mark(m.kind, tuple(offset + k for k in m.points), instance) for m in each.marks]
+        paths += [Path(name, offset + p.point, instance) for p in each.paths[:1]]
         points.append(each.points)
-    if not made:
+    if not nonempty:
         return None
-    whole = np.concatenate(points, axis=1)
-    return replace(made[0], points=whole, marks=tuple(marks), paths=tuple(paths))
+    all_points = np.concatenate(points, axis=1)
+    return replace(nonempty[0], points=all_points, marks=tuple(marks), paths=tuple(paths))

@@ -1,4 +1,4 @@
-"""Equations as MathML, which browsers set without a script: LaTeX goes through latex2mathml."""
+"""Equations as MathML, which browsers show without a script: LaTeX converted by latex2mathml."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ _FUNCTION = re.compile(r"<mi>(a?(?:sin|cos|tan)h?|exp|log|min|max|arg)</mi>")
 _SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
 
 
-def lines(found: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool, Markup]]]:
-    """The lines of the equations of motion, and of the rest: whether each goes on with the last.
+def lines(derived: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool, Markup]]]:
+    """Return the lines of the equations of motion, and of all other formulas, as MathML.
 
-    Raises EomcError without latex2mathml.
+    Each line comes with True if it continues the previous one. Raises EomcError if latex2mathml is
+    not installed.
     """
     first, second = (
-        [_line(x) for x in lines] for lines in equations_text.latex_lines(found.set_out)
+        [_line(x) for x in lines] for lines in equations_text.latex_lines(derived.set_out)
     )
     return first, second
 
 
 def _line(text: str) -> tuple[bool, Markup]:
-    more = text.startswith(equations_text.GOES_ON)
+    continues = text.startswith(equations_text.CONTINUATION)
     left, _, right = text.partition("&")
-    return more, _made((left + right.replace(r"\quad", "", int(more))).strip())
+    return continues, _convert((left + right.replace(r"\quad", "", int(continues))).strip())
 
 
 @cache
-def _made(latex: str) -> Markup:
+def _convert(latex: str) -> Markup:
     try:
         from latex2mathml.converter import convert
     except ImportError:
         raise EomcError("equations in a page need latex2mathml: pip install latex2mathml") from None
-    made = convert(latex).replace('display="inline"', 'displaystyle="true"')
-    return Markup(_FUNCTION.sub(_SPACED, made))
+    converted = convert(latex).replace('display="inline"', 'displaystyle="true"')
+    return Markup(_FUNCTION.sub(_SPACED, converted))

@@ -1,4 +1,4 @@
-"""The words, the table and the page of a measurement: recommendations, remarks, pictures."""
+"""Text, JSON and HTML of the report of `cost_of_digits`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from markupsafe import Markup
 
 from eomc.base import texts
 from eomc.emit.render import environment
-from eomc.report.cost_of_digits import CONDITION, DIGITS, LOST, Point, Report
+from eomc.report.cost_of_digits import DIGITS, LARGE_CONDITION, USELESS_ERROR, Point, Report
+from eomc.report.overview import Overview
 from eomc.report.plot import svg, without_pictures
-from eomc.report.presented import Presented
 
 EXPLAINED = """\
 Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
@@ -24,107 +24,112 @@ more than the motion. Rounding from: the h below which finer steps don't help.""
 
 
 def recommendation(report: Report, digits: float, to: float | None = None) -> str:
-    """For 6 digits up to t = 10 s: dp8 with h = 40 ms, 0.1 ms of computing. to: so many as well."""
-    found = report.best(digits)
+    """Return one recommendation, such as "for 6 digits up to t = 10 s: dp8 with h = 40 ms, ...".
+
+    If `to` is given, the recommendation is for `digits` to `to` digits.
+    """
+    best = report.best(digits)
     span = f"{digits:g}" if to is None or to == digits else f"{digits:g} to {to:g}"
     what = f"for {span} digits up to t = {report.duration:g} s"
-    if found is None:
+    if best is None:
         p = report.finest
-        if not p.along < LOST:
+        if not p.along < USELESS_ERROR:
             return f"{what}: no stepper follows this motion to its end"
         return (
             f"{what}: out of reach here; the most is {-math.log10(p.along):.1f} digits, by "
-            f"{_by(p)}, {_time(p.seconds)} of computing"
+            f"{_stepper_text(p)}, {_time(p.seconds)} of computing"
         )
-    parts = "" if found.adaptive else f" ({report.duration:g} s/{found.steps})"
+    parts = "" if best.adaptive else f" ({report.duration:g} s/{best.steps})"
     return (
-        f"{what}: {_by(found)}{parts}, {_time(found.seconds)} of computing, "
-        f"{found.evaluations} evaluations"
+        f"{what}: {_stepper_text(best)}{parts}, {_time(best.seconds)} of computing, "
+        f"{best.evaluations} evaluations"
     )
 
 
-def _by(p: Point) -> str:
-    """dp8 with h = 40 ms; adaptive steps with tol = 1e-09, 52 steps."""
+def _stepper_text(p: Point) -> str:
+    """Return "dp8 with h = 40 ms", or "adaptive steps with tol = 1e-09, 52 steps"."""
     if p.adaptive:
         return f"adaptive steps with tol = {p.tol:g}, {p.steps} steps"
     return f"{p.method} with h = {_time(p.h)}"
 
 
-def _step(p: Point) -> str:
-    """A step size, or the tolerance that chooses it."""
+def _step_text(p: Point) -> str:
+    """Return the step size, or the tolerance of an adaptive run."""
     return f"tol {p.tol:g}" if p.adaptive else _time(p.h)
 
 
 def recommendations(report: Report) -> list[str]:
-    """One for each run that is the best for some digits, and one for what is out of reach."""
+    """Return one recommendation for each range of digits, also for digits out of reach."""
     spans: list[tuple[Point | None, list[int]]] = []
     for digits in DIGITS:
-        found = report.best(digits)
-        if not spans or spans[-1][0] is not found:
-            spans.append((found, []))
+        best = report.best(digits)
+        if not spans or spans[-1][0] is not best:
+            spans.append((best, []))
         spans[-1][1].append(digits)
     return [recommendation(report, digits[0], digits[-1]) for _, digits in spans]
 
 
 def digit_rows(report: Report) -> list[tuple[str, ...]]:
-    """Of each number of digits: the texts of stepper, h, steps, evaluations and computing."""
-    made: list[tuple[str, ...]] = []
+    """Return a table row per number of digits: stepper, h, steps, evaluations and time."""
+    table_rows: list[tuple[str, ...]] = []
     for digits in DIGITS:
         p = report.best(digits)
         if p is None:
-            made.append((str(digits), "out of reach", "-", "-", "-", "-"))
+            table_rows.append((str(digits), "out of reach", "-", "-", "-", "-"))
         else:
-            times = (_step(p), str(p.steps), str(p.evaluations), _time(p.seconds))
-            made.append((str(digits), p.method, *times))
-    return made
+            times = (_step_text(p), str(p.steps), str(p.evaluations), _time(p.seconds))
+            table_rows.append((str(digits), p.method, *times))
+    return table_rows
 
 
 def remarks(report: Report) -> list[str]:
-    """What a person should know of this scene, in sentences."""
+    """Return remarks on chaos, the accuracy of the reference, the condition of D, and events."""
     g = report.growth
-    said = [
+    sentences = [
         f"A small difference at the start grows {g.amplification[-1]:.2g}-fold in "
         f"{report.duration:g} s"
         + (f", at the end by a factor e in {_time(1 / g.rate)} (chaos)." if g.wild else ".")
     ]
     if math.isfinite(g.horizon):
-        said.append(
+        sentences.append(
             f"Beyond t = {g.horizon:.3g} s no run in doubles means anything: the rounding of "
             "the start alone has grown to a tenth of the motion."
         )
     if report.digits < 25:
-        said.append(
+        sentences.append(
             f"The reference solution is known to {report.digits:.0f} digits only; smaller "
             "errors are not distinguished."
         )
-    condition, at, q = report.condition
+    condition, t_worst, q = report.condition
     where = ", ".join(f"{c} = {x:.4g}" for c, x in zip(report.coordinates, q, strict=True))
-    place = f"at t = {at:.4g} s, {where if len(q) <= 6 else f'{len(q)} coordinates'}"
-    if condition > CONDITION:
-        said.append(
+    place = f"at t = {t_worst:.4g} s, {where if len(q) <= 6 else f'{len(q)} coordinates'}"
+    if condition > LARGE_CONDITION:
+        sentences.append(
             f"D is nearly singular {place}: condition number {condition:.2g}, so "
             f"{math.log10(condition):.0f} digits of the accelerations are lost there."
         )
     else:
-        said.append(
+        sentences.append(
             f"D is regular: its condition number, once scaled to a diagonal of ones, is at most "
             f"{condition:.2g}, {place}."
         )
     if report.events:
-        said.append(
+        sentences.append(
             f"The scene has events ({report.events}); all figures here are of its motion without "
             "them."
         )
     if report.corners:
-        said.append(
+        sentences.append(
             f"Forces or energies jump or bend ({report.corners}): past a jump every fixed step "
             "is of order 1, whatever its method."
         )
-    return said + [f"{name} is not for this scene: {why}" for name, why in report.skipped.items()]
+    return sentences + [
+        f"{name} is not for this scene: {why}" for name, why in report.skipped.items()
+    ]
 
 
 def table(report: Report) -> str:
-    """Steppers, recommendations and remarks as text, for a terminal."""
+    """Return the table of steppers, the recommendations and the remarks as text for a terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -144,30 +149,32 @@ def table(report: Report) -> str:
 
 
 def rows(report: Report) -> list[tuple[str, ...]]:
-    """One for each stepper: the texts of the table."""
-    made: list[tuple[str, ...]] = []
+    """Return a table row for each stepper."""
+    table_rows: list[tuple[str, ...]] = []
     for line in report.lines:
         p = min(line.points, key=lambda p: p.along)
         stable_to = "any" if math.isinf(line.stable_to) else _time(line.stable_to)
-        found = (line.method, str(line.order), _figure(line.observed, "{:.1f}"))
-        times = (_step(p), _time(p.seconds), _time(line.rounding))
-        made.append((*found, _time(line.usable_h), stable_to, _figure(p.along, "{:.1e}"), *times))
-    return made
+        cells = (line.method, str(line.order), _figure(line.observed, "{:.1f}"))
+        times = (_step_text(p), _time(p.seconds), _time(line.rounding))
+        table_rows.append(
+            (*cells, _time(line.usable_h), stable_to, _figure(p.along, "{:.1e}"), *times)
+        )
+    return table_rows
 
 
 def as_dict(report: Report) -> dict[str, Any]:
-    """For JSON: the fields under their names, energies over time left out."""
+    """Return the report as a dictionary for JSON, without the energies over time."""
     best = {str(digits): report.best(digits) for digits in DIGITS}
-    found = asdict(report) | {
+    fields = asdict(report) | {
         "best": {digits: asdict(p) if p else None for digits, p in best.items()},
         "recommendations": recommendations(report),
         "remarks": remarks(report),
     }
-    return {key: _for_json(value) for key, value in found.items()}
+    return {key: _for_json(value) for key, value in fields.items()}
 
 
 def _for_json(value: Any) -> Any:
-    """Numbers that are not finite become None, complex ones pairs."""
+    """Replace numbers that are not finite by None and complex numbers by pairs."""
     if isinstance(value, dict):
         return {key: _for_json(inside) for key, inside in value.items() if key != "energies"}
     if isinstance(value, complex):
@@ -177,28 +184,31 @@ def _for_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def page(report: Report, about: Presented | None = None) -> str:
-    """The report as one HTML page with its pictures in it; about: what the scene is.
+def page(report: Report, overview: Overview | None = None) -> str:
+    """Return the report as one HTML page with embedded figures.
 
-    Without matplotlib it has no pictures, and says so.
+    `overview` describes the scene. Without matplotlib the page has no figures and states the
+    reason.
     """
     shown = report.best(6) or report.finest
     runs = [
         (
-            p.method, _step(p), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
+            p.method, _step_text(p), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
             _figure(p.qd, "{:.1e}"), _figure(p.along, "{:.1e}"), _figure(p.energy, "{:.1e}"),
             str(p.evaluations), _time(p.seconds),
             _time(p.seconds / report.duration),
         )
         for p in report.points
     ]  # fmt: skip
-    asked = [p for p in report.points if p.adaptive and p.along < LOST]
-    lacking = without_pictures()
-    tolerances = _svg(lambda axes: _tolerances(axes, asked), (8.6, 3.6)) if asked else ""
+    adaptive_points = [p for p in report.points if p.adaptive and p.along < USELESS_ERROR]
+    missing_pictures = without_pictures()
+    tolerances = (
+        _svg(lambda axes: _tolerances(axes, adaptive_points), (8.6, 3.6)) if adaptive_points else ""
+    )
     template = environment().get_template("report/report.html.jinja")
     return template.render(
         report=report,
-        about=about,
+        about=overview,
         digit_rows=digit_rows(report),
         title=texts.html(report.title),
         rows=rows(report),
@@ -206,11 +216,11 @@ def page(report: Report, about: Presented | None = None) -> str:
         remarks=remarks(report),
         explained=EXPLAINED,
         runs=runs,
-        lacking=lacking,
+        lacking=missing_pictures,
         work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
         energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
         tolerances=tolerances,
-        growth=_svg(lambda axes: _grown(axes, report), (8.6, 3.0)),
+        growth=_svg(lambda axes: _growth(axes, report), (8.6, 3.0)),
         shown=_time(shown.seconds),
         digits=f"{report.digits:.0f}",
         duration=f"{report.duration:g}",
@@ -218,7 +228,7 @@ def page(report: Report, about: Presented | None = None) -> str:
 
 
 def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
-    """A picture as text of SVG, the same for the same report; empty without matplotlib."""
+    """Return a figure as SVG text, equal for equal reports; empty without matplotlib."""
     if without_pictures():
         return Markup("")
     import matplotlib
@@ -245,19 +255,19 @@ def _styles(report: Report) -> dict[str, tuple[str, str]]:
 
 
 def _work(axes: Any, report: Report) -> None:
-    """Error against time, the best stepper for each number of digits marked."""
+    """Plot error against computing time; the best stepper for each number of digits is marked."""
     styles = _styles(report)
     for line in report.lines:
         colour, mark = styles[line.method]
-        good = [p for p in line.points if p.along < LOST]
+        good = [p for p in line.points if p.along < USELESS_ERROR]
         axes.loglog(
             [p.seconds for p in good], [p.along for p in good], color=colour, marker=mark,
             markersize=4, linewidth=1.2, label=line.method,
         )  # fmt: skip
     marked: dict[tuple[str, int], tuple[Point, list[int]]] = {}
     for digits in DIGITS:
-        if found := report.best(digits):
-            marked.setdefault((found.method, found.steps), (found, []))[1].append(digits)
+        if best := report.best(digits):
+            marked.setdefault((best.method, best.steps), (best, []))[1].append(digits)
     for p, reached in marked.values():
         axes.plot(
             p.seconds, p.along, marker="o", markersize=12, markerfacecolor="none",
@@ -273,17 +283,17 @@ def _work(axes: Any, report: Report) -> None:
 
 
 def _energy(axes: Any, report: Report, shown: Point) -> None:
-    """Energy errors over time, each stepper at about the same computing time."""
+    """Plot energy errors over time, for runs of each stepper with similar computing times."""
     styles = _styles(report)
     for line in report.lines:
-        good = [p for p in line.points if p.along < LOST]
+        good = [p for p in line.points if p.along < USELESS_ERROR]
         if not good:
             continue
         p = min(good, key=lambda p: abs(math.log(p.seconds / shown.seconds)))
         t = report.t[:: max(1, (len(report.t) - 1) // (len(p.energies) - 1))]
         axes.semilogy(
             t, np.maximum(p.energies, 1e-17), color=styles[line.method][0], linewidth=1.0,
-            label=f"{line.method}, {_step(p) if p.adaptive else f'h = {_time(p.h)}'}",
+            label=f"{line.method}, {_step_text(p) if p.adaptive else f'h = {_time(p.h)}'}",
         )  # fmt: skip
     axes.set_xlabel("t, s")
     axes.set_ylabel("relative energy error")
@@ -291,7 +301,7 @@ def _energy(axes: Any, report: Report, shown: Point) -> None:
 
 
 def _tolerances(axes: Any, points: Sequence[Point]) -> None:
-    """The error of each run beside the tolerance that it was asked for."""
+    """Plot the error of each adaptive run against its tolerance."""
     tol = [p.tol for p in points]
     axes.loglog(tol, tol, color="#999999", linewidth=1.0, linestyle="--", label="as asked")
     for name, errors, mark in (
@@ -305,8 +315,8 @@ def _tolerances(axes: Any, points: Sequence[Point]) -> None:
     axes.legend(frameon=False)
 
 
-def _grown(axes: Any, report: Report) -> None:
-    """By what a difference at the start has grown."""
+def _growth(axes: Any, report: Report) -> None:
+    """Plot the growth of a perturbation of the initial state."""
     g = report.growth
     axes.semilogy(g.t, g.amplification, color="#333333", linewidth=1.4)
     axes.set_xlabel("t, s")
@@ -320,7 +330,7 @@ def _figure(value: float, form: str) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Seconds with a unit: 2 s, 4.88 ms, 12.3 us."""
+    """Return a time with a suitable unit: 2 s, 4.88 ms, 12.3 us."""
     if not math.isfinite(seconds):
         return "-"
     for size, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "us")):

@@ -1,4 +1,4 @@
-"""The picture beside the curves of a run, by matplotlib: the mechanism, or a path."""
+"""The picture beside the curves of a run, by matplotlib: the mechanism or a path."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from eomc.base.errors import EomcError
 from eomc.model.system import System
 from eomc.report.drawing import drawing
 from eomc.report.labels import label, mathtext, with_unit
-from eomc.report.marks import FAR, Drawing, Mark
-from eomc.report.origin import system_of
+from eomc.report.marks import TRAVEL_LIMIT, Drawing, Mark
 from eomc.report.style import COLOURS, INK, plain
+from eomc.report.system_of_run import system_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INSTANTS = 16  # at which a small mechanism is shown; MANY: marks from which there are fewer
-MANY = 24
-ROWS = 5000  # of a run from which a small picture is made, about
-AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, from where drawings in space are seen
-BODY, GHOST = "#4D4D4D", 0.80  # of rods; the lightest grey of an earlier instant
+MAX_GHOSTS = 16  # earlier instants at which a small mechanism is drawn
+MANY_MARKS = 24  # above it, fewer instants are drawn
+MAX_ROWS = 5000  # approximate number of rows from which a small picture is made
+AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, direction from which drawings in space are viewed
+BODY, GHOST = "#4D4D4D", 0.80  # colour of rods; lightest grey of an earlier instant
 
 
 def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve | None:
-    """What stands beside the curves: the mechanism, where the scene says what it looks like.
+    """Return the picture of a run: its mechanism, a phase portrait (nq = 1) or a path (nq = 2).
 
-    Else the phase portrait of one coordinate, the path of two, nothing of more. t: (n,), s; q, qd:
-    (n, nq).
+    `t` (n,) is in s; `q` and `qd` have shape (n, nq). The mechanism is drawn if the scene describes
+    its shape. Returns None for more coordinates without a shape.
     """
     if not len(t):
         return None
-    if made := drawing(system, t, q):
-        return Mechanism(t, made)
+    if result := drawing(system, t, q):
+        return Mechanism(t, result)
     if len(system.q) == 1:
         (c,) = system.coordinates
         return Curve(np.hstack([q, qd]), (label(c), label(c, rate=True)), "Phase portrait")
@@ -51,14 +51,14 @@ def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve 
 
 
 def of_run(run: Any) -> Mechanism | None:
-    """The mechanism of a run; None where its scene is not known or says nothing of its shape."""
+    """Return the mechanism of a run; None if its scene is unknown or describes no shape."""
     try:
         system = system_of(run)
     except EomcError:
         return None
-    t, q = (np.asarray(x, dtype=float)[:: max(len(run) // ROWS, 1)] for x in (run.t, run.q))
-    made = drawing(system, t, q)
-    return Mechanism(t, made) if made else None
+    t, q = (np.asarray(x, dtype=float)[:: max(len(run) // MAX_ROWS, 1)] for x in (run.t, run.q))
+    result = drawing(system, t, q)
+    return Mechanism(t, result) if result else None
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Curve:
     title: str
 
     def draw(self, axes: Axes) -> None:
-        """The path, its start as a ring and its end as a dot."""
+        """Draw the path, with a ring at its start and a dot at its end."""
         axes.plot(*self.values.T, color=COLOURS[0])
         plain(axes)
         axes.plot(*self.values[0], "o", color=COLOURS[0], markerfacecolor="white", markersize=5)
@@ -83,66 +83,69 @@ class Curve:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A drawing at the beginning of a run, from light to dark, with the paths of its points."""
+    """A mechanism at several instants of a run, from light to dark, with paths of its points."""
 
     t: Array
     drawing: Drawing
 
     def draw(self, axes: Axes) -> None:
-        """In the plane with its axes, in space seen from the side and a little from above."""
-        made = self.drawing
-        flat = self._near(seen(made))
-        paths = [(p.name, flat[:, p.point]) for p in made.paths]
-        shapes = sum(mark.kind in LINES for mark in made.marks)
+        """Draw the mechanism: in the plane with axes, in space seen slightly from above."""
+        picture = self.drawing
+        flat = self._near(project_points(picture))
+        paths = [(p.name, flat[:, p.point]) for p in picture.paths]
+        shapes = sum(mark.kind in LINES for mark in picture.marks)
         last = self._stretch(flat) if shapes else len(flat) - 1
         ghosts = self._ghosts(last)
         for k, i in enumerate(ghosts):
             shade = str(GHOST - 0.35 * k / max(len(ghosts) - 1, 1))
-            still(axes, made, flat[i], shade)
+            draw_marks(axes, picture, flat[i], shade)
         for (name, path), colour in zip(paths, COLOURS, strict=False):
             words = f"path of {_name(name)}" if name else "path"
             axes.plot(*path.T, color=colour, linewidth=1.0, label=words, zorder=2)
-        if made.marks:
-            still(axes, made, flat[last])
+        if picture.marks:
+            draw_marks(axes, picture, flat[last])
         for (_, path), colour in zip(paths, COLOURS, strict=False):
             axes.plot(*path[last], "o", color=colour, markersize=5, zorder=6)
-        frame(axes, made, flat)
+        frame(axes, picture, flat)
         end = f", t = 0 to {self.t[last]:.3g} s" if ghosts.size else ""
-        where = "In the plane" if made.plane else "In space"
+        where = "In the plane" if picture.is_planar else "In space"
         axes.set_title(where + end, fontsize=10, color=INK)
         if paths:
             axes.legend(fontsize=8, frameon=False, loc="upper right")
 
     def _near(self, flat: Array) -> Array:
-        """Of a mechanism that travels, the beginning, in which it can be seen."""
+        """Return the initial part of the motion, if the mechanism travels too far to be seen."""
         if not self.drawing.travels:
             return flat
-        gone = np.abs(flat - flat[0]).max(axis=(1, 2))
-        return flat[: max(int(np.argmax(gone > FAR / 2 * self.drawing.extent)), 1)]
+        distance = np.abs(flat - flat[0]).max(axis=(1, 2))
+        return flat[: max(int(np.argmax(distance > TRAVEL_LIMIT / 2 * self.drawing.max_extent)), 1)]
 
     def _ghosts(self, last: int) -> NDArray[np.int64]:
-        """The instants before the last that are shown."""
+        """Return the earlier instants that are drawn."""
         shapes = sum(mark.kind in LINES for mark in self.drawing.marks)
         if not shapes or not last:
             return np.array([], dtype=int)
         springs = any(mark.kind in ("spring", "damper") for mark in self.drawing.marks)
-        few = 5 if springs else 8 if shapes > 6 or not self.drawing.plane else INSTANTS
-        count = few if shapes <= MANY else 3
+        few = 5 if springs else 8 if shapes > 6 or not self.drawing.is_planar else MAX_GHOSTS
+        count = few if shapes <= MANY_MARKS else 3
         return np.unique(np.linspace(0, last, count).round().astype(int))[:-1]
 
     def _stretch(self, flat: Array) -> int:
-        """The sample up to which what moves most has gone one and a half times its extent."""
+        """Return the last drawn sample.
+
+        Up to it, the point that moves most has moved 1.5 times the extent of its path.
+        """
         steps = np.nan_to_num(np.linalg.norm(np.diff(flat, axis=0), axis=2))
         if not len(steps):
             return 0
         reach = max(float(np.nanmax(np.ptp(flat, axis=0), initial=0.0)), 1e-12)
         furthest = steps[:, steps.sum(axis=0).argmax()]
-        gone = np.concatenate([[0.0], np.cumsum(furthest)])
-        return min(int(np.searchsorted(gone, 1.5 * reach)), len(flat) - 1)
+        distance = np.concatenate([[0.0], np.cumsum(furthest)])
+        return min(int(np.searchsorted(distance, 1.5 * reach)), len(flat) - 1)
 
 
 def _name(name: str) -> str:
-    """A point's name, or the pair of names of its coordinates."""
+    """Return the name of a point, or the pair of its coordinates' names."""
     if name.startswith("("):
         return "(" + ", ".join(map(mathtext, name[1:-1].split(", "))) + ")"
     return texts.figure(name.replace("_", " "))
@@ -151,8 +154,8 @@ def _name(name: str) -> str:
 # --- a view of space ------------------------------------------------------------------------------
 
 
-def basis(up: int) -> Array:
-    """What is to the right, upwards and towards the eye, a row each."""
+def view_basis(up: int) -> Array:
+    """Return the unit vectors to the right, upwards and towards the viewer, one per row."""
     a, e = np.radians([AZIMUTH, ELEVATION])
     right = [-np.sin(a), np.cos(a), 0.0]
     above = [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]
@@ -160,36 +163,36 @@ def basis(up: int) -> Array:
     return np.roll([right, above, near], (up - 2) % 3, axis=1)
 
 
-def seen(made: Drawing) -> Array:
-    """The points as they are seen, (n, points, 2)."""
-    return made.points if made.plane else made.points @ basis(made.up)[:2].T
+def project_points(picture: Drawing) -> Array:
+    """Return the points in the plane of the picture, (n, points, 2)."""
+    return picture.points if picture.is_planar else picture.points @ view_basis(picture.up)[:2].T
 
 
-def frame(axes: Axes, made: Drawing, flat: Array) -> None:
-    """Equal scales about all that is ever drawn; in the plane axes, in space three arrows."""
+def frame(axes: Axes, picture: Drawing, flat: Array) -> None:
+    """Set equal scales for the whole motion; draw axes in the plane, three arrows in space."""
     low, high = _bounds(flat)
     size = max(float((high - low).max()), 1e-9)
     margin = 0.06 * size
     axes.update_datalim([low, high])
     axes.margins(0.06)
     axes.set_aspect("equal", adjustable="datalim")
-    if made.plane:
+    if picture.is_planar:
         plain(axes, lines=False)
-        names = [mathtext(name) for name in made.labels]
-        axes.set_xlabel(with_unit(names[0], made.unit))
-        axes.set_ylabel(with_unit(names[1], made.unit))
+        names = [mathtext(name) for name in picture.labels]
+        axes.set_xlabel(with_unit(names[0], picture.unit))
+        axes.set_ylabel(with_unit(names[1], picture.unit))
         axes.locator_params(nbins=7)
         return
     axes.set_axis_off()
     length = 10.0 ** np.floor(np.log10(0.3 * size))
     length *= max(m for m in (1, 2, 5) if m * length <= 0.3 * size)
     x, y = (float(entry) - margin for entry in low)
-    for name, (right, above) in zip("xyz", basis(made.up)[:2].T * length, strict=True):
+    for name, (right, above) in zip("xyz", view_basis(picture.up)[:2].T * length, strict=True):
         arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.8}
         axes.annotate("", (x + right, y + above), (x, y), annotation_clip=False, arrowprops=arrow)
         axes.text(x + 1.2 * right, y + 1.2 * above, f"${name}$", color=INK, fontsize=9,
                   ha="center", va="center")  # fmt: skip
-    words = f"{length:g} {texts.figure(made.unit)}".strip()
+    words = f"{length:g} {texts.figure(picture.unit)}".strip()
     axes.annotate(words, (x, y), (0, -12), textcoords="offset points", color=INK, fontsize=8,
                   ha="center", annotation_clip=False)  # fmt: skip
 
@@ -212,39 +215,40 @@ SYMBOLS = {"joint": ("o", 4.5, "white"), "slide": ("s", 6, "white"), "ground": (
 SKIPPED = frozenset(("rail", "arm", "inertia"))  # at earlier instants
 
 
-def still(
-    axes: Axes, made: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
+def draw_marks(
+    axes: Axes, picture: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
 ) -> list[Line2D]:
-    """The marks at one instant; in a shade of grey, without symbols, where it is an earlier one.
+    """Draw the marks at one instant; with `shade`, in grey and without symbols.
 
-    hues: of instances, where several are drawn over each other.
+    hues: the colours of the instances, if several are drawn over each other.
     """
     return [
         line
-        for points, look in shapes(made, flat, shade, hues)
+        for points, look in shapes(picture, flat, shade, hues)
         for line in axes.plot(*points.T, **look)
     ]
 
 
 def shapes(
-    made: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
+    picture: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
 ) -> Iterator[tuple[Array, dict[str, Any]]]:
-    """The lines and symbols of the marks, (k, 2) each, and how they look: the same at any instant.
+    """Yield the lines and symbols of the marks, (k, 2) each, with their style.
 
-    Not finite where a point of the mark is not.
+    Their number does not depend on the instant. Points are not finite where a point of the mark is
+    not.
     """
     widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
     width = 0.02 * float(widest)
-    pairs = [frozenset(m.points) for m in made.marks if m.kind in ("spring", "damper")]
-    for mark in made.marks:
+    pairs = [frozenset(m.points) for m in picture.marks if m.kind in ("spring", "damper")]
+    for mark in picture.marks:
         points = flat[list(mark.points)]
         if not np.isfinite(points).all():
             points = np.full_like(points, np.nan)
-        ink, rod = (INK, BODY) if mark.whose is None else (hues[mark.whose],) * 2
+        ink, rod = (INK, BODY) if mark.instance is None else (hues[mark.instance],) * 2
         if mark.kind in LINES:
-            if shade and (mark.kind in SKIPPED and len(made.marks) > 3):
+            if shade and (mark.kind in SKIPPED and len(picture.marks) > 3):
                 continue
-            aside = width * 1.4 if pairs.count(frozenset(mark.points)) > 1 else 0.0
+            offset = width * 1.4 if pairs.count(frozenset(mark.points)) > 1 else 0.0
             look = {
                 "color": shade or (rod if mark.kind != "line" else ink),
                 "linewidth": LINES[mark.kind] * (0.7 if shade else 1.0),
@@ -253,7 +257,7 @@ def shapes(
                 "solid_capstyle": "round",
                 "solid_joinstyle": "round",
             }
-            for line in outline(mark, points, width, aside):
+            for line in outline(mark, points, width, offset):
                 yield line, look
         elif not shade:
             symbol, size, face = SYMBOLS[mark.kind]
@@ -262,13 +266,13 @@ def shapes(
                                "markersize": size, "markerfacecolor": face,
                                "markeredgewidth": 0.9}  # fmt: skip
             if mark.kind == "mass" and len(points) == 2:  # how it is turned
-                way = points[1] - points[0]
-                tick = points[0] + way / np.linalg.norm(way) * 2 * width
+                direction = points[1] - points[0]
+                tick = points[0] + direction / np.linalg.norm(direction) * 2 * width
                 yield np.array([points[0], tick]), {"color": ink, "linewidth": 1.2, "zorder": 4}
 
 
-def outline(mark: Mark, points: Array, width: float, aside: float) -> Iterator[Array]:
-    """The lines of a mark, (k, 2) each. aside: how far springs and dampers stand apart."""
+def outline(mark: Mark, points: Array, width: float, offset: float) -> Iterator[Array]:
+    """Yield the lines of a mark, (k, 2) each. offset: sideways shift of parallel springs."""
     if mark.kind in ("box", "inertia"):
         yield from _box(points)
     elif mark.kind == "circle":
@@ -279,48 +283,54 @@ def outline(mark: Mark, points: Array, width: float, aside: float) -> Iterator[A
             + np.sin(turn) * (points[2] - points[0])
         )
     elif mark.kind in ("spring", "damper"):
-        yield from _along(points, width, aside, mark.kind)
+        yield from _coil_or_dashpot(points, width, offset, mark.kind)
     else:
         yield points
 
 
 def _box(points: Array) -> Iterator[Array]:
-    """The edges, from the centre and the tips of the half axes."""
+    """Yield the edges of a box, given its centre and the tips of its half axes."""
     center, halves = points[0], points[1:] - points[0]
     if len(halves) == 2:
         a, b = halves
-        yield center + _around(a, b)
+        yield center + _parallelogram(a, b)
         return
     a, b, c = halves
     for side in (c, -c):
-        yield center + side + _around(a, b)
+        yield center + side + _parallelogram(a, b)
     for corner in (a + b, a - b, -a - b, b - a):
         yield center + np.array([corner + c, corner - c])
 
 
-def _around(a: Array, b: Array) -> Array:
-    """The corners of a parallelogram about the origin, the first again at the end."""
+def _parallelogram(a: Array, b: Array) -> Array:
+    """Return the closed outline of a parallelogram about the origin with half axes a and b."""
     return np.array([a + b, a - b, -a - b, b - a, a + b])
 
 
-_COIL = 12  # half turns
-_DASHPOT = (  # along and across, from its one end to the other
+_COIL_HALF_TURNS = 12
+_DASHPOT = (  # lines as (along, across), from one end to the other
     ((0, 0), (0.4, 0)), ((0.65, 1), (0.4, 1), (0.4, -1), (0.65, -1)), ((0.55, 0.7), (0.55, -0.7)),
     ((0.55, 0), (1, 0)),
 )  # fmt: skip
 
 
-def _along(points: Array, width: float, aside: float, kind: str) -> Iterator[Array]:
-    """A coil or a dashpot between two points."""
-    start, way = points[0], points[1] - points[0]
-    length = float(np.linalg.norm(way))
-    across = np.array([-way[1], way[0]]) / length if length else np.zeros(2)
-    shift = across * (aside if kind == "spring" else -aside)
+def _coil_or_dashpot(points: Array, width: float, offset: float, kind: str) -> Iterator[Array]:
+    """Yield the lines of a coil or a dashpot between two points."""
+    start, direction = points[0], points[1] - points[0]
+    length = float(np.linalg.norm(direction))
+    across = np.array([-direction[1], direction[0]]) / length if length else np.zeros(2)
+    shift = across * (offset if kind == "spring" else -offset)
     if kind == "spring":
-        s = np.concatenate([[0.0, 0.15], 0.15 + 0.7 * (np.arange(_COIL) + 0.5) / _COIL, [0.85, 1]])
-        y = np.concatenate([[0, 0], np.resize([1.0, -1.0], _COIL), [0, 0]])
-        yield start + shift + s[:, None] * way + y[:, None] * across * width
+        s = np.concatenate(
+            [
+                [0.0, 0.15],
+                0.15 + 0.7 * (np.arange(_COIL_HALF_TURNS) + 0.5) / _COIL_HALF_TURNS,
+                [0.85, 1],
+            ]
+        )
+        y = np.concatenate([[0, 0], np.resize([1.0, -1.0], _COIL_HALF_TURNS), [0, 0]])
+        yield start + shift + s[:, None] * direction + y[:, None] * across * width
         return
     for part in _DASHPOT:
         s, y = np.array(part).T[:, :, None]
-        yield start + shift + s * way + y * across * width
+        yield start + shift + s * direction + y * across * width

@@ -1,6 +1,7 @@
-"""Draws a run: coordinates, velocities and energy against time, and the picture in the plane.
+"""Figures of a run: curves against time, and a picture of the mechanism.
 
-Needs matplotlib, an optional extra, and no display: figures are made without pyplot.
+Requires matplotlib, which is an optional dependency. No display is needed, since pyplot is not
+used.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _NONE: Outputs = {}
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
-SAMPLES = 20_000  # of a run that are drawn, at most
+MAX_SAMPLES = 20_000  # rows of a run that are drawn
 
 
 def draw(
@@ -41,28 +42,45 @@ def draw(
     jacobi: Array | None = None, title: str | None = None, outputs: Outputs = _NONE,
     words: str = "", inputs: Outputs = _NONE, wrap: bool = False,
 ) -> None:  # fmt: skip
-    """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
+    """Write the figure of a run to a file.
 
-    t: (n,), s; q, qd: (n, nq); energy: (n,); jacobi: (n,), where it is not the energy; outputs,
-    inputs: (n,) by name; words: what was put in and lost; wrap: angles from -pi to pi. Raises
-    EomcError without matplotlib, with another suffix, or where the file can't be written.
+    Parameters
+    ----------
+    system : System
+    t, q, qd, energy : arrays (n,), (n, nq), (n, nq) and (n,)
+        Times in s, positions, velocities and K + P.
+    path : path
+        The suffix determines the format: .png, .svg or .pdf.
+    jacobi : array (n,), optional
+        Jacobi's integral, if it differs from the energy.
+    title : str, optional
+    outputs, inputs : mapping from names to arrays (n,), optional
+    words : str, optional
+        The energy balance in words.
+    wrap : bool, optional
+        Show angles in the range from -pi to pi.
+
+    Raises
+    ------
+    EomcError
+        If matplotlib is not installed, the suffix is unknown, or the file can't be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs, wrap)
+    result = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs, wrap)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
     drawn = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
-        made.savefig(drawn, format=suffix[1:], dpi=150, metadata=undated)
+        result.savefig(drawn, format=suffix[1:], dpi=150, metadata=undated)
     with writing(path), replacing(path) as new:
         new.write_bytes(drawn.getvalue())
 
 
 def without_pictures() -> str:
-    """Why a page has no pictures, and how it gets them; empty where matplotlib is there."""
+    """Return why a page has no pictures and the remedy; "" if matplotlib is installed."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
@@ -70,13 +88,13 @@ def without_pictures() -> str:
     return ""
 
 
-def svg(made: Figure) -> Markup:
-    """A figure as text of SVG, for a page; the same for the same figure."""
+def svg(figure: Figure) -> Markup:
+    """Return a figure as SVG text for a page; equal figures give equal text."""
     import matplotlib
 
     text = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "eomc"}):
-        made.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
+        figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
     return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
@@ -85,7 +103,7 @@ def figure(
     jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
     inputs: Outputs = _NONE, wrap: bool = False,
 ) -> Figure:  # fmt: skip
-    """The figure of a run. t: (n,), s; q, qd: (n, nq); energy, jacobi, each other: (n,)."""
+    """Return the figure of a run; the arguments are those of `draw`."""
     try:
         import matplotlib.figure
     except ImportError:
@@ -110,7 +128,7 @@ def _figure(
 ) -> Figure:
     from matplotlib.figure import Figure
 
-    every = max(len(t) // SAMPLES, 1)
+    every = max(len(t) // MAX_SAMPLES, 1)
     t, q, qd, energy = (np.asarray(a, dtype=float)[::every] for a in (t, q, qd, energy))
     if jacobi is not None:
         jacobi = np.asarray(jacobi, dtype=float)[::every]
@@ -126,7 +144,7 @@ def _figure(
     ]
     rates = {c.name: rate for c, rate in moving}
     modes = (system.coordinates[m.at].name for m in system.modes)
-    still = {*system.discrete, *modes}  # between jumps
+    discrete = {*system.discrete, *modes}  # between jumps
     groups = grouped([c for c, _ in moving])
     below = grouped(
         [
@@ -141,32 +159,32 @@ def _figure(
     picture = pictures.picture(system, t, q, qd)
     rows = len(groups) + len(below) + 1
     height = min(2.1 * rows + 0.5, max(9, 1.5 * rows))
-    made = Figure(figsize=(12, height), layout="constrained")
+    result = Figure(figsize=(12, height), layout="constrained")
     if title.strip():
-        made.suptitle(texts.figure(title), fontsize=13, color=INK)
+        result.suptitle(texts.figure(title), fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
-    grid = made.add_gridspec(rows, len(widths), width_ratios=widths)
+    grid = result.add_gridspec(rows, len(widths), width_ratios=widths)
 
     first: Axes | None = None
     for row, group in enumerate(groups):
-        going = [rates[c.name] for c in group if c.name not in still]
+        going = [rates[c.name] for c in group if c.name not in discrete]
         for column, curves in enumerate((group, going) if going else (group,)):
             place = grid[row, column] if going else grid[row, :2]
-            axes = made.add_subplot(place, sharex=first)
+            axes = result.add_subplot(place, sharex=first)
             first = first or axes
             _curves(axes, t, curves)
     for row, group in enumerate(below, len(groups)):
-        _curves(made.add_subplot(grid[row, :2], sharex=first), t, group)
-    axes = made.add_subplot(grid[-1, :2], sharex=first)
+        _curves(result.add_subplot(grid[row, :2], sharex=first), t, group)
+    axes = result.add_subplot(grid[-1, :2], sharex=first)
     unit = "J" if any(c.unit for c in system.coordinates) else ""
     _energy(axes, t, energy, jacobi, unit, words)
     axes.set_xlabel("$t$ (s)")
     if len(t) > 1 and t[-1] > t[0]:
         axes.set_xlim(t[0], t[-1])  # and of all that share it
-    made.align_ylabels()
+    result.align_ylabels()
     if picture:
-        picture.draw(made.add_subplot(grid[:, 2]))
-    return made
+        picture.draw(result.add_subplot(grid[:, 2]))
+    return result
 
 
 # --- against time ---------------------------------------------------------------------------------
@@ -189,28 +207,33 @@ def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
 def _energy(
     axes: Axes, t: Array, energy: Array, jacobi: Array | None, unit: str, words: str
 ) -> None:
-    """E, or E - E(0) where it is conserved so well that E would be a straight line.
+    """Plot E, or E - E(0) if the energy is nearly conserved and E would be a straight line.
 
-    Where Jacobi's integral J is another, both from where they start. words: where it went.
+    If Jacobi's integral J differs from the energy, both are plotted relative to their initial
+    values. `words` is the energy balance, shown in the title.
     """
     change = energy - energy[:1]
     drift = float(np.max(np.abs(change), initial=0.0))
     conserved = jacobi is not None or drift <= 0.01 * float(np.max(np.abs(energy), initial=0.0))
     axes.plot(t, change if conserved else energy, color=INK, label="energy, not conserved")
     label = "$E - E(0)$" if conserved else "$E$"
-    told, of = f", max $|E - E(0)|$ = {_quantity(drift, unit, 2)}", ""
+    heading, integral_label = f", max $|E - E(0)|$ = {_quantity(drift, unit, 2)}", ""
     if jacobi is not None:
-        other, of = jacobi - jacobi[:1], "Jacobi's integral: "
-        axes.plot(t, other, color=COLOURS[1], label=of[:-2] + ("" if words else ", conserved"))
+        other, integral_label = jacobi - jacobi[:1], "Jacobi's integral: "
+        axes.plot(
+            t, other, color=COLOURS[1], label=integral_label[:-2] + ("" if words else ", conserved")
+        )
         axes.legend(fontsize=8, frameon=False, loc="upper left")
         label = "$E - E(0)$, $J - J(0)$"
-        told += f"; {of}max $|J - J(0)|$ = {_quantity(float(np.abs(other).max()), unit, 2)}"
+        heading += (
+            f"; {integral_label}max $|J - J(0)|$ = {_quantity(float(np.abs(other).max()), unit, 2)}"
+        )
     if words:
-        told = "; " + of + texts.figure(words).replace("; ", "\n")
+        heading = "; " + integral_label + texts.figure(words).replace("; ", "\n")
     plain(axes)
     axes.set_ylabel(with_unit(label, unit))
     start = _quantity(float(energy[0]), unit) if len(energy) else "?"
-    axes.set_title(f"Energy: $E(0)$ = {start}{told}", fontsize=10, color=INK)
+    axes.set_title(f"Energy: $E(0)$ = {start}{heading}", fontsize=10, color=INK)
     if drift == 0 and jacobi is None:
         axes.set_ylim(-1, 1)
 

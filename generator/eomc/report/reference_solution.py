@@ -1,9 +1,9 @@
-"""The reference solution of any scene: its own C in __float128, by a method of order 40.
+"""Reference solutions in __float128, from the scene's generated C and a Gauss method of order 40.
 
-Computed twice, with other stages and other steps, and trusted as far as both agree. Where the
-plain equations of `symbolic` are small, they are evaluated with mpmath as well: accelerations
-along the motion, and the motion itself, by extrapolation, over as much of it as some seconds
-allow. That shares neither program, arithmetic nor method with the first way.
+Each solution is computed twice, with different orders and steps, and its accuracy is the agreement
+of both. For small scenes, the reference equations of `symbolic` are also evaluated with mpmath: the
+accelerations along the motion and, for a few seconds of computing time, the motion itself by
+extrapolation. That check shares neither program, arithmetic nor method with the first computation.
 """
 
 from __future__ import annotations
@@ -51,22 +51,22 @@ from eomc.verify.oracle import Vector
 Text = NDArray[Any]  # of str
 
 # (stages, largest of the last two Legendre coefficients of the accelerations)
-WAYS = ((20, 1e-17), (16, 3e-18))
-MOST_DIGITS = 33.0  # of __float128, 34, less what adding up rounds
-SECONDS = 120.0  # of either way
-PLAIN_SECONDS = 2.0  # of the plain equations in mpmath
+METHODS_COMPARED = ((20, 1e-17), (16, 3e-18))
+MAX_DIGITS = 33.0  # the 34 of __float128 less the rounding of sums
+MAX_SECONDS = 120.0  # computing time of each of the two solutions
+MAX_PLAIN_SECONDS = 2.0  # computing time of the motion in mpmath
 PLAIN_DIGITS = 40
 PLAIN_STATES = 5
-PLAIN_AGREES = 26.0  # digits of accelerations; fewer says that the equations are not the same
+MIN_PLAIN_DIGITS = 26.0  # of accelerations: with fewer, the equations differ
 
 
 @dataclass(frozen=True)
 class Reference:
-    """q, qd of shape (n, nq) at the times t (n,), as decimal texts of 37 digits.
+    """Positions and velocities `q`, `qd` (n, nq) at times `t` (n,), as decimal texts of 37 digits.
 
-    digits (n,): to how many both ways agree, relative to each coordinate's largest value so far.
-    plain: digits to which the plain equations agree, and until when their motion was compared:
-    (digits of accelerations, digits of the motion, t); None where they are too large.
+    digits (n,): digits to which both computations agree so far, relative to the largest value of
+    each coordinate. plain: agreement with the equations evaluated in mpmath, as (digits of the
+    accelerations, digits of the motion, last compared time); None if these equations are too large.
     """
 
     t: Vector
@@ -77,7 +77,7 @@ class Reference:
 
     @cached_property
     def halves(self) -> tuple[Vector, Vector]:
-        """x = [q; qd] as sums of two doubles each, (n, 2 nq) high and low."""
+        """x = [q; q̇] as an unevaluated sum of doubles, (high, low), each of shape (n, 2 nq)."""
         x = np.hstack([self.q, self.qd])
         high = x.astype(float)
         exact = (Fraction(text) - Fraction(h) for text, h in zip(x.flat, high.flat, strict=True))
@@ -85,28 +85,48 @@ class Reference:
 
     @property
     def scale(self) -> Vector:
-        """The largest value of each of x = [q; qd] along the motion, (2 nq,); 1 where it is 0."""
+        """Largest magnitude of each component of x = [q; q̇], (2 nq,); 1 instead of 0."""
         size = np.max(np.abs(self.halves[0]), axis=0)
         return np.where(size > 0, size, 1.0)
 
-    def off(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
-        """States minus this at those rows, (n, 2 nq), right to the last bit of the difference."""
+    def error_of(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
+        """Return states minus the reference at the given rows, (n, 2 nq), accurate to rounding."""
         high, low = self.halves
         return np.asarray((np.hstack([q, qd]) - high[rows]) - low[rows])
 
 
-def of(
+def solve(
     scene: System | str | os.PathLike[str],
     duration: float | None = None,
     rows: int = 256,
     root: str | os.PathLike[str] = "build",
 ) -> Reference:
-    """The motion from the scene's start, parameters and signals, at rows + 1 times up to duration.
+    """Compute the reference solution of a scene, from its initial state and with its signals.
 
-    Parameters, start and duration are the doubles that they are, numbers in formulas exact. rows
-    is a power of two, so that runs with h = duration/2^k meet the same times. Kept in
-    `root`/<name>/. Raises EomcError where gcc with libquadmath is missing, where the motion meets
-    a singular D, or where it takes longer than SECONDS.
+    Parameters
+    ----------
+    scene : System or path
+    duration : float, optional
+        In s; the scene's duration by default.
+    rows : int, optional
+        A power of two; the solution has rows + 1 rows, so that runs with h = duration/2^k meet
+        them.
+    root : path, optional
+        Build directory. The solution is cached in `root`/<name>/.
+
+    Returns
+    -------
+    Reference
+
+    Raises
+    ------
+    EomcError
+        If gcc with libquadmath is missing, D becomes singular, or the computation takes longer than
+        MAX_SECONDS.
+
+    Notes
+    -----
+    Parameters, initial values and duration are doubles; numbers in formulas are exact.
     """
     system = scene if isinstance(scene, System) else pipeline.read(scene)
     span = system.run.duration if duration is None else float(duration)
@@ -115,40 +135,40 @@ def of(
     if not (math.isfinite(span) and span > 0):
         raise EomcError(f"duration = {duration!r}: give a number of seconds above 0")
     start = [x for c in system.coordinates for x in (c.start, c.rate)]
-    made_of = [span, rows, *start, *(p.value for p in system.parameters)]
-    wanted = builds.key(system.digest, f"reference {made_of!r}")
+    inputs = [span, rows, *start, *(p.value for p in system.parameters)]
+    key = builds.key(system.digest, f"reference {inputs!r}")
     file = Path(root) / system.name / f"reference_{span!r}_{rows}.json"
     try:
-        kept = json.loads(file.read_text(encoding="utf-8"))
-        if kept["key"] == wanted:
-            return _from_json(kept)
+        stored = json.loads(file.read_text(encoding="utf-8"))
+        if stored["key"] == key:
+            return _from_json(stored)
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    made = _computed(system, span, rows)
-    kept = {name: np.asarray(value).tolist() for name, value in vars(made).items()}
-    kept["key"] = wanted
+    solution = _compute(system, span, rows)
+    stored = {name: np.asarray(value).tolist() for name, value in vars(solution).items()}
+    stored["key"] = key
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file, cached=True) as new:
-            new.write_text(json.dumps(kept) + "\n", encoding="utf-8")
+            new.write_text(json.dumps(stored) + "\n", encoding="utf-8")
     except OSError as fault:
         raise FolderError(f"{file}: can't be written ({fault.strerror})") from None
-    return made
+    return solution
 
 
-def _from_json(kept: dict[str, Any]) -> Reference:
-    plain = tuple(kept["plain"]) if kept["plain"] else None
-    arrays = {name: np.array(kept[name]) for name in ("t", "q", "qd", "digits")}
+def _from_json(stored: dict[str, Any]) -> Reference:
+    plain = tuple(stored["plain"]) if stored["plain"] else None
+    arrays = {name: np.array(stored[name]) for name in ("t", "q", "qd", "digits")}
     return Reference(**arrays, plain=plain)
 
 
 # --- the program in __float128 ------------------------------------------------------------------
 
 
-def _computed(system: System, span: float, rows: int) -> Reference:
+def _compute(system: System, span: float, rows: int) -> Reference:
     with tempfile.TemporaryDirectory(prefix="eomc-reference-") as folder:
-        executable = _compiled(system, Path(folder))
-        one, other = (_run(executable, system, span, rows, *way) for way in WAYS)
+        executable = _compile(system, Path(folder))
+        one, other = (_run(executable, system, span, rows, *way) for way in METHODS_COMPARED)
     n = len(system.coordinates)
     digits = _agreement(one[:, : 2 * n], other[:, : 2 * n])
     return Reference(
@@ -156,16 +176,16 @@ def _computed(system: System, span: float, rows: int) -> Reference:
         q=one[:, :n],
         qd=one[:, n : 2 * n],
         digits=digits,
-        plain=_plainly(system, one[: 1 + np.sum(digits > PLAIN_AGREES)], span / rows),
+        plain=_compare_plain(system, one[: 1 + np.sum(digits > MIN_PLAIN_DIGITS)], span / rows),
     )
 
 
-def _compiled(system: System, folder: Path) -> Path:
-    """The program in __float128 with its integrator, as an executable."""
+def _compile(system: System, folder: Path) -> Path:
+    """Compile the scene's C in __float128 with the integrator; return the executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
-    made = rename_for_c(program.build(lagrange.derive(system)))[0]
-    shown = plain.files(made, show, QUAD)
-    functions = Functions(Target(made, QUAD))
+    lowered = rename_for_c(program.build(lagrange.derive(system)))[0]
+    shown = plain.files(lowered, show, QUAD)
+    functions = Functions(Target(lowered, QUAD))
     call = functions.acceleration.function.call(
         qdd="a", u="NULL", p=f"(const {system.name}_params *)p"
     )
@@ -180,52 +200,55 @@ def _compiled(system: System, folder: Path) -> Path:
     if gcc is None:
         raise EomcError(missing)
     command = [gcc, "-std=gnu99", "-O1", "-w", "quad.c", "-o", "quad", "-lquadmath", "-lm"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise EomcError(f"{missing}; {gcc} said:\n{done.stderr.rstrip()[:2000]}")
+    completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if completed.returncode:
+        raise EomcError(f"{missing}; {gcc} said:\n{completed.stderr.rstrip()[:2000]}")
     return folder / "quad"
 
 
 def _run(
     executable: Path, system: System, span: float, rows: int, stages: int, target: float
 ) -> Text:
-    """The rows [q, qd, qdd] as texts, (rows + 1, 3 nq)."""
-    numbers: tuple[float, ...] = (span, float(rows), target, SECONDS)
+    """Run the executable and return the rows [q, qd, qdd] as texts, (rows + 1, 3 nq)."""
+    numbers: tuple[float, ...] = (span, float(rows), target, MAX_SECONDS)
     numbers += tuple(c.start for c in system.coordinates)
     numbers += tuple(c.rate for c in system.coordinates)
     numbers += tuple(p.value for p in system.parameters)
     # Decimal writes a double as the number that it is
     exact = " ".join(str(Decimal(x)) for x in numbers)
-    given = f"{gauss(stages)} {exact}\n"
-    done = subprocess.run([executable], input=given, capture_output=True, text=True, check=False)
-    found = [line.split()[:-1] for line in done.stdout.splitlines()]
-    reached = max(0, len(found) - 1) * span / rows
-    if done.returncode == 3:
+    standard_input = f"{gauss(stages)} {exact}\n"
+    completed = subprocess.run(
+        [executable], input=standard_input, capture_output=True, text=True, check=False
+    )
+    lines = [line.split()[:-1] for line in completed.stdout.splitlines()]
+    reached = max(0, len(lines) - 1) * span / rows
+    if completed.returncode == 3:
         raise EomcError(
             f"{system.name}: the reference solution got to t = {reached:.6g} s of {span:g} s in "
-            f"{SECONDS:g} s of computing: ask for a shorter duration"
+            f"{MAX_SECONDS:g} s of computing: ask for a shorter duration"
         )
-    if done.returncode and (jumps := corners(system)):
+    if completed.returncode and (jumps := corners(system)):
         raise EomcError(
             f"{system.name}: no reference solution beyond t = {reached:.6g} s: a force that jumps "
             f"({jumps}) holds the motion there; write it smooth, such as tanh(v/0.001) for "
             "sign(v), or ask for a shorter duration"
         )
-    if done.returncode:
+    if completed.returncode:
         raise EomcError(
             f"{system.name}: no reference solution beyond t = {reached:.6g} s: D is singular there "
             "or a state is not finite; ask for a shorter duration"
         )
-    return np.array(found)
+    return np.array(lines)
 
 
 @cache
 def gauss(stages: int) -> str:
-    """c, A, A A, b, b A and the Legendre weights of the Gauss method, as decimals of 40 digits.
+    """Return c, A, A A, b, b A and Legendre weights of the Gauss method, to 40 digits.
 
-    Nodes are the zeros of the Legendre polynomial P_s on [0, 1], a_ij = int_0^c_i l_j, by the
-    exact rule l_j = b_j sum_k (2k + 1) P_k(c_j) P_k (Hairer & Wanner, Solving ODEs II, sec. IV.5).
-    The weights give a's Legendre coefficients, (2k + 1) b_j P_k(c_j).
+    Nodes are the zeros of the Legendre polynomial P_s on [0, 1], a_ij = int_0^c_i l_j, by the exact
+    rule l_j = b_j sum_k (2k + 1) P_k(c_j) P_k (Hairer & Wanner, Solving ODEs II, sec. IV.5). The
+    weights
+    (2k + 1) b_j P_k(c_j) give the Legendre coefficients of the accelerations.
     """
     with mpmath.workdps(60):
         n = stages
@@ -239,7 +262,7 @@ def gauss(stages: int) -> str:
         c = [(1 + z) / 2 for z in x]
 
         def integral(k: int, i: int) -> Any:
-            """int_0^c_i of P_k(2 tau - 1)."""
+            """Return the integral of P_k(2 tau - 1) from 0 to c_i."""
             if k == 0:
                 return c[i]
             return (P[k + 1][i] - P[k - 1][i]) / (2 * (2 * k + 1))
@@ -256,67 +279,67 @@ def gauss(stages: int) -> str:
 
 
 def _agreement(one: Text, other: Text) -> Vector:
-    """Digits to which two arrays of texts agree, row by row, relative to the largest value so far.
+    """Return the digits to which two arrays agree, by row, relative to the largest value so far.
 
-    The fewest so far: what has drifted apart does not become right by meeting again.
+    The result never increases along the rows: solutions that have diverged may cross by chance.
     """
     size = np.maximum.accumulate(np.abs(one.astype(float)), axis=0)
-    apart = [
+    differences = [
         abs(float(Fraction(a) - Fraction(b))) for a, b in zip(one.flat, other.flat, strict=True)
     ]
-    off = np.array(apart).reshape(one.shape)
-    worst = np.max(np.where(off > 0, off / np.where(size > 0, size, 1.0), 0.0), axis=1)
-    found = -np.log10(np.maximum(worst, 10.0**-MOST_DIGITS))
-    return np.asarray(np.minimum.accumulate(np.maximum(found, 0.0)))
+    error = np.array(differences).reshape(one.shape)
+    worst = np.max(np.where(error > 0, error / np.where(size > 0, size, 1.0), 0.0), axis=1)
+    digits = -np.log10(np.maximum(worst, 10.0**-MAX_DIGITS))
+    return np.asarray(np.minimum.accumulate(np.maximum(digits, 0.0)))
 
 
 # --- the plain equations in arbitrary precision -------------------------------------------------
 
 
-def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, float] | None:
-    """Digits of accelerations and motion to which the plain equations agree, and until which t.
+def _compare_plain(system: System, rows: Text, spacing: float) -> tuple[float, float, float] | None:
+    """Compare the rows with the plain equations in mpmath; return `Reference.plain`.
 
-    Raises EomcError where the accelerations are others: then one of both is wrong.
+    Raises EomcError if the accelerations disagree, since then one of both is wrong.
     """
     if len(rows) < 2 or not symbolic.is_small(system):
         return None
     n = len(system.coordinates)
     with mpmath.workdps(PLAIN_DIGITS):
-        found = [[mpmath.mpf(text) for text in row] for row in rows]
-        plain = _Plain(system)
+        states = [[mpmath.mpf(text) for text in row] for row in rows]
+        plain = _PlainEquations(system)
         size = np.max(np.abs(rows[:, 2 * n :].astype(float)), axis=0)
-        digits = MOST_DIGITS
+        digits = MAX_DIGITS
         for k in sorted(set(np.linspace(0, len(rows) - 1, PLAIN_STATES).astype(int).tolist())):
-            a = plain.acceleration(found[k][:n], found[k][n : 2 * n], mpmath.mpf(spacing) * k)
+            a = plain.acceleration(states[k][:n], states[k][n : 2 * n], mpmath.mpf(spacing) * k)
             for i in range(n):
-                digits = min(digits, _digits(a[i] - found[k][2 * n + i], size[i]))
-        if digits < PLAIN_AGREES and not corners(system):
+                digits = min(digits, _digits(a[i] - states[k][2 * n + i], size[i]))
+        if digits < MIN_PLAIN_DIGITS and not corners(system):
             raise EomcError(
                 f"{system.name}: accelerations in __float128 and those of the plain equations "
                 f"agree to {digits:.0f} digits only: please report it, with the scene"
             )
-        motion, until = MOST_DIGITS, 0.0
-        deadline = time.monotonic() + PLAIN_SECONDS
-        x = found[0][: 2 * n]
+        motion, until = MAX_DIGITS, 0.0
+        deadline = time.monotonic() + MAX_PLAIN_SECONDS
+        x = states[0][: 2 * n]
         sizes = np.max(np.abs(rows[:, : 2 * n].astype(float)), axis=0)
         for k in range(1, len(rows)):
-            after = plain.over(x, mpmath.mpf(spacing) * (k - 1), mpmath.mpf(spacing), deadline)
+            after = plain.advance(x, mpmath.mpf(spacing) * (k - 1), mpmath.mpf(spacing), deadline)
             if after is None:
                 break
             x, until = after, spacing * k
             for i in range(2 * n):
-                motion = min(motion, _digits(x[i] - found[k][i], sizes[i]))
+                motion = min(motion, _digits(x[i] - states[k][i], sizes[i]))
         return digits, motion if until else 0.0, until
 
 
-def _digits(off: Any, size: float) -> float:
-    if off == 0:
-        return MOST_DIGITS
-    return min(MOST_DIGITS, float(-mpmath.log10(abs(off) / (size or 1.0))))
+def _digits(difference: Any, size: float) -> float:
+    if difference == 0:
+        return MAX_DIGITS
+    return min(MAX_DIGITS, float(-mpmath.log10(abs(difference) / (size or 1.0))))
 
 
-class _Plain:
-    """The reference's D, bias, tau, constraints and signals with mpmath numbers."""
+class _PlainEquations:
+    """D, bias, tau, constraints and signals of the symbolic reference, evaluated with mpmath."""
 
     def __init__(self, system: System) -> None:
         core = constant(system)
@@ -344,35 +367,38 @@ class _Plain:
         self.signals = compiled(symbols, list(r.signals), "mpmath")
 
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
-        """Qdd from D qdd = tau - bias + A^T lambda."""
+        """Solve D q̈ = τ - bias + Aᵀλ for q̈."""
         u = [mpmath.mpf(0)] * self.m
         if self.m:
             u = self.signals(*q, *qd, t, *u, *self.parameters)
         v = self.values(*q, *qd, t, *u, *self.parameters)
         n = self.size
         matrix = mpmath.matrix([v[i * n : (i + 1) * n] for i in range(n)])
-        found, whole = mpmath.lu_solve(matrix, mpmath.matrix(v[n * n :])), [mpmath.mpf(0)] * self.n
+        solution, accelerations = (
+            mpmath.lu_solve(matrix, mpmath.matrix(v[n * n :])),
+            [mpmath.mpf(0)] * self.n,
+        )
         for i, k in enumerate(self.own):
-            whole[k] = found[i]
-        return whole
+            accelerations[k] = solution[i]
+        return accelerations
 
-    def over(self, x: list[Any], t: Any, span: Any, deadline: float) -> list[Any] | None:
-        """The state after `span`, by extrapolated midpoint steps; None where time is up."""
+    def advance(self, x: list[Any], t: Any, span: Any, deadline: float) -> list[Any] | None:
+        """Return the state after `span` by extrapolated midpoint steps; None after the deadline."""
         parts = 1
-        while (found := self._extrapolated(x, t, span / parts, deadline)) is None:
+        while (state := self._extrapolated_step(x, t, span / parts, deadline)) is None:
             if time.monotonic() > deadline or parts > 1000:
                 return None
             parts *= 2
         for k in range(1, parts):
-            found = self._extrapolated(found, t + k * span / parts, span / parts, deadline)
-            if found is None:
+            state = self._extrapolated_step(state, t + k * span / parts, span / parts, deadline)
+            if state is None:
                 return None
-        return found
+        return state
 
-    def _extrapolated(self, x: list[Any], t: Any, H: Any, deadline: float) -> list[Any] | None:
-        """One step by Gragg, Bulirsch & Stoer with 2, 4, ... midpoint steps; None: not settled.
+    def _extrapolated_step(self, x: list[Any], t: Any, H: Any, deadline: float) -> list[Any] | None:
+        """Return one extrapolation of 2, 4, ... midpoint steps; None if it does not converge.
 
-        Hairer, Norsett & Wanner, Solving ODEs I, sec. II.9.
+        Gragg, Bulirsch & Stoer: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.9.
         """
         n = self.n
 

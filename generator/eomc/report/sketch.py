@@ -1,7 +1,7 @@
-"""What a scene declares of its shape, at many states at once: bodies, springs, its [picture].
+"""Draw what a scene declares of its shape: bodies, joints, springs and its [picture].
 
-A second, plain forward kinematics from the scene's own text, with arrays for numbers: it shares
-nothing with the derivation.
+This is an independent forward kinematics, evaluated from the scene's formulas at many states at
+once. It shares nothing with the derivation of the equations.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from eomc.scene.picture import Shape
 from eomc.scene.scene import Scene
 
 Array = NDArray[np.float64]
-Pose = tuple[Array, Array]  # at n states: the offset (n, 3) and rotation (n, 3, 3) of a frame
-PATHS = 3  # of points, at most
+Pose = tuple[Array, Array]  # position (n, 3) and rotation (n, 3, 3) of a frame at n states
+MAX_PATHS = 3
 
 ARRAYS: Mapping[str, Any] = {
     **formulas.NUMERIC,
@@ -33,14 +33,14 @@ ARRAYS: Mapping[str, Any] = {
     "heaviside": lambda x: np.heaviside(x, 0.5),
     "min": lambda *x: reduce(np.minimum, x),
     "max": lambda *x: reduce(np.maximum, x),
-    "dot": lambda x: 0.0 * x,  # of what does not move, or it could not stand here
+    "dot": lambda x: 0.0 * x,  # its argument is constant: others are refused by the scene's checks
 }  # fmt: skip
 
 
-def declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> Drawing | None:
-    """The drawing of what a scene declares; None where that is nothing.
+def draw_declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> Drawing | None:
+    """Return the drawing of what a scene declares; None if it declares nothing.
 
-    values: of parameters, numbers or (n,). t: (n,), s; q: (n, nq).
+    values: parameters by name, numbers or (n,). `t` (n,) is in s; `q` has shape (n, nq).
     """
     with np.errstate(all="ignore"):  # what has no value is not drawn
         return _Sketch(scene, values, t, q).drawing()
@@ -53,14 +53,14 @@ class _Sketch:
             p.name: p.value for p in (*scene.constants, *scene.parameters)
         }
         self.known |= {name: values[name] for name in values.keys() & self.known.keys()}
-        names = [c.name for c in scene.coordinates]  # behind them come modes, where there are
+        names = [c.name for c in scene.coordinates]  # columns of q after them are friction modes
         self.known |= dict(zip(names, q.T, strict=False)) | {"t": t}
         self.definitions = dict(scene.definitions)
         self.marks = Marks(self.n)
-        still = np.zeros((self.n, 3)), np.broadcast_to(np.eye(3), (self.n, 3, 3))
-        self.poses: dict[str, Pose] = {WORLD: still}
-        self.seats: dict[str, Pose] = {}  # of joints, before they move
-        self.centers: dict[str, Array] = {}  # of mass, in the world
+        world_pose = np.zeros((self.n, 3)), np.broadcast_to(np.eye(3), (self.n, 3, 3))
+        self.poses: dict[str, Pose] = {WORLD: world_pose}
+        self.joint_frames: dict[str, Pose] = {}  # frames of joints at zero displacement
+        self.centers: dict[str, Array] = {}  # centres of mass, in the world frame
 
     def drawing(self) -> Drawing | None:
         assembly, picture = self.scene.assembly, self.scene.picture
@@ -79,7 +79,7 @@ class _Sketch:
         return self.marks.drawing(axes, unit, up=self._up(assembly))
 
     def _up(self, assembly: Assembly | None) -> int:
-        """Against gravity, where it has a direction."""
+        """Return the index of the upward axis, opposite to gravity."""
         if assembly is None:
             return 2
         pull = np.abs([float(self._number(g)) for g in assembly.gravity])
@@ -100,12 +100,12 @@ class _Sketch:
         return self.known[name]
 
     def _vector(self, entries: Sequence[Formula]) -> Array:
-        """(n, 3)"""
+        """Evaluate a vector of formulas, (n, 3)."""
         columns = [np.broadcast_to(self._number(entry), self.n) for entry in entries]
         return np.stack(columns, axis=1).astype(float)
 
     def _rotation(self, turns: Sequence[Turn]) -> Array:
-        """(n, 3, 3)"""
+        """Return the rotation matrices of successive turns, (n, 3, 3)."""
         R = self.poses[WORLD][1]
         for turn in turns:
             R = R @ self._about(np.eye(3)["xyz".index(turn.axis)], self._number(turn.angle))
@@ -119,15 +119,15 @@ class _Sketch:
     # --- bodies ----------------------------------------------------------------------------------
 
     def _place(self, assembly: Assembly) -> None:
-        """Where all frames are, first those on joints."""
+        """Compute the poses of all frames, those of bodies on joints first."""
         for body in assembly.bodies:
             if body.joint:
                 at, R = self.poses[body.parent]
                 if body.offset:
                     at = at + _turned(R, self._vector(body.offset))
                 R = R @ self._rotation(body.rotation)
-                self.seats[body.name] = at, R
-                self.poses[body.name] = self._moved(body, at, R)
+                self.joint_frames[body.name] = at, R
+                self.poses[body.name] = self._after_joint(body, at, R)
                 at, R = self.poses[body.name]
                 self.centers[body.name] = at + _turned(R, self._vector(body.center))
         for body in assembly.bodies:
@@ -135,7 +135,7 @@ class _Sketch:
                 pose = self._vector(body.position), self._rotation(body.rotation)
                 self.poses[body.name], self.centers[body.name] = pose, pose[0]
 
-    def _moved(self, body: Body, at: Array, R: Array) -> Pose:
+    def _after_joint(self, body: Body, at: Array, R: Array) -> Pose:
         kind = JOINTS[body.joint]
         along = zip(kind.motions, kind.along(body.axes), body.coordinates, strict=True)
         for motion, axis, by in along:
@@ -150,21 +150,21 @@ class _Sketch:
     def _skeleton(self, assembly: Assembly) -> None:
         for body in assembly.bodies:
             if body.joint:
-                self._join(body)
+                self._draw_joint(body)
         for body in assembly.bodies:
             self._mass(body, assembly.plane)
         if not assembly.plane:
             self._boxes(assembly)
         for loop in assembly.loops:
             if loop.bodies:
-                self._close(loop)
+                self._draw_loop(loop)
         for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
             for end in some:
                 self._between(kind, end, assembly)
 
-    def _join(self, body: Body) -> None:
-        """The joint of a body, and what holds it to the frame of its parent."""
-        marks, (seat, R) = self.marks, self.seats[body.name]
+    def _draw_joint(self, body: Body) -> None:
+        """Draw the joint of a body, and a rod from the parent's frame to it."""
+        marks, (seat, R) = self.marks, self.joint_frames[body.name]
         at = marks.point(seat)
         if body.parent != WORLD:
             marks.add("rod", marks.point(self.poses[body.parent][0]), at)
@@ -175,9 +175,9 @@ class _Sketch:
             marks.add("ground", at)
         if "t" in motions:
             axis = JOINTS[body.joint].along(body.axes)[motions.index("t")]
-            way = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
+            direction = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
             unit = _turned(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
-            ends = (marks.point(seat + x * unit) for x in (way.min(), way.max()))
+            ends = (marks.point(seat + x * unit) for x in (direction.min(), direction.max()))
             marks.add("rail", *ends)
             marks.add("slide", marks.point(self.poses[body.name][0]))
         elif motions:
@@ -185,27 +185,32 @@ class _Sketch:
         if body.point:
             marks.add("point", marks.point(self.poses[body.name][0]))
 
-    def _close(self, loop: Loop) -> None:
-        """The joint of a loop, and what holds it to the frames of its bodies."""
+    def _draw_loop(self, loop: Loop) -> None:
+        """Draw the joint that closes a loop, and rods from the frames of its bodies to it."""
         marks, ends = self.marks, list[Array]()
         for k, name in enumerate(loop.bodies):
             at, R = self.poses[name]
             ends.append(at + _turned(R, self._vector(loop.points[k])) if loop.points else at)
-            marks.add("ground" if name == WORLD else "rod", *self._hold(name, marks.point(ends[k])))
+            marks.add(
+                "ground" if name == WORLD else "rod", *self._support(name, marks.point(ends[k]))
+            )
         first, second = map(marks.point, ends)
         if loop.joint == "distance":
             marks.add("rod", first, second)
         if loop.joint in ("prismatic", "cylindrical", "point-on-line"):
             unit = _turned(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
-            way = np.sum((ends[1] - ends[0]) * unit, axis=1)
-            marks.add("rail", *(marks.point(ends[0] + x * unit) for x in (way.min(), way.max())))
+            direction = np.sum((ends[1] - ends[0]) * unit, axis=1)
+            marks.add(
+                "rail",
+                *(marks.point(ends[0] + x * unit) for x in (direction.min(), direction.max())),
+            )
             marks.add("slide", second)
         elif loop.joint != "weld":
             for end in (first, second) if loop.joint == "distance" else (first,):
                 marks.add("joint", end)
 
     def _mass(self, body: Body, plane: bool) -> None:
-        """The centre of mass, and how the body is turned where no line of it shows that."""
+        """Draw the centre of mass; in the plane also the orientation of the body."""
         mass = float(self._number(body.mass))
         if mass <= 0:
             return
@@ -220,7 +225,10 @@ class _Sketch:
         marks.add("mass", at)
 
     def _boxes(self, assembly: Assembly) -> None:
-        """Of bodies in space that no line shows the turning of; what is fixed together is one."""
+        """Draw inertia boxes of bodies in space whose rotation no line shows.
+
+        Bodies that are fixed to one another share one box.
+        """
         roots: dict[str, str] = {}
         for body in assembly.bodies:
             together = body.joint == "fixed" and body.parent != WORLD
@@ -229,14 +237,14 @@ class _Sketch:
         lines = {m.points[0] for m in marks.marks if m.kind in ("rod", "arm")}
         for root in assembly.bodies:
             group = [b for b in assembly.bodies if roots[b.name] == root.name]
-            held = any(marks.point(self.poses[b.name][0]) in lines for b in group)
-            if group and (root.joint in ("", "free") or not held):
+            shows_rotation = any(marks.point(self.poses[b.name][0]) in lines for b in group)
+            if group and (root.joint in ("", "free") or not shows_rotation):
                 self._inertia(group, self.poses[root.name][1])
 
     def _inertia(self, group: Sequence[Body], R: Array) -> None:
-        """The box of the mass and inertia of bodies that are fixed together, R their rotation.
+        """Draw the box with the mass and inertia of bodies fixed to one another.
 
-        With edges 2a, 2b, 2c Ixx is m (b^2 + c^2)/3.
+        `R` is the rotation of the box. With edges 2a, 2b, 2c, Ixx = m (b² + c²)/3.
         """
         masses = np.array([float(self._number(body.mass)) for body in group])
         if not masses.sum() > 0:
@@ -245,17 +253,17 @@ class _Sketch:
         center = centers[0]  # exactly, where it is alone
         if len(group) > 1:
             center = np.tensordot(masses, centers, 1) / masses.sum()
-        whole = np.zeros((3, 3))
+        inertia_sum = np.zeros((3, 3))
         for body, m, own in zip(group, masses, centers, strict=True):
             d, turned = R[0].T @ (own[0] - center[0]), np.eye(3)
             if body is not group[0]:
                 turned = R[0].T @ self.poses[body.name][1][0]
             inertia = [float(self._number(entry)) for entry in body.inertia]
-            whole += turned @ spatial.tensor(inertia) @ turned.T
-            whole += m * (d @ d * np.eye(3) - np.outer(d, d))
-        if not np.isfinite(whole).all():
+            inertia_sum += turned @ spatial.tensor(inertia) @ turned.T
+            inertia_sum += m * (d @ d * np.eye(3) - np.outer(d, d))
+        if not np.isfinite(inertia_sum).all():
             return
-        moments, axes = np.linalg.eigh(whole)
+        moments, axes = np.linalg.eigh(inertia_sum)
         halves = np.sqrt(np.maximum(3 * (moments.sum() / 2 - moments) / masses.sum(), 0))
         halves[halves < 1e-6 * halves.max(initial=0.0)] = 0
         if halves.any():
@@ -264,14 +272,14 @@ class _Sketch:
             self.marks.add("inertia", self.marks.point(center), *points)
 
     def _between(self, kind: str, end: Between, assembly: Assembly) -> None:
-        """A spring or damper where its ends are known."""
+        """Draw a spring or damper if its end points are known."""
         marks = self.marks
         if end.points and end.bodies:
             points = []
             for name, place in zip(end.bodies, end.points, strict=True):
                 at, R = self.poses[name]
                 points.append(marks.point(at + _turned(R, self._vector(place))))
-                marks.add("ground" if name == WORLD else "rod", *self._hold(name, points[-1]))
+                marks.add("ground" if name == WORLD else "rod", *self._support(name, points[-1]))
             marks.add(kind, *points)
             return
         for body in assembly.bodies:
@@ -279,21 +287,21 @@ class _Sketch:
             by = [formula.text for formula in body.coordinates]
             turns = end.turning and end.bodies and {body.name, body.parent} == {*end.bodies}
             if motions == "r" and (turns or by == [end.coordinate]) and kind == "spring":
-                marks.add("spiral", marks.point(self.seats[body.name][0]))
+                marks.add("spiral", marks.point(self.joint_frames[body.name][0]))
             elif motions == "t" and by == [end.coordinate]:
-                ends = (self.seats[body.name][0], self.poses[body.name][0])
+                ends = (self.joint_frames[body.name][0], self.poses[body.name][0])
                 marks.add(kind, *map(marks.point, ends))
 
-    def _hold(self, name: str, point: int) -> tuple[int, ...]:
-        """The points of what holds the end of a spring: the world at it, or a rod of the body."""
+    def _support(self, name: str, point: int) -> tuple[int, ...]:
+        """Return the points of the mark that supports a spring's end: ground or rod."""
         return (point,) if name == WORLD else (self.marks.point(self.poses[name][0]), point)
 
     def _paths(self, assembly: Assembly) -> None:
-        """Of the points that the scene names, else of the one body that carries none."""
+        """Add the paths of the scene's [[point]]s, or of the only body without children."""
         marks = self.marks
         tips = [b.name for b in assembly.bodies if b.point]
         if tips:
-            for name in tips[:PATHS]:
+            for name in tips[:MAX_PATHS]:
                 marks.path(name, marks.point(self.poses[name][0]))
             return
         parents = {b.parent for b in assembly.bodies if b.joint}
@@ -305,7 +313,7 @@ class _Sketch:
 
     def _shape(self, shape: Shape) -> None:
         marks = self.marks
-        at = [self._at(place.name, place.at) for place in shape.places]
+        at = [self._pose_of_place(place.name, place.at) for place in shape.places]
         points = [marks.point(x) for x, _ in at]
         if shape.kind == "path":
             name = shape.places[0].name
@@ -320,8 +328,8 @@ class _Sketch:
             tips = (marks.point(center + h * R[:, :, k]) for k, h in enumerate(halves))
             marks.add(shape.kind, points[0], *tips)
 
-    def _at(self, name: str, at: Sequence[Formula] | None) -> Pose:
-        """A place, and the axes there."""
+    def _pose_of_place(self, name: str, at: Sequence[Formula] | None) -> Pose:
+        """Return the position of a place and the axes there."""
         return self.poses[name] if at is None else (self._vector(at), self.poses[WORLD][1])
 
 

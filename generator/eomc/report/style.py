@@ -14,7 +14,7 @@ INK, FAINT = "#333333", "#DDDDDD"
 
 
 def colours(count: int) -> tuple[str, ...]:
-    """As many colours, from red to violet where COLOURS are too few."""
+    """Return `count` distinct colours, hues from red to violet if COLOURS has too few."""
     if count <= len(COLOURS):
         return COLOURS[:count]
     hues = (k / count * 5 / 6 for k in range(count))
@@ -23,7 +23,7 @@ def colours(count: int) -> tuple[str, ...]:
 
 
 def plain(axes: Axes, lines: bool = True) -> None:
-    """Light grid, no box, and of what is drawn so far thin lines."""
+    """Format axes: a light grid, no box, and thin lines for the curves drawn so far."""
     axes.grid(True, color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

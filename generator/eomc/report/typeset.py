@@ -1,8 +1,8 @@
-"""Formulas in the order in which they are taught, their lines broken, as text and as LaTeX.
+"""Print formulas in textbook order, broken into lines, as text and as LaTeX.
 
-Masses and lengths stand before coordinates, these before rates and accelerations, sines last;
-a sum begins with accelerations, then rates. Such sums and products are not evaluated, since SymPy
-would sort them by name.
+In a product, masses and lengths come before coordinates, these before velocities and accelerations,
+and sines last; in a sum, accelerations come first, then velocities. Such sums and products are not
+evaluated, since SymPy would sort them by name.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from sympy.printing.str import StrPrinter
 from eomc.model.system import System, symbol, t
 from eomc.runtime.labels import tex
 
-DECIMAL = 20  # below the line of a fraction, from which it is shown as a decimal
-DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # behind words, not on a letter in their middle
-LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
-TINY = 1e-25  # a factor below it is what rounding left of a zero
-WIDE = 96  # columns of text, and of what LaTeX sets in a line
+MIN_DECIMAL_DENOMINATOR = 20  # smaller denominators are shown as fractions
+DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # appended to names of several letters
+MAX_FRACTION_PART = 10**12  # larger numerators or denominators are shown as decimals
+ZERO_TOLERANCE = 1e-25  # a smaller factor is the rounding error of zero
+WIDE = 96  # columns of a line of text; also limits lines of LaTeX
 
-Term = tuple[bool, Expr]  # whether it is subtracted, and what
+Term = tuple[bool, Expr]  # (True if subtracted, the term without its sign)
 
 
 class Typesetter:
-    """Prints expressions over a system's names."""
+    """Prints expressions over the names of a system."""
 
     def __init__(self, system: System) -> None:
         dotted = {c.q: (c.name, 0) for c in system.coordinates}
@@ -56,29 +56,33 @@ class Typesetter:
         self._text = _Text(shown, names)
         self._blocks: dict[Expr, prettyForm] = {}
         self._line = _Line(shown, names)
-        every = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
-        words = any(tex(name).startswith(r"\mathrm") for name in every)
+        all_names = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
+        words = any(tex(name).startswith(r"\mathrm") for name in all_names)
         in_latex = {s: tex(name, n) for s, (name, n) in dotted.items()}
-        self._latex = _Latex(_apart(system.definitions) | in_latex, words)
+        self._latex = _Latex(_ambiguous_names(system.definitions) | in_latex, words)
 
     def terms(self, e: Expr) -> list[Term]:
-        """The terms of a sum, ordered, without their signs."""
-        parts = [x for part in sympy.Add.make_args(sympy.sympify(e)) for x in self._parted(part)]
+        """Return the terms of a sum in order, each with its sign."""
+        parts = [
+            x
+            for part in sympy.Add.make_args(sympy.sympify(e))
+            for x in self._split_wide_product(part)
+        ]
         return [self.term(part) for part in sorted(parts, key=self._place)]
 
-    def _parted(self, part: Expr) -> list[Expr]:
-        """A product that is too wide for a line, multiplied out by its longest sum."""
+    def _split_wide_product(self, part: Expr) -> list[Expr]:
+        """Expand a product that is too wide for a line over its longest sum."""
         sums = [f for f in part.args if f.is_Add] if part.is_Mul else []
-        if (apart := spread(part)) is not part:
-            return [*apart.args]
+        if (distributed := distribute_decimal(part)) is not part:
+            return [*distributed.args]
         if not sums or self._block(part).width() <= WIDE - 12:
             return [part]
         longest = max(sums, key=lambda f: (f.count_ops(), str(f)))
-        made = [part / longest * x for x in longest.args]
-        return [y for x in made for y in sympy.Add.make_args(spread(x))]
+        products = [part / longest * x for x in longest.args]
+        return [y for x in products for y in sympy.Add.make_args(distribute_decimal(x))]
 
     def term(self, *factors: Expr) -> Term:
-        """A product in order; its sign by itself."""
+        """Return a product with its factors in order, and its sign."""
         factors = tuple(x for f in factors for x in sympy.Mul.make_args(f) if x != 1)
         signed = sympy.Mul(*(f for f in factors if f.is_Number))
         number = abs(signed)
@@ -90,22 +94,22 @@ class Typesetter:
                 number = sympy.S.One
             else:
                 number = sympy.Float(number, 15)
-        made = [self.ordered(f) for f in sorted(others, key=self._factor)]
-        if number != 1 or not made:
-            made.insert(0, number)
-        product = made[0] if len(made) == 1 else sympy.Mul(*made, evaluate=False)
+        ordered = [self.ordered(f) for f in sorted(others, key=self._factor)]
+        if number != 1 or not ordered:
+            ordered.insert(0, number)
+        product = ordered[0] if len(ordered) == 1 else sympy.Mul(*ordered, evaluate=False)
         return bool(signed < 0), product
 
     def ordered(self, e: Expr) -> Expr:
-        """A formula with its sums and products in order."""
+        """Return an expression with its sums and products in order."""
         if e.is_Add:
             signed = [(-1 if minus else 1, term) for minus, term in self.terms(e)]
             return sympy.Add(*(_negative(x) if s < 0 else x for s, x in signed), evaluate=False)
-        if (apart := spread(e)) is not e:
-            return self.ordered(apart)
+        if (distributed := distribute_decimal(e)) is not e:
+            return self.ordered(distributed)
         if e.is_Mul:
-            minus, made = self.term(e)
-            return _negative(made) if minus else made
+            minus, product = self.term(e)
+            return _negative(product) if minus else product
         if e.is_Pow:
             return sympy.Pow(self.ordered(e.base), e.exp, evaluate=False)
         if isinstance(e, sympy.MatrixBase):
@@ -123,14 +127,14 @@ class Typesetter:
         return (2 if f.is_Pow and not base.is_Function else 6, 0, str(f))
 
     def _place(self, part: Expr) -> tuple[Any, ...]:
-        """Of terms: those with accelerations and rates of first coordinates first, then signs."""
+        """Sort key of a term: by accelerations, then velocities, then sign."""
         powers = part.as_powers_dict()
         degrees = [powers.get(s, 0) for s in self._rates]
         rank = tuple(-float(n) if n.is_number else 0.0 for n in map(sympy.sympify, degrees))
         return (*rank, bool(part.as_coeff_Mul()[0] < 0), sympy.default_sort_key(part))
 
     def text(self, e: Expr) -> prettyForm:
-        """A formula as a block of text; in lines one above the other where it is too wide."""
+        """Return an expression as a block of text, wrapped to several lines if it is too wide."""
         if e not in self._blocks:
             block = self._block(e)
             if block.width() > WIDE - 12 and not isinstance(e, sympy.MatrixBase):
@@ -148,25 +152,25 @@ class Typesetter:
             pretty_use_unicode(unicode)
 
     def latex(self, e: Expr) -> str:
-        """A formula in LaTeX."""
-        made: str = self._latex.doprint(e)
-        return made
+        """Return an expression in LaTeX."""
+        printed: str = self._latex.doprint(e)
+        return printed
 
     def rows(self, terms: Iterable[Term], width: int) -> list[list[Term]]:
-        """Terms in lines of so many columns."""
+        """Split terms into rows at most `width` columns wide."""
         lines: list[list[Term]] = [[]]
-        gone = 0
+        used_width = 0
         for minus, term in terms:
-            wide = self.text(term).width() + 3
-            if lines[-1] and gone + wide > width:
+            width_of_term = self.text(term).width() + 3
+            if lines[-1] and used_width + width_of_term > width:
                 lines.append([])
-                gone = 0
+                used_width = 0
             lines[-1].append((minus, term))
-            gone += wide
+            used_width += width_of_term
         return lines
 
     def text_lines(self, terms: Sequence[Term], right: Sequence[Term] | None = None) -> list[str]:
-        """A sum, or an equation, as lines of text at most WIDE columns wide."""
+        """Return a sum, or an equation, as text lines of at most WIDE columns."""
         lines: list[str] = []
         rows = self.rows(terms, WIDE - 4)
         ends = [] if right is None else self.rows(right or [(False, sympy.S.Zero)], WIDE - 8)
@@ -174,7 +178,7 @@ class Typesetter:
             block = self._row(row, "" if k == 0 else "+")
             if ends and k == len(rows) - 1:
                 closing = self._row(ends[0], "=")
-                joined = _beside(block, closing)
+                joined = _join_blocks(block, closing)
                 if joined.width() <= WIDE - 4 * (k > 0):
                     block, ends = joined, ends[1:]
                 else:
@@ -186,7 +190,7 @@ class Typesetter:
         return lines
 
     def _row(self, row: Sequence[Term], begin: str) -> prettyForm:
-        made = prettyForm("")
+        printed = prettyForm("")
         for k, (minus, term) in enumerate(row):
             if k:
                 sign = " - " if minus else " + "
@@ -194,11 +198,15 @@ class Typesetter:
                 sign = "- " if minus else "+ "
             else:
                 sign = ("" if not begin else " = ") + ("-" if minus else "")
-            made = _beside(made, prettyForm(sign), self.text(term)) if sign else self.text(term)
-        return made
+            printed = (
+                _join_blocks(printed, prettyForm(sign), self.text(term))
+                if sign
+                else self.text(term)
+            )
+        return printed
 
     def latex_lines(self, terms: Sequence[Term], right: Sequence[Term] | None = None) -> list[str]:
-        """A sum, or an equation, as lines of LaTeX about as wide."""
+        """Return a sum, or an equation, as LaTeX lines of about WIDE columns."""
         lines = [self._latex_row(row, k > 0) for k, row in enumerate(self.rows(terms, WIDE))]
         if right is not None:
             ends = self.rows(right or [(False, sympy.S.Zero)], WIDE)
@@ -207,23 +215,23 @@ class Typesetter:
         return lines
 
     def _latex_row(self, row: Sequence[Term], joined: bool) -> str:
-        made = ""
+        printed = ""
         for k, (minus, term) in enumerate(row):
             sign = ("- " if minus else "+ ") if k or joined else ("-" if minus else "")
-            made += (" " if k else "") + sign + self.latex(term)
-        return made
+            printed += (" " if k else "") + sign + self.latex(term)
+        return printed
 
 
-def _apart(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Symbol, str]:
-    """Names that LaTeX would set as others, whole: joint_y_, beside joint_y."""
+def _ambiguous_names(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Symbol, str]:
+    """Return upright LaTeX names for definitions that LaTeX would set like others: joint_y_."""
     many = Counter(tex(s.name) for s, _ in definitions)
     whole = (s for s, _ in definitions if many[tex(s.name)] > 1 and "" in s.name.split("_"))
     return {s: r"\mathrm{" + s.name.replace("_", r"\_") + "}" for s in whole}
 
 
 def _decimal(e: Expr) -> bool:
-    """Whether it reads better as a decimal, which it was in the scene: 0.028, not 7/250."""
-    if not e.is_Rational or e.q < DECIMAL:
+    """True if a number is shown as a decimal, as in the scene: 0.028 rather than 7/250."""
+    if not e.is_Rational or e.q < MIN_DECIMAL_DENOMINATOR:
         return False
     rest = e.q
     for prime in (2, 5):
@@ -232,17 +240,18 @@ def _decimal(e: Expr) -> bool:
     return bool(rest == 1)
 
 
-def spread(e: Expr) -> Expr:
-    """A decimal times a sum, as the sum of terms each with its own; anything else as it is."""
+def distribute_decimal(e: Expr) -> Expr:
+    """Multiply out a decimal times a sum; return anything else unchanged."""
     if e.is_Mul and len(e.args) == 2 and _decimal(e.args[0]) and e.args[1].is_Add:
         return sympy.Add(*(e.args[0] * x for x in e.args[1].args))
     return e
 
 
 def readable(value: Expr) -> Expr:
-    """With decimals for fractions that nobody reads, as those of 50 digits of slanted axes.
+    """Return an expression with decimals in place of fractions of many digits.
 
-    At 30 digits more of them fall together, and what rounding left of zeros is gone.
+    Such fractions arise from slanted axes, given to 50 digits. Numbers that agree to 30 digits are
+    merged, and factors below ZERO_TOLERANCE, which are rounding errors of zero, are removed.
     """
     if not _long(value):
         return value
@@ -252,19 +261,22 @@ def readable(value: Expr) -> Expr:
 
 
 def _simple_fraction(x: sympy.Rational) -> sympy.Rational | None:
-    """Return the fraction of at most three digits that float64 does not tell from x, if any."""
+    """Return the fraction with at most three digits that rounds to the float64 of x, or None."""
     simple = Fraction(int(x.p), int(x.q)).limit_denominator(999)
     return sympy.Rational(simple) if float(simple) == float(x) else None
 
 
 def _rounded(e: Expr) -> Expr:
     return e.xreplace(
-        {x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > TINY else 0 for x in _long(e)}
+        {
+            x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > ZERO_TOLERANCE else 0
+            for x in _long(e)
+        }
     )
 
 
 def _long(e: Expr) -> set[sympy.Rational]:
-    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= LONG}
+    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= MAX_FRACTION_PART}
 
 
 def _negative(e: Expr) -> Expr:
@@ -274,7 +286,7 @@ def _negative(e: Expr) -> Expr:
     return sympy.Mul(-1, *factors, evaluate=False)
 
 
-def _beside(*blocks: prettyForm) -> prettyForm:
+def _join_blocks(*blocks: prettyForm) -> prettyForm:
     return prettyForm(*stringPict.next(*blocks))
 
 
@@ -283,7 +295,7 @@ def _indented(block: prettyForm, by: int) -> list[str]:
 
 
 def _dotted(name: str, dots: int) -> str:
-    """theta2 -> thetadot2, which SymPy prints as a dotted theta with a subscript 2."""
+    """Return the name of a time derivative: theta2 -> thetadot2, which SymPy prints with a dot."""
     if not dots:
         return name
     base = name.split("_")[0].rstrip("0123456789") or name
@@ -291,13 +303,13 @@ def _dotted(name: str, dots: int) -> str:
 
 
 def _set_as_name(name: str) -> str:
-    """With its subscripts, as far as Unicode has them; else as it is."""
-    made = str(pretty_symbol(name))
-    return name if {" ", "_"} & {*made} else made
+    """Return a name with Unicode subscripts if all of them exist, else unchanged."""
+    printed = str(pretty_symbol(name))
+    return name if {" ", "_"} & {*printed} else printed
 
 
 class _Text(PrettyPrinter):  # type: ignore[misc]
-    """Blocks of Unicode."""
+    """Prints blocks of Unicode text."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
         super().__init__(
@@ -314,7 +326,7 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
 
 
 class _Line(StrPrinter):  # type: ignore[misc]
-    """One line of text: √(x + y), x^2."""
+    """Prints one line of text: √(x + y), x^2."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
         super().__init__({"order": "none", "full_prec": False})
@@ -327,12 +339,12 @@ class _Line(StrPrinter):  # type: ignore[misc]
         return f"d/dt ({self._print(e.args[0])})"
 
     def doprint(self, e: Expr) -> str:
-        made: str = super().doprint(e)
-        return made.replace("**", "^").replace("*", "⋅").replace("sqrt(", "√(")
+        printed: str = super().doprint(e)
+        return printed.replace("**", "^").replace("*", "⋅").replace("sqrt(", "√(")
 
 
 class _Latex(LatexPrinter):  # type: ignore[misc]
-    """LaTeX with upright words, a thin space between factors where there are any; sin θ bare."""
+    """Prints LaTeX: upright words, thin spaces between factors that are words, sin θ bare."""
 
     def __init__(self, names: dict[Symbol, str], words: bool) -> None:
         settings = {"order": "none", "fold_func_brackets": True, "full_prec": False}

@@ -1,4 +1,4 @@
-"""From a run back to the system that it is a motion of."""
+"""Find the system that a run was simulated with."""
 
 from __future__ import annotations
 
@@ -16,10 +16,23 @@ Source = str | os.PathLike[str] | System
 
 
 def system_of(run: Any, scene: Source | None = None) -> System:
-    """The system of a run, with the parameters that the run, or a batch's first, was made with.
+    """Return the system of a run, with the run's parameter values.
 
-    scene: where it is not what eomc.load made the module from, the path of a scene or a System.
-    Raises EomcError where there is none, or where the scene is another than the one that was built.
+    Parameters
+    ----------
+    run : Run or batch of runs
+        Of a batch, the parameter values are those of the first instance.
+    scene : path or System, optional
+        Needed if the module was not loaded with `eomc.load`.
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    EomcError
+        If the scene is unknown, or is not the one that the module was built from.
     """
     model = run._model
     source = model.source if scene is None else scene

@@ -16,7 +16,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.report import cost_of_digits, equations, mathml, page, presented
+from eomc.report import cost_of_digits, equations, mathml, overview, page
 from eomc.scene.read import parse
 
 pytest.importorskip("matplotlib")
@@ -70,17 +70,17 @@ def system() -> System:
 def made() -> str:
     needs("gcc")
     report = cost_of_digits.measure(system(), REPORTS, longest=0.005, methods=("rk4", "dp8"))
-    return page.page(report, presented.of(system(), report, REPORTS))
+    return page.page(report, overview.describe_scene(system(), report, REPORTS))
 
 
 def test_equations_become_mathml() -> None:
-    first, rest = mathml.lines(equations.of(system()))
+    first, rest = mathml.lines(equations.derive(system()))
     ((more, line),) = first
     assert not more and line.startswith("<math") and 'displaystyle="true"' in line
     assert "<mi>k</mi>" in line and "push" in re.sub("<[^>]+>", "", line)
     symbols = [re.sub("<[^>]+>", "", line)[0] for _, line in rest[:6]]
     assert symbols == ["K", "P", "L", "D", "C", "g"]
-    swing = equations.of(pipeline.read(ROOT / "scenes" / "furuta_pendulum.toml"))
+    swing = equations.derive(pipeline.read(ROOT / "scenes" / "furuta_pendulum.toml"))
     first, _ = mathml.lines(swing)
     assert [more for more, _ in first] == [False, True, False]
     assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
@@ -91,9 +91,9 @@ def test_without_latex2mathml_equations_say_what_to_install(
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
         monkeypatch.setitem(sys.modules, name, None)
-    mathml._made.cache_clear()
+    mathml._convert.cache_clear()
     with pytest.raises(EomcError, match="need latex2mathml: pip install latex2mathml"):
-        mathml.lines(equations.of(system()))
+        mathml.lines(equations.derive(system()))
 
 
 @pytest.mark.slow
@@ -115,11 +115,11 @@ def test_a_scene_too_large_to_write_out_says_how_it_is_computed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     needs("gcc")
-    monkeypatch.setattr(equations, "DERIVED", 1_000)
+    monkeypatch.setattr(equations, "MAX_DERIVED_OPERATIONS", 1_000)
     chain = pipeline.read(ROOT / "scenes" / "chain.toml")
     chain = replace(chain, run=replace(chain.run, duration=0.2))
     report = cost_of_digits.measure(chain, REPORTS, longest=0.002, methods=("rk4",))
-    about = presented.of(chain, report, REPORTS)
+    about = overview.describe_scene(chain, report, REPORTS)
     assert not about.equations and "link2 on link1: turns about z" in about.text
     assert '<pre tabindex="0">Chain of links' in page.page(report, about)
 
@@ -127,10 +127,10 @@ def test_a_scene_too_large_to_write_out_says_how_it_is_computed(
 @pytest.mark.parametrize("given", ["page", "latex", "escape", "attribute"])
 def test_free_text_is_escaped(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
     text = PAYLOADS[given]
-    monkeypatch.setattr(presented, "_motion", lambda *_: ("", ""))
+    monkeypatch.setattr(overview, "_motion", lambda *_: ("", ""))
     whole = system()
     noted = replace(whole.coordinates[0], unit=text, note=text)
-    about = presented.of(replace(whole, note=text, coordinates=(noted,)), None, Path())  # type: ignore[arg-type]
+    about = overview.describe_scene(replace(whole, note=text, coordinates=(noted,)), None, Path())  # type: ignore[arg-type]
     assert about.note == texts.html(texts.flat(text))
     assert about.coordinates[0][2:] == (texts.html(texts.flat(text)),) * 2
 
@@ -167,7 +167,7 @@ def test_a_motion_that_adaptive_steps_do_best_is_drawn_by_them(tmp_path: Path) -
     report = cost_of_digits.measure(system, tmp_path, methods=("rk4", "adaptive"), longest=0.01)
     best = report.best(6)
     assert best is not None and best.adaptive
-    assert presented.of(system, report, tmp_path).said.startswith(
+    assert overview.describe_scene(system, report, tmp_path).said.startswith(
         f"By steps that fit a tolerance of {best.tol:.0e}, within "
     )
 

@@ -1,4 +1,4 @@
-"""What a scene is: its words, tables, equations and motion, as a page shows them."""
+"""Overview of a scene for a page: its note, tables, equations and motion."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from eomc.report import equations, large_system, mathml
 from eomc.report.cost_of_digits import Report, variant
 from eomc.report.labels import html_name
 
-ROWS = 1_000  # of a motion that is drawn, at least
-Row = tuple[Markup, str, Markup, Markup]  # name, number, unit, note
+MIN_ROWS = 1_000  # of a drawn motion, so that curves look smooth
+Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
 
 
 @dataclass(frozen=True)
-class Presented:
-    """The parts of a page, made harmless. equations, rest: lines, and which go on with the last.
+class Overview:
+    """Contents of the overview, escaped for HTML.
 
-    text: what stands for equations that are too long to write out, or that nothing sets. motion: a
-    picture, SVG, empty without matplotlib.
+    equations, rest: lines of MathML, each with True if it continues the previous line. text: plain
+    text that replaces equations which are too long, or which cannot be shown as MathML. motion: a
+    figure as SVG, empty without matplotlib, and its caption.
     """
 
     note: Markup
@@ -37,14 +38,14 @@ class Presented:
     rest: Sequence[tuple[bool, Markup]]
     text: Markup
     motion: Markup
-    said: str
+    caption: str
 
 
-def of(system: System, report: Report, root: Path) -> Presented:
-    """A scene as it is presented, its motion by the stepper that was found best for six digits."""
+def describe_scene(system: System, report: Report, root: Path) -> Overview:
+    """Return the overview of a scene, with the motion of the fastest run of six digits."""
     first, rest, text = _equations(system)
-    motion, said = _motion(system, report, root)
-    return Presented(
+    motion, caption = _motion(system, report, root)
+    return Overview(
         note=Markup(texts.html(texts.flat(system.note))),
         coordinates=[_row(c, f"{c.start:.6g}", f"{c.rate:.6g}") for c in system.coordinates],
         parameters=[_row(p, f"{p.value:.6g}") for p in system.parameters],
@@ -54,7 +55,7 @@ def of(system: System, report: Report, root: Path) -> Presented:
         rest=rest,
         text=Markup("\n").join(map(texts.html, text.splitlines())),
         motion=motion,
-        said=said,
+        caption=caption,
     )
 
 
@@ -62,20 +63,23 @@ Lines = Sequence[tuple[bool, Markup]]
 
 
 def _equations(system: System) -> tuple[Lines, Lines, str]:
-    """Those of motion and the rest as MathML; else as text: without latex2mathml, or too long."""
+    """Return the equations of motion and the other formulas as MathML, or both as text.
+
+    They are returned as text if latex2mathml is not installed or if the equations are too long.
+    """
     try:
-        found = equations.of(system)
+        derived = equations.derive(system)
     except EomcError:
         return [], [], large_system.text(system)
     try:
-        return *mathml.lines(found), ""
+        return *mathml.lines(derived), ""
     except EomcError:
-        return [], [], str(found)
+        return [], [], str(derived)
 
 
-def _row(what: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
-    name = Markup(html_name(what.name))
-    unit, note = (Markup(texts.html(texts.flat(x))) for x in (what.unit, what.note))
+def _row(entry: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
+    name = Markup(html_name(entry.name))
+    unit, note = (Markup(texts.html(texts.flat(x))) for x in (entry.unit, entry.note))
     return name, ", ".join(numbers), unit, note
 
 
@@ -86,14 +90,14 @@ def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
         return Markup(""), ""
     best = report.best(6) or report.finest
     module, _ = variant(system, [p.method for p in report.lines], root / system.name / "report")
-    finer = max(1, math.ceil(ROWS / best.steps))  # enough rows for smooth curves
+    finer = max(1, math.ceil(MIN_ROWS / best.steps))  # enough rows for smooth curves
     if best.adaptive:
         run = module.simulate(tol=best.tol, duration=report.duration)._drawn
-        said = f"By steps that fit a tolerance of {best.tol:.0e}"
+        caption = f"By steps that fit a tolerance of {best.tol:.0e}"
     else:
         h, steps = best.h / finer, best.steps * finer
         run = module.simulate(h=h, steps=steps, method=best.method)
-        said = f"By {best.method}, h = {run.h:.3g} s"
+        caption = f"By {best.method}, h = {run.h:.3g} s"
     jacobi = run.jacobi if run._model.has_jacobi else None
     inputs = dict(zip(module.inputs, run.u.T, strict=True))
     balance = run.balance() if run._model.has_power else None
@@ -102,5 +106,5 @@ def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
         balance.words if balance else "", inputs,
     )  # fmt: skip
     if best.adaptive or finer == 1:
-        said += f", within {best.along:.1g} of the reference solution"
-    return plot.svg(figure), said + "."
+        caption += f", within {best.along:.1g} of the reference solution"
+    return plot.svg(figure), caption + "."
