@@ -73,9 +73,11 @@ class Equations(Derived):
     @cached_property
     def set_out(self) -> Equations:
         """The equations as they are printed: abbreviated if they are long."""
+        if self.named:
+            return self
         if self._internal is not None:
             return self._internal.set_out.with_user_symbols()
-        long = not self.named and _operations(self) > MAX_WRITTEN_OPERATIONS
+        long = _operations(self) > MAX_WRITTEN_OPERATIONS
         return abbreviations.abbreviate(self) if long else self
 
     def with_user_symbols(self) -> Equations:
