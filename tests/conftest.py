@@ -69,7 +69,7 @@ SourceFileLoader.get_code = _code_once  # type: ignore[method-assign]
 
 def _binding_flags() -> tuple[str, ...]:
     """The calls' own speed is no matter, and they are compiled in half of the time."""
-    given = compiler.given_flags()
+    given = compiler.user_flags()
     if os.environ.get("CC") or (given is not None and given != ("-O0",)):
         return given or ("-O0",)
     return ("-O0", *precompiled.included())
@@ -87,9 +87,9 @@ def _build_once(
     if os.environ.get("CC"):
         _build(made, name, folder, library, by, *how)
         return
-    if len(how) == 1 and compiler.given_flags() == ("-O0",):
+    if len(how) == 1 and compiler.user_flags() == ("-O0",):
         how = (*how, precompiled.UNOPTIMISED)
-    parts = (made.files, made.cdef, name, library, by, how, compiler.given_flags())
+    parts = (made.files, made.cdef, name, library, by, how, compiler.user_flags())
     key = hashlib.sha256(repr(parts).encode()).hexdigest()
     if key in _libraries:
         (folder / library).write_bytes(_libraries[key])

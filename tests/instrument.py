@@ -19,7 +19,7 @@ from forks import in_a_fork as in_a_fork
 import eomc
 from eomc.model.system import System
 from eomc.toolchain import compiler as compiling
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 
@@ -34,7 +34,7 @@ class Shipped:
         made = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
         files = fast_kit(made)
-        lay_out(files, folder)
+        write_files(files, folder)
         self.source = files[f"{self.name}.c"]
         ffi = cffi.FFI()
         ffi.cdef(made.cdef)

@@ -226,9 +226,9 @@ def write_wheel(
 def _tell_preparing(warn: Callable[[Problem], None] | None) -> None:
     """A note where the compiler's first call takes long."""
     from eomc.base.errors import Problem
-    from eomc.toolchain.compiler import preparing
+    from eomc.toolchain.compiler import first_call_note
 
-    if warn is not None and (why := preparing()):
+    if warn is not None and (why := first_call_note()):
         warn(Problem(why, severity="note"))
 
 

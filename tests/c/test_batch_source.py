@@ -18,7 +18,7 @@ from corner_cases import CASES
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 
 def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_step_of_a_tile_is_vectors_alone(real: str, scalar: str, tmp_path: Pat
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     file = tmp_path / "cartpole.toml"
     file.write_text(text.replace("[run]\n", f'[run]\nreal = "{real}"\nbatch = true\n'))
-    lay_out(fast_kit(eomc.sources(eomc.read(file))), tmp_path)
+    write_files(fast_kit(eomc.sources(eomc.read(file))), tmp_path)
     subprocess.run(
         ["gcc", "-std=gnu99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
          "-fno-tree-slp-vectorize", "-S", "cartpole.c"],
@@ -80,7 +80,7 @@ def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     run = f'[run]\nreal = "{real}"\nbatch = true\nmethod = ["rk4", "dp8"]\n'
     (tmp_path / "strict.toml").write_text(text.replace("[run]\n", run), encoding="utf-8")
-    lay_out(fast_kit(eomc.sources(eomc.read(tmp_path / "strict.toml"))), tmp_path)
+    write_files(fast_kit(eomc.sources(eomc.read(tmp_path / "strict.toml"))), tmp_path)
     warnings = "-Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Werror".split()
     for compiler in filter(shutil.which, ("gcc", "clang")):
         given = [compiler, "-std=c99", *warnings, "-c", f"{name}.c", "-o", "out.o"]
@@ -94,6 +94,6 @@ def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path
 def test_gcc_sees_that_all_is_initialised(text: str, level: str, tmp_path: Path) -> None:
     """Constants of an empty batch, and vectors that are filled entry by entry."""
     made = eomc.sources(from_scene(parse(text.replace("[run]", "[run]\nbatch = true"), "x.toml")))
-    lay_out(fast_kit(made), tmp_path)
+    write_files(fast_kit(made), tmp_path)
     flags = ["-std=gnu99", level, "-Wall", "-Wextra", "-Werror"]
     compiled(needs("gcc"), *flags, "-c", f"{made.name}.c", "-o", "out.o", cwd=tmp_path)

@@ -23,7 +23,7 @@ from eomc.emit.fast.files import PLACEHOLDERS
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 from eomc.verify import symbolic
 
 NAMES = [
@@ -57,7 +57,7 @@ def generated(name: str) -> dict[str, str]:
 @pytest.fixture
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A folder with the generated files of a scene."""
-    lay_out(generated(request.param), tmp_path)
+    write_files(generated(request.param), tmp_path)
     return tmp_path
 
 
@@ -159,7 +159,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Printed:
     @cache
     def of(name: str, command: str) -> str:
         folder = tmp_path_factory.mktemp(name)
-        lay_out(generated(name), folder)
+        write_files(generated(name), folder)
         compiler, *flags = command.split()
         files = ("-I.", "main.c", f"{name}.c", "-lm")
         compiled(needs(compiler), "-std=c99", *flags, *files, cwd=folder)
@@ -273,7 +273,7 @@ E = { start = 1 }
 [energy]
 kinetic = "E_dot**2/2"
 """
-    lay_out(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
+    write_files(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
     compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
 
 
@@ -295,7 +295,7 @@ def test_enumerators_are_none_of_our_own_macros() -> None:
 def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
     text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")
-    lay_out(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
+    write_files(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
     program = f"""
         #include <stdio.h>
         #include "cartpole.h"
@@ -362,7 +362,7 @@ def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) ->
 
 def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
-    lay_out(generated("cartpole"), tmp_path)
+    write_files(generated("cartpole"), tmp_path)
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0
     assert "-ffast-math" in done.stderr

@@ -13,7 +13,7 @@ from conftest import ROOT, needs, tiers
 import eomc
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 # both headers in one file, and which way each goes
 PROBE = f"""
@@ -153,7 +153,7 @@ def test_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
 def outcome(text: str, folder: Path, *flags: str) -> tuple[int, str]:
     """Status and words of the self-test of a scene."""
     s = system.from_scene(scene.parse(text))
-    lay_out(fast_kit(eomc.sources(s)), folder)
+    write_files(fast_kit(eomc.sources(s)), folder)
     (folder / "fma.c").write_text(TWO_ROUNDINGS)
     command = ["cc", "-std=c99", "-O0", "-I.", *flags, "selftest.c", f"{s.name}.c", "-lm"]
     subprocess.run(command, cwd=folder, check=True)

@@ -25,7 +25,7 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import sizes
 from eomc.toolchain.compiler import Compiler
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 pytestmark = pytest.mark.slow
 CORTEX = ROOT / "docs" / "examples" / "cortex_m"
@@ -153,7 +153,7 @@ def test_the_self_test_passes_there(
     """Angles up to the stated limits, D, bias and accelerations as computed here in Python."""
     its = MACHINES[machine]
     run, command = runner(its), compiler(its, alone=False)
-    lay_out(generated(name, real), tmp_path)
+    write_files(generated(name, real), tmp_path)
     at = "." if form == "plain" else "fast"
     how = ["-std=c99", "-Os"] if form == "plain" else ["-std=gnu99", "-O2"]
     files = ["selftest.c", f"{at}/{name}.c"]

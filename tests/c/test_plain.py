@@ -25,7 +25,7 @@ from eomc.model.system import System
 from eomc.program import outline
 from eomc.program.assembly import assembled
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 from eomc.verify import rows_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row
@@ -101,7 +101,7 @@ def both(name: str) -> tuple[ModuleType, ModuleType]:
 def kit(name: str, folder: Path) -> str:
     """The generated C as `eomc build` writes it; the name that it bears."""
     (folder / "fast").mkdir()
-    lay_out(generated(name), folder)
+    write_files(generated(name), folder)
     return made(name).name
 
 

@@ -127,16 +127,16 @@ def test_the_object_is_bounded(name: str, level: str, monkeypatch: pytest.Monkey
     names = {f.name for f in found.functions}
     public = [f for f in found.functions if "." not in f.name]
     assert {f"{title}_acceleration", f"{title}_{made(name).run.methods[0]}_run"} <= names
-    assert all(f.code > 0 and f.stack is not None and f.deepest is not None for f in public)
+    assert all(f.code > 0 and f.stack is not None and f.total_stack is not None for f in public)
     called = {x for f in found.functions for x in f.calls} - names
     assert called <= MATHEMATICS | {"memcpy", "memset", "memmove"}, called - MATHEMATICS
     run_of, step_of = (
         next(f for f in public if f.name == f"{title}_{made(name).run.methods[0]}_{what}")
         for what in ("run", "step")
     )
-    assert run_of.deepest is not None and step_of.deepest is not None
+    assert run_of.total_stack is not None and step_of.total_stack is not None
     if level == "-O0":  # where nothing is inlined
-        assert run_of.deepest > step_of.deepest > (step_of.stack or 0)
+        assert run_of.total_stack > step_of.total_stack > (step_of.stack or 0)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_what_is_unbounded_is_told(text: str, fault: str, monkeypatch: pytest.Mo
     gcc = compiler.Compiler((needs("gcc"),), "")
     found = sizes.measure({"x.h": "", "x.c": text}, "x", gcc)
     assert fault in "\n".join(found.faults)
-    assert next(f for f in found.functions if f.name == "x_f").deepest is None
+    assert next(f for f in found.functions if f.name == "x_f").total_stack is None
 
 
 def test_writable_data_and_constants_are_counted() -> None:

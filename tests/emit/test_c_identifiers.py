@@ -26,7 +26,7 @@ from eomc.emit import c_identifiers
 from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"
@@ -144,7 +144,7 @@ def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
 
 
 def write(folder: Path, files: dict[str, str]) -> None:
-    lay_out(files, folder)
+    write_files(files, folder)
 
 
 def compiled(folder: Path, name: str, *flags: str) -> None:

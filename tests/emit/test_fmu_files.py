@@ -22,7 +22,7 @@ from eomc.emit.fmu import units
 from eomc.emit.fmu.files import Unit
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 ODD = """
 eomc = 1
@@ -144,7 +144,7 @@ def test_its_c_is_strict_and_has_nothing_that_changes(
     version: int, text: str, tmp_path: Path
 ) -> None:
     unit = made(text, version)
-    lay_out(unit.files, tmp_path)
+    write_files(unit.files, tmp_path)
     # the standard's own headers declare functions without prototypes
     flags = """-std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Wshadow -Werror
     -O2 -fno-pic""".split()
@@ -161,7 +161,7 @@ def test_its_c_is_strict_and_has_nothing_that_changes(
 @pytest.mark.parametrize("version", [2, 3])
 def test_units_that_are_linked_statically_have_a_prefix(version: int, tmp_path: Path) -> None:
     unit = made(BALL, version)
-    lay_out(unit.files, tmp_path)
+    write_files(unit.files, tmp_path)
     command = [needs("gcc"), f"-DFMI{version}_FUNCTION_PREFIX=ball_", "-c", f"fmi/fmi{version}.c",
                "-o", "unit.o"]  # fmt: skip
     compiled(*command, cwd=tmp_path / "sources")

@@ -20,7 +20,7 @@ from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.trig import apart
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 
 def odd() -> program.Program:
@@ -171,7 +171,7 @@ def test_a_run_cut_in_c_is_the_same_to_the_last_bit(
     name: str, h: float, tmp_path: Path, modules: Modules
 ) -> None:
     """With the memory handed on; without it, sums begin anew. Near what was predicted, and not."""
-    lay_out(fast_files(modules(name)), tmp_path)
+    write_files(fast_files(modules(name)), tmp_path)
     main = r"""
         #include "NAME.h"
         #include <stdio.h>

@@ -19,7 +19,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.fast.lanes import Accelerations
 from eomc.program import program
 from eomc.program.trig import Angle
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 
 @cache
@@ -34,7 +34,7 @@ def made_with(
     main: str, name: str, rows: Iterable[Sequence[float]], flags: Sequence[str], folder: Path
 ) -> list[list[float]]:
     """What a main() behind the fast C of a scene tells of rows of numbers."""
-    lay_out(fast(name)[1], folder)
+    write_files(fast(name)[1], folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     main = "#include <stdio.h>\n" + main.replace("eomc_", f"{name}_")
     main = main.replace("EOMC_", f"{name.upper()}_")

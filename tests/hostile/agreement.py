@@ -36,7 +36,7 @@ from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.toolchain import compiler
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 from eomc.verify import symbolic
 
 NAMES = ("cartpole", "double_pendulum", "furuta_pendulum", "spring_pendulum", "four_bar")
@@ -119,7 +119,7 @@ class Scene:
     ) -> tuple[float, float, float, bool]:
         """The same of a program for another machine, which an emulator runs."""
         at, name, n = "fast/" if form == "fast" else "", self.system.name, self.q.shape[1]
-        lay_out(self.sources.embeddable, place)
+        write_files(self.sources.embeddable, place)
         words = [compiler.standard(form), *flags.split(), *PLAIN, "-static", f"-I{place / at}"]
         given = {"HEADER": f"<{name}.h>", "SCENE": name, "SIZE": n, "NUMBER": self.real}
         given["INPUTS"] = len(self.system.inputs)

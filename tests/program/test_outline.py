@@ -41,7 +41,7 @@ from eomc.program.ir import (
 from eomc.program.program import Program
 from eomc.scene import read as scene
 from eomc.toolchain import cache
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -164,7 +164,7 @@ def test_the_cut_is_where_few_values_cross() -> None:
 
 def written(made: Sources, folder: Path) -> str:
     folder.mkdir(exist_ok=True)
-    lay_out(fast_kit(made), folder)
+    write_files(fast_kit(made), folder)
     return f"{made.name}.c"
 
 

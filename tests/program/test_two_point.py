@@ -27,7 +27,7 @@ from eomc.model import from_scene as system
 from eomc.program import program, two_point
 from eomc.program.ir import Assignment, Operand, Product, Sum
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 from eomc.verify import symbolic
 
 # angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that
@@ -417,7 +417,7 @@ def test_no_step_reads_what_none_has_written(tmp_path: Path) -> None:
     needs("gcc")
     run = 'method = ["rk4", "dp8", "gauss8", "gauss16"]'
     made = system.from_scene(scene.parse(with_run(ODD, "dirt_", run), "dirt_odd.toml"))
-    lay_out({**fast_kit(eomc.sources(made)), "dirt.c": DIRT}, tmp_path)
+    write_files({**fast_kit(eomc.sources(made)), "dirt.c": DIRT}, tmp_path)
     command = "gcc -std=gnu99 -O0 -march=native dirt.c dirt_odd.c -lm -o dirt"
     compiled(*command.split(), cwd=tmp_path)
     assert subprocess.run([tmp_path / "dirt"]).returncode == 0

@@ -14,7 +14,7 @@ import eomc
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import Reaction
 from eomc.scene.read import parse
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 MADE = from_scene(
     parse("""eomc = 1
@@ -79,7 +79,9 @@ def test_outputs_over_them_are_nan(lighter: ModuleType) -> None:
 def test_the_c_of_both_forms_says_so_and_writes_nothing(tmp_path: Path) -> None:
     made = eomc.sources(LIGHTER).files
     (tmp_path / "fast").mkdir()
-    lay_out({file: text for file, text in made.items() if file.endswith((".c", ".h"))}, tmp_path)
+    write_files(
+        {file: text for file, text in made.items() if file.endswith((".c", ".h"))}, tmp_path
+    )
     (tmp_path / "asked.c").write_text(PROGRAM)
     for at in (".", "fast"):
         built = ["cc", "-std=gnu99", "-O0", f"-I{at}", "asked.c", f"{at}/lighter.c", "-lm"]

@@ -50,4 +50,4 @@ def test_the_first_build_by_ziglang_says_that_it_prepares(
 def test_other_compilers_prepare_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/nowhere")
-    assert compiler.preparing() == ""
+    assert compiler.first_call_note() == ""

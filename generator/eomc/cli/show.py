@@ -9,7 +9,7 @@ import click
 from eomc import pipeline
 from eomc.cli import options
 from eomc.cli.terminal import say, status_line, warn
-from eomc.toolchain import kept
+from eomc.toolchain import disk_cache
 
 
 @click.command("show")
@@ -47,7 +47,7 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):
-        found = kept.texts(root, name, form or "text", digest, made)
+        found = disk_cache.cached_texts(root, name, form or "text", digest, made)
     if found["warnings"]:
         say(found["warnings"], err=True)
     say(found["text"])
@@ -66,7 +66,7 @@ def _sizes(scene: Path) -> str:
         found = sizes.measure(made.files, made.name, compiler)
     rows: list[tuple[str, ...]] = [("function", "code", "stack", "with calls")]
     for f in found.functions:
-        told = (f.code, f.stack, f.deepest)
+        told = (f.code, f.stack, f.total_stack)
         rows.append((f.name, *("-" if n is None else str(n) for n in told)))
     wide = max(len(row[0]) for row in rows)
     library = sorted(

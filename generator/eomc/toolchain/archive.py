@@ -1,4 +1,4 @@
-"""Archives that are the same bytes for the same contents, and never half there."""
+"""Write zip archives: reproducible, and never left half written."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from eomc.base.errors import writing
 from eomc.runtime.written import replacing
 
-_DATE = (1980, 1, 1, 0, 0, 0)  # of all that is inside, the earliest of a zip
+_DATE = (1980, 1, 1, 0, 0, 0)  # of all entries: the earliest date that zip allows
 
 
 def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None:
-    """Write a zip in place of `file`, when it is whole; its folder is made where it isn't there.
+    """Write a zip archive and replace `file` with it once it is complete.
 
-    programs: the folder in it whose files are executable. Raises EomcError where it can't be
-    written.
+    Missing folders are created. `programs` is the folder in the archive whose files are executable.
+    Raises EomcError if the archive can't be written.
     """
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -24,7 +24,7 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
             for name, data in contents.items():
                 entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.create_system = 3  # whose rights these are
+                entry.create_system = 3  # Unix: permissions are in external_attr
                 runs = programs and name.startswith(f"{programs}/")
                 entry.external_attr = (0o755 if runs else 0o644) << 16
                 archive.writestr(entry, data)

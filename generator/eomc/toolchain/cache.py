@@ -28,7 +28,14 @@ from typing import TYPE_CHECKING, Any
 from eomc.base import resources
 from eomc.base.errors import EomcError, FolderError
 from eomc.base.version import __version__
-from eomc.toolchain.compiler import MANY, STANDARD, compiler_for, flags, processor, standard
+from eomc.toolchain.compiler import (
+    MANY_OPERATIONS,
+    STANDARD,
+    compiler_for,
+    flags,
+    processor,
+    standard,
+)
 from eomc.toolchain.lock import locked
 
 if TYPE_CHECKING:
@@ -68,7 +75,7 @@ def key(scene_digest: str, form: str = "fast") -> str:
     Half is the digest of all of it, half that of all but the compiler. Raises EomcError where
     there is none.
     """
-    small, large = compiler_for(0), compiler_for(MANY + 1)
+    small, large = compiler_for(0), compiler_for(MANY_OPERATIONS + 1)
     parts = _parts(scene_digest, form)
     return _total(*parts, small.identity, large.identity)[:HALF] + _total(*parts)[:HALF]
 
@@ -195,11 +202,11 @@ def _build(
     scene_digest: str,
 ) -> None:
     from eomc.toolchain import extension
-    from eomc.toolchain.running import lay_out
+    from eomc.toolchain.subprocesses import write_files
 
     called = f"_{name}_{wanted[:12]}"
     made = sources(called)
-    lay_out(made.files, new)
+    write_files(made.files, new)
     library = called + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
     extension.build(made, called, new, library, compiler, form)

@@ -1,4 +1,4 @@
-"""The C compiler: which one, and with which flags."""
+"""Find the C compiler and choose its flags."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from pathlib import Path
 
 from eomc.base.errors import EomcError, NoCompilerError
 
-# no -ffast-math: it breaks the reduction of angles and the checks for singular D
+# no -ffast-math, which breaks the reduction of angles and the checks for singular D
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
 STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
-# the plain one as it is embedded: any compiler, no processor of its own
+# portable C as it is embedded: any compiler, no specific processor
 PLAIN_STANDARD, PLAIN_FLAGS = "-std=c99", ("-O2",)
-# operations over which gcc takes some twenty seconds (0.3 ms each, in pieces) and clang two thirds
-MANY = 60_000
+# above it gcc takes more than some twenty seconds (0.3 ms per operation), clang two thirds of that
+MANY_OPERATIONS = 60_000
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler: the command, and what identifies it."""
+    """A C compiler: its command, and a text that identifies its version."""
 
     command: tuple[str, ...]
     identity: str
 
 
 def find_compiler() -> Compiler:
-    """$CC, cc, gcc, clang or the pip-installable ziglang, in this order. Raises EomcError."""
-    wish = os.environ.get("CC")
-    for candidate in [wish] if wish else ["cc", "gcc", "clang"]:
-        words = _words("CC", candidate)
+    """Return $CC, cc, gcc, clang or ziglang (from pip), the first that exists. Raises EomcError."""
+    requested = os.environ.get("CC")
+    for candidate in [requested] if requested else ["cc", "gcc", "clang"]:
+        words = _split_words("CC", candidate)
         if words and (path := shutil.which(words[0])):
             return Compiler((path, *words[1:]), _identity(path) + " ".join(words[1:]))
-    if wish:
-        raise EomcError(f"the C compiler CC={wish!r} is not there: correct or unset CC")
+    if requested:
+        raise EomcError(f"the C compiler CC={requested!r} is not there: correct or unset CC")
     if importlib.util.find_spec("ziglang") is not None:
         import ziglang
 
@@ -50,35 +50,39 @@ def find_compiler() -> Compiler:
     )
 
 
-def preparing() -> str:
-    """What there is to say before ziglang's first call, which takes a minute; "" otherwise."""
+def first_call_note() -> str:
+    """Return a note for ziglang's first call, which takes a minute; "" for other compilers."""
     if not find_compiler().identity.startswith("ziglang"):
         return ""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    kept = Path(os.environ.get("ZIG_GLOBAL_CACHE_DIR") or Path(home) / "zig")
-    if (kept / "o").is_dir():
+    cache_folder = Path(os.environ.get("ZIG_GLOBAL_CACHE_DIR") or Path(home) / "zig")
+    if (cache_folder / "o").is_dir():
         return ""
     return "ziglang prepares its libraries: the first build takes a minute or two, others seconds"
 
 
-def _words(variable: str, text: str) -> list[str]:
-    """The words of a variable of the environment, as a shell divides them. Raises EomcError."""
+def _split_words(variable: str, text: str) -> list[str]:
+    """Split the value of an environment variable as a shell does. Raises EomcError."""
     try:
         return shlex.split(text)
     except ValueError as fault:  # an open quote, a backslash at the end
-        said = str(fault).lower()
-        raise EomcError(f"{variable}={text!r}: {said}: close it, or unset {variable}") from None
+        reason = str(fault).lower()
+        raise EomcError(f"{variable}={text!r}: {reason}: close it, or unset {variable}") from None
 
 
 def compiler_for(operations: int) -> Compiler:
-    """The compiler for a scene of that size: find_compiler's; clang, where it is there, for many.
+    """Return the compiler for a scene: `find_compiler`'s, or clang for more than MANY_OPERATIONS.
 
-    $CC is always obeyed. Raises EomcError.
+    $CC takes precedence. Raises EomcError.
     """
-    found = find_compiler()
-    if operations > MANY and not os.environ.get("CC") and (clang := shutil.which("clang")):
+    default = find_compiler()
+    if (
+        operations > MANY_OPERATIONS
+        and not os.environ.get("CC")
+        and (clang := shutil.which("clang"))
+    ):
         return Compiler((clang,), _identity(clang))
-    return found
+    return default
 
 
 def _identity(path: str) -> str:
@@ -88,41 +92,43 @@ def _identity(path: str) -> str:
 
 
 def flags(form: str = "fast") -> tuple[str, ...]:
-    """The optimisation flags: $EOMC_CFLAGS where it is set, else those of the form of C.
+    """Return the optimisation flags: $EOMC_CFLAGS if set, else those of the form of C.
 
-    Vector registers that the C asks for are as wide as there are; what compilers put into some by
-    themselves is quicker in half of AVX-512's: a chain of five takes 0.85 of the time.
+    With AVX-512, compilers vectorise in registers of half width, which is faster here: a chain of
+    five links takes 0.85 of the time. Explicit vectors in the generated C use the full width.
     """
-    given = given_flags()
-    if given is not None:
-        return given
+    chosen = user_flags()
+    if chosen is not None:
+        return chosen
     if form == "plain":
         return PLAIN_FLAGS
     return (*FLAGS, "-mprefer-vector-width=256") if "avx512f" in processor() else FLAGS
 
 
 def binding_flags() -> tuple[str, ...]:
-    """Those of the binding: $EOMC_CFLAGS or -O1, since its speed is that of the calls in it."""
-    return given_flags() or ("-O1",)
+    """Return the flags of the binding: $EOMC_CFLAGS, or -O1, since its own speed hardly matters."""
+    return user_flags() or ("-O1",)
 
 
-def given_flags() -> tuple[str, ...] | None:
-    """The words of $EOMC_CFLAGS; None where it is not set."""
-    given = os.environ.get("EOMC_CFLAGS")
-    return None if given is None else tuple(_words("EOMC_CFLAGS", given))
+def user_flags() -> tuple[str, ...] | None:
+    """Return the words of $EOMC_CFLAGS; None if it is not set."""
+    value = os.environ.get("EOMC_CFLAGS")
+    return None if value is None else tuple(_split_words("EOMC_CFLAGS", value))
 
 
 def standard(form: str) -> str:
-    """The language of a form of C."""
+    """Return the language standard flag of a form of C."""
     return PLAIN_STANDARD if form == "plain" else STANDARD
 
 
 @lru_cache(maxsize=1)
 def processor() -> str:
-    """What -march=native depends on."""
+    """Return the processor model and features, which -march=native depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        kept = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
-        return platform.machine() + " " + " ".join(sorted(kept))
+        identifying = {
+            line for line in lines if line.startswith(("model name", "flags", "Features"))
+        }
+        return platform.machine() + " " + " ".join(sorted(identifying))
     except OSError:
         return platform.machine() + " " + platform.processor()

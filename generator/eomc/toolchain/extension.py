@@ -1,4 +1,4 @@
-"""Sources to a compiled extension: cffi's wrapper, two compilations, a link, a trial."""
+"""Compile sources to an extension module: cffi binding, two compilations, linking, load test."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
-from eomc.toolchain.running import run, try_out
+from eomc.toolchain.subprocesses import run, try_load
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
 
-_UNASSERTED = ("-DNDEBUG",)  # cffi asserts its own tables at each call: a seventh of the time
+_NO_ASSERTIONS = ("-DNDEBUG",)  # cffi's own assertions take a seventh of a call's time
 
 
 def build(
-    made: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str,
+    sources: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str,
     optimised: Sequence[str] | None = None,
 ) -> None:  # fmt: skip
-    """Compile the sources that lie in `folder` and link `library` there; it can be loaded then.
+    """Compile the sources in `folder`, link `library` there, and test that it can be loaded.
 
-    optimised: other flags than those of the form.
-    Raises EomcError where the compiler fails, with its own words.
+    `optimised` replaces the flags of the form of C. Raises EomcError with the compiler's message if
+    it fails.
     """
     import cffi
 
-    name = made.name
+    name = sources.name
     ffi = cffi.FFI()
-    ffi.cdef(made.cdef)
-    ffi.set_source(extension, made.binding, compiler_verbose=0)
-    at = "fast/" if form == "fast" else ""  # where the header lies that the binding includes
+    ffi.cdef(sources.cdef)
+    ffi.set_source(extension, sources.binding, compiler_verbose=0)
+    subfolder = "fast/" if form == "fast" else ""  # folder of the header that the binding includes
     try:
-        ffi.emit_c_code(str(folder / f"{at}binding.c"))
-    except FileNotFoundError as fault:  # of what cffi removes once it could not rename its file
+        ffi.emit_c_code(str(folder / f"{subfolder}binding.c"))
+    except FileNotFoundError as fault:  # cffi's clean-up hides why renaming its file failed
         first = fault.__context__
         raise first if isinstance(first, OSError) else fault from None
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
-    bound = [*common, STANDARD, *_UNASSERTED, *binding_flags(), *include]
+    binding_command = [*common, STANDARD, *_NO_ASSERTIONS, *binding_flags(), *include]
     scene_flags = optimised or flags(form)
     jobs = [
-        [*common, standard(form), *scene_flags, "-c", f"{at}{name}.c", "-o", "scene.o"],
-        [*bound, "-c", f"{at}binding.c", "-o", "binding.o"],
+        [*common, standard(form), *scene_flags, "-c", f"{subfolder}{name}.c", "-o", "scene.o"],
+        [*binding_command, "-c", f"{subfolder}binding.c", "-o", "binding.o"],
     ]
     run(name, folder, *jobs)
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
@@ -58,20 +58,20 @@ def build(
     run(name, folder, link)
     backend = importlib.util.find_spec("_cffi_backend")
     assert backend is not None and backend.origin is not None
-    given = (os.path.dirname(backend.origin), extension, str((folder / library).resolve()))
+    arguments = (os.path.dirname(backend.origin), extension, str((folder / library).resolve()))
     # before it replaces another
-    try_out(name, compiler.command, _TRIAL, given, "; the last build stays")
+    try_load(name, compiler.command, _LOAD_TEST, arguments, "; the last build stays")
 
 
 def python_library(library: str) -> str:
-    """What extensions are linked with on Windows, of their own Python or, abi3, of any Python 3."""
+    """Return the import library for Windows: of this Python, or of any Python 3 with abi3."""
     version = f"{sys.version_info[0]}{sys.version_info[1]}"
     name = f"python{version if version in library else 3}.lib"
     return str(Path(sys.base_prefix, "libs", name))
 
 
-# imports an extension from a file, with nothing of Python's own start-up but cffi's backend
-_TRIAL = """
+# imports an extension from a file, in a Python without site packages except cffi's backend
+_LOAD_TEST = """
 import sys
 sys.path.append(sys.argv[1])
 from importlib.machinery import ExtensionFileLoader, ModuleSpec

@@ -1,4 +1,4 @@
-"""A lock on a file, which keeps builds of one scene apart: by flock, on Windows by msvcrt."""
+"""File locks that separate builds of one scene: flock, or msvcrt on Windows."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from pathlib import Path
 from eomc.base.errors import EomcError
 
 _NO_LOCK = "{}: is no file, and builds of a scene lock one there: remove it"
-_FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # which Windows has not, nor what they are for
+_FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not needed, on Windows
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """A lock on a file that is made where it isn't there; nothing is written to it.
+    """Hold an exclusive lock on a file, which is created if needed; nothing is written to it.
 
-    Raises EomcError where something else lies there: no link is followed, no pipe waited for.
+    Raises EomcError if the path is not a regular file. Links are not followed and pipes not waited
+    for.
     """
     try:
         flags = os.O_RDWR | os.O_CREAT
@@ -41,15 +42,15 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _wait(lock: int) -> None:
-    """Until it is ours; closing the file gives it back."""
+    """Wait for the exclusive lock; closing the file releases it."""
     if sys.platform == "win32":
         import msvcrt
 
         while True:
             try:
-                msvcrt.locking(lock, msvcrt.LK_LOCK, 1)  # its first byte, which need not be there
+                msvcrt.locking(lock, msvcrt.LK_LOCK, 1)  # first byte, which need not exist
                 return
-            except OSError as fault:  # it tries for ten seconds
+            except OSError as fault:  # LK_LOCK gives up after ten seconds
                 if fault.errno != errno.EDEADLK:
                     raise
     else:

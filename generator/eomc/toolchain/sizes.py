@@ -1,7 +1,7 @@
-"""Bytes of code and stack of each function of the plain C, read from what a compiler makes of it.
+"""Sizes of code and stack of each function of the portable C, read from compiler output.
 
-gcc writes a graph of calls with the stack of each function (-fcallgraph-info=su), clang the stack
-alone (-fstack-usage). Sizes of functions and sections stand in the object, which must be ELF.
+gcc writes a call graph with stack sizes (-fcallgraph-info=su), clang stack sizes only
+(-fstack-usage). Sizes of functions and sections are read from the object file, which must be ELF.
 """
 
 from __future__ import annotations
@@ -15,85 +15,93 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from eomc.base.errors import EomcError
-from eomc.toolchain.compiler import PLAIN_STANDARD, Compiler, given_flags
-from eomc.toolchain.running import run
+from eomc.toolchain.compiler import PLAIN_STANDARD, Compiler, user_flags
+from eomc.toolchain.subprocesses import run
 
-SMALL = ("-Os",)  # where EOMC_CFLAGS says nothing
-# tables by which debuggers unwind are in no small machine
-BARE = ("-fno-asynchronous-unwind-tables", "-fno-unwind-tables")
-# how stacks are asked for, first what tells most; ziglang's clang has to be told the file
-_STACKS = (
+DEFAULT_FLAGS = ("-Os",)  # without EOMC_CFLAGS
+# small machines have no unwind tables for debuggers
+NO_UNWIND_TABLES = ("-fno-asynchronous-unwind-tables", "-fno-unwind-tables")
+# flags that report stack sizes, the most informative first; ziglang's clang needs the file name
+_STACK_FLAGS = (
     ("-fstack-usage", "-fcallgraph-info=su"),
     ("-fstack-usage", "-Xclang", "-stack-usage-file", "-Xclang", "{name}.su"),
     ("-fstack-usage",),
     (),
 )
 _ELF = b"\x7fELF"
-_SYMBOLS, _WRITE, _ALLOCATED, _EXECUTED, _FUNCTION = 2, 1, 2, 4, 2  # ELF's own numbers
+_SYMBOLS, _WRITE, _ALLOCATED, _EXECUTED, _FUNCTION = 2, 1, 2, 4, 2  # constants of the ELF format
 
 
 @dataclass(frozen=True)
-class Size:
-    """A function: bytes of code, and of stack alone and with all that it calls.
+class FunctionSize:
+    """Size of a function in bytes: its code, its own stack, and the stack including its callees.
 
-    stack, deepest: None where the compiler does not say, or there is no bound. calls: by name,
-    those of libraries too, whose stack is not known.
+    stack, total_stack: None if the compiler does not report it or it has no bound. calls: names of
+    the callees, including library functions, whose stack is not known.
     """
 
     name: str
     code: int
     stack: int | None = None
-    deepest: int | None = None
+    total_stack: int | None = None
     calls: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
-class Object:
-    """A compiled source: its functions, and the bytes of all code, constants and writable data."""
+class ObjectSizes:
+    """Sizes of a compiled source: functions, and bytes of code, constants and writable data."""
 
     command: tuple[str, ...]
-    functions: tuple[Size, ...]
+    functions: tuple[FunctionSize, ...]
     code: int
     constants: int
     writable: int
-    faults: tuple[str, ...]  # of its stack: recursion, frames without a bound
+    faults: tuple[str, ...]  # recursion and unbounded stack frames
 
 
 @dataclass
 class _Graph:
-    """Frames by function, which of them have no bound, and who calls whom."""
+    """Call graph: stack frames by function, functions with unbounded frames, and calls."""
 
     frames: dict[str, int] = field(default_factory=dict)
     unbounded: set[str] = field(default_factory=set)
     calls: dict[str, set[str]] = field(default_factory=dict)
-    whole: bool = False  # whether calls are known
+    has_calls: bool = False  # True if `calls` is complete
 
 
-def measure(files: Mapping[str, str], name: str, compiler: Compiler) -> Object:
-    """The sizes of name.c, compiled by itself. Raises EomcError where it can't be, or is no ELF."""
-    given = given_flags()
-    flags = (PLAIN_STANDARD, *(SMALL if given is None else given), *BARE, "-c", f"{name}.c")
+def measure(files: Mapping[str, str], name: str, compiler: Compiler) -> ObjectSizes:
+    """Compile name.c alone and return its sizes. Raises EomcError if it can't be read as ELF."""
+    chosen = user_flags()
+    flags = (
+        PLAIN_STANDARD,
+        *(DEFAULT_FLAGS if chosen is None else chosen),
+        *NO_UNWIND_TABLES,
+        "-c",
+        f"{name}.c",
+    )
     with tempfile.TemporaryDirectory(prefix="eomc-sizes-") as place:
         folder = Path(place)
         for end in "hc":
             (folder / f"{name}.{end}").write_text(files[f"{name}.{end}"], encoding="utf-8")
         _compile(name, (*compiler.command, *flags, "-o", f"{name}.o"), folder)
-        return _object(name, (*compiler.command, *flags[:-2]), folder)
+        return _read_sizes(name, (*compiler.command, *flags[:-2]), folder)
 
 
 def _compile(name: str, command: tuple[str, ...], folder: Path) -> None:
-    """By the first way of asking for stacks that the compiler takes."""
-    *others, last = ([*command, *(word.format(name=name) for word in more)] for more in _STACKS)
-    for asked in others:
+    """Compile with the first set of stack flags that the compiler accepts."""
+    *others, last = (
+        [*command, *(word.format(name=name) for word in extra)] for extra in _STACK_FLAGS
+    )
+    for command_with_stack in others:
         with contextlib.suppress(EomcError):
-            return run(name, folder, asked)
+            return run(name, folder, command_with_stack)
     run(name, folder, last)
 
 
-def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:
-    """What was compiled in a folder."""
-    made = folder / f"{name}.o"
-    elf = made.read_bytes() if made.is_file() else b""
+def _read_sizes(name: str, command: tuple[str, ...], folder: Path) -> ObjectSizes:
+    """Return the sizes of the object that was compiled in `folder`."""
+    object_file = folder / f"{name}.o"
+    elf = object_file.read_bytes() if object_file.is_file() else b""
     if not elf.startswith(_ELF):
         raise EomcError(
             f"{' '.join(command)}: makes no ELF object, and sizes are read from those alone: "
@@ -101,9 +109,9 @@ def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:
         )
     graph, loops = _graph(folder), set[str]()
     functions = tuple(
-        Size(
+        FunctionSize(
             called, size, graph.frames.get(called),
-            _deepest(graph, called, (), loops) if graph.whole else None,
+            _total_stack(graph, called, (), loops) if graph.has_calls else None,
             frozenset(graph.calls.get(called, ())),
         )
         for called, size in sorted(_functions(elf))
@@ -111,7 +119,7 @@ def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:
     faults = [f"{f}: calls itself, by itself or others" for f in sorted(loops)]
     faults += [f"{f}: its stack has no bound" for f in sorted(graph.unbounded)]
     kinds = list(_sections(elf))
-    return Object(
+    return ObjectSizes(
         command,
         functions,
         sum(size for kind, size in kinds if kind & _EXECUTED),
@@ -121,19 +129,22 @@ def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:
     )
 
 
-def _deepest(graph: _Graph, name: str, above: tuple[str, ...], loops: set[str]) -> int | None:
-    """The stack of a function and of all that it calls here; functions that call themselves into
-    `loops`. None where there is no bound.
+def _total_stack(graph: _Graph, name: str, callers: tuple[str, ...], loops: set[str]) -> int | None:
+    """Return the stack of a function and its callees, or None if it has no bound.
+
+    Recursive functions are added to `loops`.
     """
-    if name in above:
+    if name in callers:
         loops.add(name)
         return None
     if name not in graph.frames:
-        return 0  # of a library
-    below = [_deepest(graph, f, (*above, name), loops) for f in sorted(graph.calls.get(name, ()))]
-    if name in graph.unbounded or None in below:
+        return 0  # library function
+    stacks = [
+        _total_stack(graph, f, (*callers, name), loops) for f in sorted(graph.calls.get(name, ()))
+    ]
+    if name in graph.unbounded or None in stacks:
         return None
-    return graph.frames[name] + max((x for x in below if x is not None), default=0)
+    return graph.frames[name] + max((x for x in stacks if x is not None), default=0)
 
 
 # --- what compilers write -------------------------------------------------------------------------
@@ -144,17 +155,17 @@ _FRAME = re.compile(r"^.*:(\w[\w.]*)\t(\d+)\t(\S+)$", re.M)
 
 
 def _graph(folder: Path) -> _Graph:
-    """From gcc's graph of calls, else from frames alone."""
+    """Return the call graph from gcc's output, or stack frames alone."""
     graph = _Graph()
     for file in folder.glob("*.su"):
         for name, size, kind in _FRAME.findall(file.read_text(encoding="utf-8")):
             _frame(graph, name, size, kind)
     for file in folder.glob("*.ci"):
-        graph, text = _Graph(whole=True), file.read_text(encoding="utf-8")
+        graph, text = _Graph(has_calls=True), file.read_text(encoding="utf-8")
         for title, size, kind in _NODE.findall(text):
-            _frame(graph, _bare(title), size, kind)
+            _frame(graph, _without_file(title), size, kind)
         for caller, callee in _EDGE.findall(text):
-            graph.calls.setdefault(_bare(caller), set()).add(_bare(callee))
+            graph.calls.setdefault(_without_file(caller), set()).add(_without_file(callee))
     return graph
 
 
@@ -164,8 +175,8 @@ def _frame(graph: _Graph, name: str, size: str, kind: str) -> None:
         graph.unbounded.add(name)
 
 
-def _bare(title: str) -> str:
-    """A static function's title begins with its file."""
+def _without_file(title: str) -> str:
+    """Return a function's name; titles of static functions begin with their file."""
     return title.rsplit(":", 1)[-1]
 
 
@@ -183,7 +194,7 @@ class _Section:
 
 
 def _headers(elf: bytes) -> Iterator[_Section]:
-    """The section headers of an object of 32 or 64 bits, in either order of bytes."""
+    """Yield the section headers of a 32-bit or 64-bit object of either byte order."""
     wide, order = elf[4] == 2, "<" if elf[5] == 1 else ">"
     at = struct.unpack_from(f"{order}{'Q' if wide else 'I'}", elf, 0x28 if wide else 0x20)[0]
     size, count = struct.unpack_from(f"{order}HH", elf, 0x3A if wide else 0x2E)
@@ -196,7 +207,7 @@ def _headers(elf: bytes) -> Iterator[_Section]:
 
 
 def _sections(elf: bytes) -> Iterator[tuple[int, int]]:
-    """(flags, bytes) of what is loaded; a processor's own tables aside, for unwinding."""
+    """Yield (flags, bytes) of all loaded sections except processor-specific unwind tables."""
     notes = 0x70000000  # and beyond
     for s in _headers(elf):
         if s.flags & _ALLOCATED and s.size and s.kind < notes:
@@ -204,7 +215,7 @@ def _sections(elf: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _functions(elf: bytes) -> Iterator[tuple[str, int]]:
-    """(name, bytes) of every function of an object's table of symbols."""
+    """Yield (name, bytes) of every function in the symbol table."""
     wide, order = elf[4] == 2, "<" if elf[5] == 1 else ">"
     sections = list(_headers(elf))
     for s in sections:

@@ -1,7 +1,7 @@
-"""A wheel of a compiled scene, which needs NumPy and cffi alone where it is installed.
+"""Build a wheel of a compiled scene, which requires NumPy and cffi only.
 
-Its extensions use the part of Python's interface that stays (abi3). There is one for each of some
-generations of processors; the package loads the widest that the machine has.
+Its extensions use Python's stable ABI (abi3). There is one extension for each of several processor
+generations; the package loads the most capable one that the machine supports.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from eomc.base.version import __version__
 from eomc.emit.render import Sources, show
 from eomc.emit.views import Compiled, Form
 from eomc.toolchain import archive, extension
-from eomc.toolchain.compiler import FLAGS, compiler_for, given_flags
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.compiler import FLAGS, compiler_for, user_flags
+from eomc.toolchain.subprocesses import write_files
 
-COMPILED = "compiled"  # the module that chooses an extension
-OLDEST = 17  # glibc 2.17, below which installers know no wheels
+COMPILED = "compiled"  # name of the module that chooses an extension
+OLDEST_GLIBC = 17  # minor version, glibc 2.17: the oldest for which wheels have a tag
 
 
 @dataclass(frozen=True)
 class _Generation:
-    """Of processors: what Linux says that they have, and the flags that use it."""
+    """A processor generation: the features that Linux reports for it, and its compiler flags."""
 
     name: str
     needs: tuple[str, ...]
@@ -51,55 +51,68 @@ _GENERATIONS = {
         _Generation("avx2", _AVX2, _AVX2_FLAGS),
     ),
 }
-_BASELINE = _Generation("baseline", (), ())  # what every processor of the architecture has
+_BASELINE = _Generation("baseline", (), ())  # every processor of the architecture
 
 
 def generations() -> tuple[_Generation, ...]:
-    """Those of this architecture, the widest first; with $EOMC_CFLAGS one of these flags."""
-    given = given_flags()
-    if given is not None:
-        return (_Generation("given", (), given),)
+    """Return the generations of this architecture, the newest first; one only with $EOMC_CFLAGS."""
+    chosen = user_flags()
+    if chosen is not None:
+        return (_Generation("given", (), chosen),)
     portable = tuple(flag for flag in FLAGS if flag != "-march=native")
-    found = (*_GENERATIONS.get(platform.machine(), ()), _BASELINE)
-    return tuple(_Generation(g.name, g.needs, (*portable, *g.flags)) for g in found)
+    supported = (*_GENERATIONS.get(platform.machine(), ()), _BASELINE)
+    return tuple(_Generation(g.name, g.needs, (*portable, *g.flags)) for g in supported)
 
 
-def build(made: Sources, scene: bytes, digest: str, title: str, folder: Path) -> Path:
-    """Compile the sources, and write their wheel into `folder`; its path.
+def build(sources: Sources, scene: bytes, digest: str, title: str, folder: Path) -> Path:
+    """Compile the sources and write their wheel into `folder`; return its path.
 
-    made: with COMPILED for its extension. scene: its file, which is packed too. digest: of that.
-    Raises EomcError where the compiler fails, or the folder can't be written.
+    Parameters
+    ----------
+    sources : Sources
+        With COMPILED as the name of their extension.
+    scene : bytes
+        The scene file, which is included.
+    digest : str
+        Digest of the scene file, for the version.
+    title : str
+    folder : Path
+
+    Raises
+    ------
+    EomcError
+        If the compiler fails, or the folder can't be written.
     """
-    name, (suffix, python, abi) = made.name, _interface()
-    compiler = compiler_for(made.operations)
-    files = {f: text.encode() for f, text in made.files.items() if f.endswith(".py")}
-    files |= {"__init__.pyi": made.stub.encode(), "py.typed": b"", f"{name}.toml": scene}
+    name, (suffix, python, abi) = sources.name, _interface()
+    compiler = compiler_for(sources.operations)
+    files = {f: text.encode() for f, text in sources.files.items() if f.endswith(".py")}
+    files |= {"__init__.pyi": sources.stub.encode(), "py.typed": b"", f"{name}.toml": scene}
     forms = []
     with tempfile.TemporaryDirectory(prefix="eomc-wheel-") as place:
-        at = Path(place)
-        lay_out(made.files, at)
+        build_folder = Path(place)
+        write_files(sources.files, build_folder)
         for g in generations():
-            called = f"_{name}_{g.name}"
-            library = called + suffix
-            extension.build(made, called, at, library, compiler, "fast", g.flags)
-            files[library] = (at / library).read_bytes()
-            forms.append(Form(g.name, called, g.needs))
+            module = f"_{name}_{g.name}"
+            library = module + suffix
+            extension.build(sources, module, build_folder, library, compiler, "fast", g.flags)
+            files[library] = (build_folder / library).read_bytes()
+            forms.append(Form(g.name, module, g.needs))
     files[f"{COMPILED}.py"] = show(Compiled(name, __version__, tuple(forms))).encode()
     version = f"{__version__}+scene{digest[:12]}"
     tag = f"{python}-{abi}-{_platform(files)}"
     info = f"{name}-{version}.dist-info"
-    whole = {f"{name}/{file}": data for file, data in sorted(files.items())}
-    whole[f"{info}/METADATA"] = _metadata(name, version, title).encode()
-    whole[f"{info}/WHEEL"] = (
+    contents = {f"{name}/{file}": data for file, data in sorted(files.items())}
+    contents[f"{info}/METADATA"] = _metadata(name, version, title).encode()
+    contents[f"{info}/WHEEL"] = (
         f"Wheel-Version: 1.0\nGenerator: eomc {__version__}\nRoot-Is-Purelib: false\nTag: {tag}\n"
     ).encode()
     wheel = folder / f"{name}-{version}-{tag}.whl"
-    archive.write(wheel, _recorded(whole, f"{info}/RECORD"))
+    archive.write(wheel, _with_record(contents, f"{info}/RECORD"))
     return wheel
 
 
 def _interface() -> tuple[str, str, str]:
-    """An extension's suffix, and a wheel's tags of Python and of its interface."""
+    """Return the suffix of extensions, and the Python and ABI tags of the wheel."""
     if sysconfig.get_config_var("Py_DEBUG") or sysconfig.get_config_var("Py_GIL_DISABLED"):
         version = f"cp{sys.version_info[0]}{sys.version_info[1]}"
         suffix = str(sysconfig.get_config_var("EXT_SUFFIX"))
@@ -108,11 +121,11 @@ def _interface() -> tuple[str, str, str]:
 
 
 def _platform(files: Mapping[str, bytes]) -> str:
-    """A wheel's tag of the platform: of Linux with the glibc that its extensions ask for."""
+    """Return the platform tag of the wheel; on Linux, with the glibc version that it requires."""
     if sys.platform == "linux" and platform.libc_ver()[0] == "glibc":
-        asked = (re.findall(rb"GLIBC_2\.(\d+)", data) for data in files.values())
-        newest = max((int(n) for found in asked for n in found), default=0)
-        return f"manylinux_2_{max(newest, OLDEST)}_{platform.machine()}"
+        versions = (re.findall(rb"GLIBC_2\.(\d+)", data) for data in files.values())
+        newest = max((int(n) for matches in versions for n in matches), default=0)
+        return f"manylinux_2_{max(newest, OLDEST_GLIBC)}_{platform.machine()}"
     return re.sub(r"[-.]", "_", sysconfig.get_platform())
 
 
@@ -132,8 +145,8 @@ def _metadata(name: str, version: str, title: str) -> str:
     )
 
 
-def _recorded(files: Mapping[str, bytes], record: str) -> dict[str, bytes]:
-    """The files, and behind them the record of their digests."""
+def _with_record(files: Mapping[str, bytes], record: str) -> dict[str, bytes]:
+    """Return the files together with the RECORD of their digests."""
     rows = []
     for name, data in files.items():
         digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()

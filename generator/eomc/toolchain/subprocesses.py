@@ -1,4 +1,4 @@
-"""Compilers as processes: started in a folder, awaited, their words in an error where they fail."""
+"""Run compilers as subprocesses, and report their messages if they fail."""
 
 from __future__ import annotations
 
@@ -15,72 +15,72 @@ from eomc.base.errors import EomcError
 
 
 def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
-    """Compilers at work side by side, until all are done; none goes on where one fails.
+    """Run commands in parallel in `folder`, and wait until all have ended.
 
-    Raises EomcError with the words of the first that fails, or where one can't be run. name: the
-    scene's.
+    If one fails, or on Ctrl-C, the others are terminated. Raises EomcError with the output of the
+    first that fails, or if one can't be started; `name` is the scene's name, for the message.
     """
     running: list[subprocess.Popen[str]] = []
     try:
         for command in commands:
-            with _undisturbed():
+            with _delayed_interrupt():
                 running.append(_start(command, folder))
         for command, process in zip(commands, running, strict=True):
             _finish(name, command, process)
     finally:
         for process in running:
-            _end(process)
+            _terminate(process)
 
 
-def lay_out(files: Mapping[str, str], folder: Path) -> None:
-    """Texts by name into a folder; the name of a scene's file in them may be no text."""
+def write_files(files: Mapping[str, str], folder: Path) -> None:
+    """Write texts by name into a folder; the scene's file name in them may not be valid Unicode."""
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def try_out(
+def try_load(
     name: str, command: Sequence[str], code: str, arguments: Sequence[str], remedy: str
 ) -> None:
-    """Python code that loads what `command` has made, in a process of its own (some 10 ms).
+    """Run Python code that loads what `command` produced, in a separate process (some 10 ms).
 
-    Raises EomcError with the remedy where it fails, or ends that process.
+    Raises EomcError with the remedy if the code fails or crashes.
     """
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-I", "-S", "-c", code, *arguments],
         stdin=subprocess.DEVNULL, capture_output=True, errors="backslashreplace",
     )  # fmt: skip
-    if done.returncode:
-        said = [f"status {done.returncode}", *done.stderr.strip().splitlines()][-1]
+    if completed.returncode:
+        last_line = [f"status {completed.returncode}", *completed.stderr.strip().splitlines()][-1]
         raise EomcError(
             f"{name}: the C compiler {shlex.join(command)} returned 0, but what it made can't be "
-            f"loaded: correct CC and EOMC_CFLAGS{remedy}\n  {said}"
+            f"loaded: correct CC and EOMC_CFLAGS{remedy}\n  {last_line}"
         )
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """What Ctrl-C raises comes behind it: within Popen it would lose the process just begun.
+def _delayed_interrupt() -> Iterator[None]:
+    """Delay KeyboardInterrupt until the block has ended, so that a started process is not lost.
 
-    It is raised in the main thread alone, where there is a handler of Python's.
+    This applies to the main thread only, and only if Python handles the signal.
     """
-    before, came = signal.getsignal(signal.SIGINT), list[tuple[int, FrameType | None]]()
+    handler, pending = signal.getsignal(signal.SIGINT), list[tuple[int, FrameType | None]]()
     try:
-        if callable(before):
-            signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+        if callable(handler):
+            signal.signal(signal.SIGINT, lambda number, frame: pending.append((number, frame)))
     except ValueError:  # another thread
-        before = None
+        handler = None
     try:
         yield
     finally:
-        if callable(before):
-            signal.signal(signal.SIGINT, before)
-            for number, frame in came[:1]:
-                before(number, frame)
+        if callable(handler):
+            signal.signal(signal.SIGINT, handler)
+            for number, frame in pending[:1]:
+                handler(number, frame)
 
 
 def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
-    """A compiler at work. Raises EomcError where it can't be run."""
+    """Start a compiler. Raises EomcError if it can't be started."""
     try:
         return subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
@@ -91,7 +91,7 @@ def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
 
 
 def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
-    """Wait for it. Raises EomcError with its words where it fails."""
+    """Wait for a compiler. Raises EomcError with its output if it fails."""
     words, _ = process.communicate()
     if process.returncode:
         raise EomcError(
@@ -100,8 +100,8 @@ def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -
         )
 
 
-def _end(process: subprocess.Popen[str]) -> None:
-    """End a compiler that may be at work, in time for it to remove its temporary files."""
+def _terminate(process: subprocess.Popen[str]) -> None:
+    """Terminate a compiler that may still run, and give it time to remove its temporary files."""
     process.terminate()
     try:
         process.wait(1)

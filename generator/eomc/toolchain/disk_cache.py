@@ -1,0 +1,48 @@
+"""Cache texts that take SymPy seconds to produce, on disk beside the built modules."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+from eomc.runtime.written import replacing
+from eomc.toolchain.cache import generator_digest
+
+
+def cached_texts(
+    root: Path, name: str, kind: str, scene_digest: str, make: Callable[[], dict[str, str]]
+) -> dict[str, str]:
+    """Return the texts that `make` returns, from the cache in `root`/.shown/ if it is up to date.
+
+    Parameters
+    ----------
+    root : Path
+        Build directory.
+    name : str
+        Name of the scene; "" disables the cache.
+    kind : str
+        What the texts are; part of the file name.
+    scene_digest : str
+        Digest of the scene's text.
+    make : callable
+        Returns the texts by name. They are not stored if the folder can't be written.
+    """
+    file = root / ".shown" / f"{name}.{kind}.json"
+    parts = (scene_digest, kind, generator_digest(), version("sympy"))
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    if name:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            if stored["key"] == key:
+                return {str(k): str(v) for k, v in stored["texts"].items()}
+    results = make()
+    if name:
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(file, cached=True) as new:
+                new.write_text(json.dumps({"key": key, "texts": results}), encoding="utf-8")
+    return results
