@@ -295,7 +295,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         raise EomcError(f"{what}: {source}: can't be read ({fault.strerror})") from None
     if hashlib.sha256(data).hexdigest() != model.digest:
         raise EomcError(f"{what}: {source} has changed since it was built: load it again")
-    text = data.decode() + toml_text.events(events, what)
+    text = data.decode() + toml_text.events_to_toml(events, what)
     root = folder / ".events" / hashlib.sha256(text.encode()).hexdigest()[:16]
     file = root / f"{name}.toml"
     if not file.is_file():

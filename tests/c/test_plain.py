@@ -426,7 +426,7 @@ def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.M
         (tmp_path / file).write_text(small.files[file], encoding="utf-8")
     text = small.files[f"{title}.c"]
     assert f"{title}_acceleration_2(" in text
-    assert (f"{title}_slopes_2(" in text) == made(name).run.sloped
+    assert (f"{title}_slopes_2(" in text) == made(name).run.needs_derivatives
     assert f"{title}_kinetic_energy_2(" in text
     run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", f"{title}.c", cwd=tmp_path)
     run("cc", "-std=c99", "-I.", "selftest.c", f"{title}.c", "-lm", cwd=tmp_path)

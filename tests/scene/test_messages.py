@@ -29,7 +29,7 @@ from eomc.scene.read import parse
     ],
 )
 def test_numbers_with_units(text: str, wanted: str) -> None:
-    said = messages.quantity(text)
+    said = messages.quantity_remedy(text)
     assert said is not None and said.endswith(wanted)
 
 
@@ -37,7 +37,7 @@ def test_numbers_with_units(text: str, wanted: str) -> None:
     "text", ["2*m", "2 x", "m g", "1/2", "pi/2", "2 m", "sin x", "1e", "°", ""]
 )
 def test_formulas_are_not_numbers_with_units(text: str) -> None:
-    assert messages.quantity(text, declared={"m"}) is None
+    assert messages.quantity_remedy(text, declared={"m"}) is None
 
 
 @pytest.mark.parametrize(
@@ -46,18 +46,21 @@ def test_formulas_are_not_numbers_with_units(text: str) -> None:
     thetadot thetap theta_d theta_v theta_prime theta_velocity""".split(),
 )
 def test_velocities_of_others(name: str) -> None:
-    assert messages.velocity(name, {"x": "coordinates", "theta": "coordinates"}) == "theta_dot"
+    assert (
+        messages.intended_velocity(name, {"x": "coordinates", "theta": "coordinates"})
+        == "theta_dot"
+    )
 
 
 @pytest.mark.parametrize("name", ["theta", "omega", "dot", "d", "theta_0", "phi_dot"])
 def test_other_names_are_no_velocities(name: str) -> None:
-    assert messages.velocity(name, {"x": "coordinates", "theta": "coordinates"}) == ""
+    assert messages.intended_velocity(name, {"x": "coordinates", "theta": "coordinates"}) == ""
 
 
 def test_long_texts_cost_nothing() -> None:
     begun = time.perf_counter()
     for text in ("1 " + "m " * 500_000, "1" * 1_000_000, "=" + " " * 1_000_000, "m" * 1_000_000):
-        messages.quantity(text), messages.bare(text), messages.number(text)
+        messages.quantity_remedy(text), messages.toml_remedy(text), messages.number_remedy(text)
     assert time.perf_counter() - begun < 1
 
 

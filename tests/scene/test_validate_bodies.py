@@ -11,7 +11,7 @@ from eomc.scene import formulas
 from eomc.scene import read as scene
 from eomc.scene.assembly import Turn
 from eomc.scene.joints import JOINTS
-from eomc.scene.validate_values import ROUNDING
+from eomc.scene.validate_values import MOMENT_TOLERANCE
 
 SCENES = Path(__file__).parents[2] / "scenes"
 HEAD = 'eomc = 1\nname = "made"\n'
@@ -48,7 +48,7 @@ def test_each_joint_in_space(kind):
     assert body.parent == "world"
     names = NAMES[: len(JOINTS[kind].motions)]
     assert tuple(formula.text for formula in body.coordinates) == names
-    assert len(body.axes) == JOINTS[kind].given
+    assert len(body.axes) == JOINTS[kind].axis_count
     assert body.axes == (((0, 0.6, 0.8),) if kind == "prismatic" else JOINTS[kind].defaults)
     assert body.mass.text == "k"
     assert texts(body.inertia) == ["0"] * 6
@@ -109,8 +109,8 @@ def test_rotations():
     ("moments", "fault"),
     [
         ((1, 1, 2), ""),
-        ((1, 1, 2 + ROUNDING), ""),  # within rounding
-        ((1, 1, 2 + 1e4 * ROUNDING), "one is larger than the two others"),
+        ((1, 1, 2 + MOMENT_TOLERANCE), ""),  # within rounding
+        ((1, 1, 2 + 1e4 * MOMENT_TOLERANCE), "one is larger than the two others"),
         ((0, 0, 0), ""),
         ((0, 2, 2), ""),  # a rod
         ((2, 2, 2, 1, 1, 1), "one is larger than the two others"),  # 1, 1 and 4

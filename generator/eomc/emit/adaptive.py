@@ -20,7 +20,7 @@ from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.corners import steep
 from eomc.model.system import System
 from eomc.program import outline
-from eomc.scene.schema import LOOSEST
+from eomc.scene.schema import MAX_TOLERANCE
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
@@ -352,7 +352,7 @@ def run(
         constants=form.constants,
         unread_p=target.needs_p and not takes_p,
         compute_constants=form.compute_constants,
-        loosest=target.literal(LOOSEST),
+        loosest=target.literal(MAX_TOLERANCE),
         tightest=target.literal(tightest(target.real)),
         events=bool(happen),
         f=target.real.suffix,

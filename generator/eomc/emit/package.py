@@ -26,7 +26,7 @@ from eomc.emit.views import (
 )
 from eomc.integrators.tableaux import METHODS
 from eomc.runtime.package import CONSTRAINED
-from eomc.scene.formulas import folded, parse
+from eomc.scene.formulas import fold_values, parse
 
 _OF_STEPS = ("Phi", "Gamma")
 ROWS = 200  # approximate number of rows that main.c prints
@@ -242,7 +242,7 @@ def start_formulas(target: Target) -> dict[str, str]:
     s, written = target.system, target.as_written
     set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
     return {
-        f"{written(c.name)}{end}": folded(parse(text), set_by_jumps)
+        f"{written(c.name)}{end}": fold_values(parse(text), set_by_jumps)
         for c in s.coordinates
         for end, text in (("", c.follows), ("_dot", c.rate_follows))
         if text

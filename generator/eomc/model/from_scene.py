@@ -28,7 +28,7 @@ from eomc.model.symbols import (
     t,
 )
 from eomc.model.system import System
-from eomc.scene.formulas import Formula, FormulaError, folded
+from eomc.scene.formulas import Formula, FormulaError, fold_values
 from eomc.scene.scene import Coordinate as Written
 from eomc.scene.scene import Scene
 from eomc.scene.scope import ENERGIES
@@ -223,7 +223,7 @@ def from_scene(scene: Scene) -> System:
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
     rubs, sticks = made.frictions(more)
     coordinates = tuple(
-        Coordinate(c.name, c.unit, q, qd, c.note, c.held, c.held_rate, *_follows(scene, c))
+        Coordinate(c.name, c.unit, q, qd, c.note, c.start_fixed, c.rate_fixed, *_follows(scene, c))
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
     )
     rows, reactions = made.constraints(coordinates, definitions, more.closed)
@@ -269,7 +269,7 @@ def _follows(scene: Scene, c: Written) -> Iterator[str]:
     constants = {one.name: one.value for one in scene.constants}
     for formula in (c.start, c.rate):
         free = {name.id for name in formula.names()}.isdisjoint(p.name for p in scene.parameters)
-        yield "" if free else folded(formula, constants)
+        yield "" if free else fold_values(formula, constants)
 
 
 def _at_the_start(scene: Scene) -> list[Problem]:

@@ -19,7 +19,13 @@ from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
 from eomc.scene.scene import Run
-from eomc.scene.schema import LEAST_OF_FLOAT, LEAST_TOLERANCE, LOOSEST, OF_EVENTS, REALS
+from eomc.scene.schema import (
+    DEFAULT_TOLERANCE,
+    MAX_TOLERANCE,
+    MIN_FLOAT_TOLERANCE,
+    MIN_TOLERANCE,
+    REALS,
+)
 
 _FUNCTIONS = (
     *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
@@ -259,11 +265,13 @@ def run(
     if not isinstance(linearize, bool) and linearize != "parameters":
         raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
     if tolerance is not None:
-        least = LEAST_OF_FLOAT if real == "float" else LEAST_TOLERANCE
-        if not least <= number(tolerance, "tolerance") <= LOOSEST:
-            raise fault("tolerance", f"lies between {least:g} and {LOOSEST:g}, here {tolerance!r}")
+        least = MIN_FLOAT_TOLERANCE if real == "float" else MIN_TOLERANCE
+        if not least <= number(tolerance, "tolerance") <= MAX_TOLERANCE:
+            raise fault(
+                "tolerance", f"lies between {least:g} and {MAX_TOLERANCE:g}, here {tolerance!r}"
+            )
         tolerance = float(tolerance)
     elif events:
-        tolerance = OF_EVENTS[real]
+        tolerance = DEFAULT_TOLERANCE[real]
     plain = (float(h), float(duration), methods, real, batch, linearize, discretize)
     return Run(*plain, tolerance=tolerance, inverse_dynamics=inverse_dynamics)

@@ -234,7 +234,7 @@ class Kinematics:
 
     def axes(self, body: Body) -> list[Array]:
         """The axis of each coordinate of a joint, in the frame that those before it moved."""
-        axes = map(np.array, JOINTS[body.joint].along(body.axes))
+        axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
 
     def _roots(self, body: Body) -> tuple[float, Array]:

@@ -130,9 +130,11 @@ class Builder:
         )
         armature = [self.value(f"{key}.armature", a) for a in body.armature]
         kind, by = JOINTS[body.joint], [self._coordinate(key, c) for c in body.coordinates]
-        for k, along in enumerate(zip(kind.motions, kind.along(body.axes), by, strict=True)):
+        for k, along in enumerate(zip(kind.motions, kind.motion_axes(body.axes), by, strict=True)):
             place = self._move(body.name, place, *along, armature[k] if armature else S.Zero)
-        moved = zip(kind.motions, kind.along(body.axes), self.moved.get(body.name, ()), strict=True)
+        moved = zip(
+            kind.motions, kind.motion_axes(body.axes), self.moved.get(body.name, ()), strict=True
+        )
         turned = sum((self.value(f"{key}.rotation", x.angle) for x in body.rotation), S.Zero)
         self.chains.steps[body.name] = Step(body.parent, offset, rotation, turned, tuple(moved))
         if not self.assembly.plane and body.joint != "fixed":

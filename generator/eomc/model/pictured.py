@@ -63,7 +63,7 @@ def pictured(
         "picture": table,
     }
     try:
-        scene = read.of_tree(tree, "System.make")
+        scene = read.check_tree(tree, "System.make")
     except SceneError as wrong:
         told = [replace(p, message=in_python(p.message)) for p in wrong.problems]
         raise SceneError(told) from None

@@ -49,7 +49,7 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         yield lower("projection_along", e.tape, values_and_derivatives, system.names, checks=pivots)
     if system.reactions:
         yield _reactions(system)
-    if system.run.sloped:
+    if system.run.needs_derivatives:
         gradients = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
         yield lower("constraint_slopes", e.tape, gradients, system.names)
 

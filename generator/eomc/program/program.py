@@ -143,7 +143,7 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
     route.
     """
     run, names = system.run, system.names
-    if run.sloped or any(METHODS[name].newton for name in run.methods):
+    if run.needs_derivatives or any(METHODS[name].newton for name in run.methods):
         rows = linearization(system, taken.tape, taken.outputs)
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
@@ -167,7 +167,7 @@ def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
     symbols = {x for o in system.outputs for x in o.formula.free_symbols}
     known = (taken.tape, multipliers) if symbols & multipliers.keys() else None
     checks = taken.checks if known else ()
-    derived = outputs.outputs(system, with_derivatives=system.run.sloped, base=known)
+    derived = outputs.outputs(system, with_derivatives=system.run.needs_derivatives, base=known)
     labels = [o.name for o in system.outputs]
     yield lower("outputs", derived.tape, derived.values, system.names, checks=checks, labels=labels)
     if rows := [x for row in derived.slopes for x in row]:
@@ -230,7 +230,9 @@ def _requested(system: System) -> Iterator[Function]:
 def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
     """Yield [du/dq, du/dqd] of signals that depend on the state, where the derivatives exist."""
     state = {x.name for x in (*system.q, *system.qd)}
-    if not system.run.sloped or not ("signal" in functions and functions["signal"].uses & state):
+    if not system.run.needs_derivatives or not (
+        "signal" in functions and functions["signal"].uses & state
+    ):
         return
     try:
         derived = outputs.signal_slopes(system)

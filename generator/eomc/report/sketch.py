@@ -137,7 +137,7 @@ class _Sketch:
 
     def _after_joint(self, body: Body, at: Array, R: Array) -> Pose:
         kind = JOINTS[body.joint]
-        along = zip(kind.motions, kind.along(body.axes), body.coordinates, strict=True)
+        along = zip(kind.motions, kind.motion_axes(body.axes), body.coordinates, strict=True)
         for motion, axis, by in along:
             unit = np.array(axis) / np.linalg.norm(axis)
             moved = self._number(by)
@@ -174,7 +174,7 @@ class _Sketch:
         if body.parent == WORLD and not body.point and "t" not in motions:
             marks.add("ground", at)
         if "t" in motions:
-            axis = JOINTS[body.joint].along(body.axes)[motions.index("t")]
+            axis = JOINTS[body.joint].motion_axes(body.axes)[motions.index("t")]
             direction = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
             unit = _turned(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
             ends = (marks.point(seat + x * unit) for x in (direction.min(), direction.max()))

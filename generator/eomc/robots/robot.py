@@ -271,7 +271,7 @@ def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in its parent's: offset (m) and rotation, at `values`."""
     offset, rotation = body.offset, body.rotation
     joint = JOINTS[body.joint]
-    for kind, axis, value in zip(joint.motions, joint.along(body.axes), values, strict=True):
+    for kind, axis, value in zip(joint.motions, joint.motion_axes(body.axes), values, strict=True):
         if kind == "t":
             offset = plus(offset, apply(rotation, scaled(axis, value)))
         else:

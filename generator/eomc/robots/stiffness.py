@@ -199,7 +199,7 @@ def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, 
         parent = found[body.parent]
         place, turn = parent.point(body.offset), times(parent.turn, body.rotation)
         columns, joint = [*parent.columns], JOINTS[body.joint]
-        axes = zip(joint.motions, joint.along(body.axes), body.motions, strict=True)
+        axes = zip(joint.motions, joint.motion_axes(body.axes), body.motions, strict=True)
         for kind, axis, m in axes:
             gear = m.mimics.gear if m.mimics else 1.0
             row = rows.index(m.mimics.coordinate if m.mimics else m.name)

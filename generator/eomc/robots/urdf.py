@@ -35,7 +35,7 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, ti
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
-from eomc.scene.scope import ring_text, rings
+from eomc.scene.scope import cycle_text, find_cycles
 
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
@@ -266,8 +266,8 @@ class _Reader:
             given = elements[joint.name].first("mimic")
             if given is not None and joint.kind != "fixed":
                 found[joint.name] = self._mimic(joint, given, elements)
-        for ring in rings({name: [mimic.coordinate] for name, mimic in found.items()}):
-            self.say(f"joint {ring[0]}", f"joints mimic one another in a ring: {ring_text(ring)}")
+        for ring in find_cycles({name: [mimic.coordinate] for name, mimic in found.items()}):
+            self.say(f"joint {ring[0]}", f"joints mimic one another in a ring: {cycle_text(ring)}")
             for name in ring:
                 found.pop(name, None)
         by_name = {joint.name: joint for joint in joints}
@@ -343,7 +343,7 @@ class _Reader:
             name = waiting.pop()
             out += self._held(bodies[name], holds.get(name))
             waiting += [joint.child for joint in reversed(carries[name])]
-        loop = next(rings({name: [joint.parent] for name, joint in holds.items()}), [])
+        loop = next(find_cycles({name: [joint.parent] for name, joint in holds.items()}), [])
         if loop and not self.faults:
             self.say(
                 f"joint {holds[loop[0]].name}",

@@ -25,7 +25,7 @@ MAX_LENGTH = 10_000
 MAX_DEPTH = 150
 MAX_EXPONENT = 64
 MAX_DIGITS = 1_000  # of a number as it is written
-MANY = 1_000  # names, among which near ones are looked for
+MAX_CANDIDATES = 1_000  # names, among which near ones are looked for
 MAX_LOG10 = 300  # no number in a formula, folded or written, may pass 1e300
 
 # called the same in Python's math, in SymPy and in C
@@ -51,7 +51,7 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
 # what people write instead, and the remedy: characters, then functions, then syntax
 _QUOTE = "quotes and primes are not used here: write {}_dot for a velocity, dot(e) for de/dt"
 _ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
-_CHARACTERS: Mapping[str, str] = {
+_CHARACTER_REMEDIES: Mapping[str, str] = {
     **dict.fromkeys("'\"`", _QUOTE),
     **dict.fromkeys("<>", _ORDER),
     **dict.fromkeys(
@@ -74,7 +74,7 @@ _CHARACTERS: Mapping[str, str] = {
     "√": "'√' is not ASCII: write sqrt(...)",
 }
 
-_ELSEWHERE: Mapping[str, str] = {
+_FUNCTION_ALIASES: Mapping[str, str] = {
     **{f"arc{f}": f"a{f}" for f in ("sin", "cos", "tan", "tan2")},
     **{f.capitalize(): f for f in FUNCTIONS},
     **{"ln": "log", "fabs": "abs", "sgn": "sign", "sine": "sin", "cosine": "cos"},
@@ -82,7 +82,7 @@ _ELSEWHERE: Mapping[str, str] = {
     **{"diff": "dot", "derivative": "dot", "ddt": "dot", "arctg": "atan", "tg": "tan"},
 }
 
-_FOREIGN: Mapping[type, str] = {
+_SYNTAX_REMEDIES: Mapping[type, str] = {
     ast.FloorDiv: "'//' is not used in formulas: write '/'",
     ast.IfExp: "'if' is not used in formulas: write heaviside(a - b), min or max",
     ast.BoolOp: "'and' and 'or' are not used in formulas: write heaviside, min or max",
@@ -97,7 +97,7 @@ NOT_ELEMENTARY: Mapping[str, str] = {
     "erfc": f"{_NO_FORM}; the force 2*exp(-x**2)/sqrt(pi) of a potential erfc(x) has one: [forces]",
     "gamma": _NO_FORM,
 }
-_INSTEAD: Mapping[str, str] = {
+_FUNCTION_REMEDIES: Mapping[str, str] = {
     **NOT_ELEMENTARY,
     "pow": "write a**b",
     **dict.fromkeys(("radians", "deg2rad", "deg", "degrees"), "write 30 degrees as 30*pi/180"),
@@ -136,8 +136,8 @@ class Formula:
     def names(self) -> Iterator[ast.Name]:
         """The names used as values (not functions, not pi), in reading order."""
         called = {id(n.func) for n in ast.walk(self.tree) if isinstance(n, ast.Call)}
-        found = [n for n in ast.walk(self.tree) if isinstance(n, ast.Name) and id(n) not in called]
-        yield from sorted((n for n in found if n.id != "pi"), key=lambda n: n.col_offset)
+        nodes = [n for n in ast.walk(self.tree) if isinstance(n, ast.Name) and id(n) not in called]
+        yield from sorted((n for n in nodes if n.id != "pi"), key=lambda n: n.col_offset)
 
     def calls(self, *functions: str) -> Iterator[ast.Call]:
         """The calls of the given functions."""
@@ -151,11 +151,13 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """The known name that `name` may have been meant for, or the empty string."""
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
-    begun = [k for k in known if k.startswith(name)] if len(name) > 2 else []  # tol, dir
-    if len(known) > MANY:  # difflib takes a tenth of a millisecond each
-        known = [k for k in known if k[:1] == name[:1] and abs(len(k) - len(name)) < 2][:MANY]
+    with_prefix = [k for k in known if k.startswith(name)] if len(name) > 2 else []  # tol, dir
+    if len(known) > MAX_CANDIDATES:  # difflib takes a tenth of a millisecond each
+        known = [k for k in known if k[:1] == name[:1] and abs(len(k) - len(name)) < 2][
+            :MAX_CANDIDATES
+        ]
     close = same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
-    return next(iter(close or (begun if len(begun) == 1 else [])), "")
+    return next(iter(close or (with_prefix if len(with_prefix) == 1 else [])), "")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -176,8 +178,8 @@ def parse(text: str) -> Formula:
     if not line:
         raise FormulaError("the formula is empty: write 0 if nothing is meant")
     for at, c in enumerate(line):
-        if c in _CHARACTERS:
-            raise _character(line, at)
+        if c in _CHARACTER_REMEDIES:
+            raise _character_error(line, at)
         if not " " <= c <= "~":
             raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
     try:
@@ -193,7 +195,7 @@ def parse(text: str) -> Formula:
     return formula
 
 
-def _character(line: str, at: int) -> FormulaError:
+def _character_error(line: str, at: int) -> FormulaError:
     """What to write instead of the character at `at`, by what stands before it."""
     before = line[max(at - 40, 0) : at]
     if line[at] == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", before)):
@@ -206,7 +208,7 @@ def _character(line: str, at: int) -> FormulaError:
     if power and name in FUNCTIONS:
         message = f"write powers behind the function: {name}(...)**{power[1]}"
         return FormulaError(message, at - len(name), len(name) + 2)
-    return FormulaError(_CHARACTERS[line[at]].format(name), at)
+    return FormulaError(_CHARACTER_REMEDIES[line[at]].format(name), at)
 
 
 # 2m, then m g, then )m
@@ -279,7 +281,7 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
             _check(formula, right, depth + 1)
             exponent = _number(formula, right)
             if exponent is not None:
-                power = _bounded(right, exponent, power)
+                power = _exponent_product(right, exponent, power)
             _check(formula, left, depth + 1, power)
             _check_value(formula, node)
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
@@ -296,7 +298,7 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
         case ast.Call(func=ast.Attribute(attr=name) as func) if name in FUNCTIONS:
             raise _fault(func, f"functions stand by themselves: write {name}(...)")
         case ast.Call(func=ast.Attribute() | ast.Lambda() as func):
-            raise _fault(func, _FOREIGN[type(func)])
+            raise _fault(func, _SYNTAX_REMEDIES[type(func)])
         case ast.Call(func=func) if not isinstance(func, ast.Name):
             raise _fault(func, "write products with '*': a parenthesis follows without one")
         case ast.Tuple(elts=[first, *_]):
@@ -306,16 +308,16 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
             )
         case _:
             kinds = (type(node), type(getattr(node, "op", None)))
-            remedy = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
+            remedy = next((_SYNTAX_REMEDIES[k] for k in kinds if k in _SYNTAX_REMEDIES), None)
             raise _fault(node, remedy or f"only {_ALLOWED} are used here")
 
 
 def _check_call(func: ast.Name, call: ast.Call) -> None:
-    name, given = func.id, len(call.args)
-    if name in _INSTEAD:
-        raise _fault(func, f"'{name}' is not used in formulas: {_INSTEAD[name]}")
+    name, argument_count = func.id, len(call.args)
+    if name in _FUNCTION_REMEDIES:
+        raise _fault(func, f"'{name}' is not used in formulas: {_FUNCTION_REMEDIES[name]}")
     if name not in FUNCTIONS:
-        near = _ELSEWHERE.get(name)
+        near = _FUNCTION_ALIASES.get(name)
         raise _fault(
             func,
             f"'{name}' is not a function"
@@ -324,18 +326,18 @@ def _check_call(func: ast.Name, call: ast.Call) -> None:
                 or f": write {name}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
             ),
         )
-    least, most = FUNCTIONS[name]
-    if not least <= given <= most:
-        wanted = str(least) if least == most else f"{least} to {most}"
-        plural = "" if wanted == "1" else "s"
-        raise _fault(call, f"{name}() takes {wanted} argument{plural}, here {given}")
+    minimum, maximum = FUNCTIONS[name]
+    if not minimum <= argument_count <= maximum:
+        count = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
+        plural = "" if count == "1" else "s"
+        raise _fault(call, f"{name}() takes {count} argument{plural}, here {argument_count}")
 
 
 def _in_range(value: float) -> bool:
     return value == 0 or (abs(value) < math.inf and abs(math.log10(abs(value))) < MAX_LOG10)
 
 
-def _bounded(node: ast.expr, exponent: float, power: float) -> float:
+def _exponent_product(node: ast.expr, exponent: float, power: float) -> float:
     """The product of the exponents, within bounds."""
     if not abs(exponent) <= MAX_EXPONENT:
         raise _fault(node, f"an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}")
@@ -352,11 +354,11 @@ def _check_value(formula: Formula, node: ast.expr) -> None:
 
 def _number(formula: Formula, node: ast.expr) -> float | None:
     """The value of a subtree, nan where it is not real and finite, None where it has names."""
-    found = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
-    if any(name not in FUNCTIONS and name != "pi" for name in found):
+    names_used = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
+    if any(name not in FUNCTIONS and name != "pi" for name in names_used):
         return None
     try:
-        value = _walk(formula, node, _OF_NUMBERS, _OF_NUMBERS.__getitem__)
+        value = _walk(formula, node, _CONSTANT_ALGEBRA, _CONSTANT_ALGEBRA.__getitem__)
         return float(value) if isinstance(value, (int, float)) else math.nan
     except (ArithmeticError, ValueError, TypeError):
         return math.nan
@@ -371,7 +373,7 @@ def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str
     return _walk(formula, formula.tree, algebra, lookup)
 
 
-def folded(formula: Formula, values: Mapping[str, float]) -> str:
+def fold_values(formula: Formula, values: Mapping[str, float]) -> str:
     """The formula as text, with these values in place of their names."""
 
     class Folded(ast.NodeTransformer):
@@ -424,4 +426,4 @@ NUMERIC: Mapping[str, Any] = {
     "min": min,
     "max": max,
 }
-_OF_NUMBERS = {**NUMERIC, "dot": lambda _: 0.0}  # which do not change
+_CONSTANT_ALGEBRA = {**NUMERIC, "dot": lambda _: 0.0}  # which do not change

@@ -22,7 +22,7 @@ class Joint:
     axes: of each motion its axis, or which of the axes that the scene gives it takes (0, 1).
     defaults: the axes of a scene that gives none; empty where it has to give them, or has none.
     plane: whether a plane scene may have it. order: what its coordinates are, where that is not
-    plain. others: what other tools and textbooks call it.
+    plain. aliases: what other tools and textbooks call it.
     """
 
     motions: str
@@ -30,39 +30,39 @@ class Joint:
     defaults: tuple[Axis, ...] = ()
     plane: bool = False
     order: str = ""
-    others: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()
 
     @property
-    def given(self) -> int:
+    def axis_count(self) -> int:
         """How many axes the scene chooses: 0, 1 or 2."""
         return max((axis + 1 for axis in self.axes if isinstance(axis, int)), default=0)
 
-    def along(self, given: Sequence[Axis]) -> tuple[Axis, ...]:
-        """The axis of each motion, `given` being those of the scene."""
-        chosen = given or self.defaults
+    def motion_axes(self, scene_axes: Sequence[Axis]) -> tuple[Axis, ...]:
+        """The axis of each motion, `scene_axes` being those of the scene."""
+        chosen = scene_axes or self.defaults
         return tuple(chosen[a] if isinstance(a, int) else a for a in self.axes)
 
 
 JOINTS = {
-    "fixed": Joint("", (), plane=True, others=("weld", "rigid")),
+    "fixed": Joint("", (), plane=True, aliases=("weld", "rigid")),
     "revolute": Joint(
-        "r", (0,), (Z,), plane=True, others=("hinge", "pin", "rotational", "continuous")
+        "r", (0,), (Z,), plane=True, aliases=("hinge", "pin", "rotational", "continuous")
     ),
     "prismatic": Joint(
-        "t", (0,), plane=True, others=("slider", "slide", "translational", "linear")
+        "t", (0,), plane=True, aliases=("slider", "slide", "translational", "linear")
     ),
     "planar": Joint(
-        "ttr", (X, Y, Z), plane=True, order="along x, along y and about z", others=("plane",)
+        "ttr", (X, Y, Z), plane=True, order="along x, along y and about z", aliases=("plane",)
     ),
     "cylindrical": Joint("tr", (0, 0), (Z,), order="along the axis and about it"),
-    "universal": Joint("rr", (0, 1), (X, Y), order="about each axis", others=("cardan", "hooke")),
+    "universal": Joint("rr", (0, 1), (X, Y), order="about each axis", aliases=("cardan", "hooke")),
     # yaw, pitch, roll: singular at a pitch of pi/2
-    "spherical": Joint("rrr", (Z, Y, X), order="about z, then y, then x", others=("ball",)),
+    "spherical": Joint("rrr", (Z, Y, X), order="about z, then y, then x", aliases=("ball",)),
     "free": Joint(
         "tttrrr",
         (X, Y, Z, Z, Y, X),
         order="along x, y and z, then about z, y and x",
-        others=("floating",),
+        aliases=("floating",),
     ),
 }
 
@@ -83,7 +83,7 @@ class Closing:
     space: tuple[str, ...] = ()
     axes: int = 0
     defaults: tuple[Axis, ...] = ()
-    others: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()
 
     def rows(self, plane: bool) -> tuple[str, ...]:
         """Those in the plane or in space."""
@@ -94,8 +94,10 @@ CLOSINGS = {
     "revolute": Closing(
         ("x", "y"), ("x", "y", "z", "ru", "rv"), 1, (Z, Z), ("hinge", "pin", "rotational")
     ),
-    "spherical": Closing((), ("x", "y", "z"), others=("ball", "connect", "point", "coincident")),
-    "weld": Closing(("x", "y", "rz"), ("x", "y", "z", "rx", "ry", "rz"), others=("fixed", "rigid")),
+    "spherical": Closing((), ("x", "y", "z"), aliases=("ball", "connect", "point", "coincident")),
+    "weld": Closing(
+        ("x", "y", "rz"), ("x", "y", "z", "rx", "ry", "rz"), aliases=("fixed", "rigid")
+    ),
     "prismatic": Closing(
         ("u", "rz"), ("u", "v", "rx", "ry", "rz"), 1, (), ("slider", "slide", "translational")
     ),
@@ -104,8 +106,8 @@ CLOSINGS = {
     "point-on-line": Closing(
         ("u",), ("u", "v"), 1, (), ("point_on_line", "line", "slot", "pin-in-slot")
     ),
-    "distance": Closing(("length",), ("length",), others=("rod", "rope", "link")),
-    "gear": Closing(("ratio",), ("ratio",), others=("gears", "belt", "mimic", "coupling")),
+    "distance": Closing(("length",), ("length",), aliases=("rod", "rope", "link")),
+    "gear": Closing(("ratio",), ("ratio",), aliases=("gears", "belt", "mimic", "coupling")),
 }
 
 # what a loop between bodies does to the second: names behind its own, in the plane and in space
@@ -114,6 +116,6 @@ REACTIONS = {
     False: ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z"),
 }
 
-CLOSING_MEANT = {other: kind for kind, joint in CLOSINGS.items() for other in joint.others}
+CLOSING_ALIASES = {other: kind for kind, joint in CLOSINGS.items() for other in joint.aliases}
 
-MEANT = {other: kind for kind, joint in JOINTS.items() for other in joint.others}
+JOINT_ALIASES = {other: kind for kind, joint in JOINTS.items() for other in joint.aliases}

@@ -9,7 +9,7 @@ from typing import Any
 
 from eomc.base import resources
 
-LONGEST = 60  # characters of a text that may be a number with its unit
+MAX_QUANTITY_LENGTH = 60  # characters of a text that may be a number with its unit
 
 # --- tables ---------------------------------------------------------------------------------------
 
@@ -47,10 +47,10 @@ _ONE_TABLE: Mapping[str, str] = {
 _OF_FORCES = {"body", "point", "force", "torque", "frame"}
 
 
-def array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
+def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
     """Of [[parameter]]: the table that is meant, and its entries; None of anything else."""
-    meant = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
-    if meant is None or not isinstance(entries, list) or not entries:
+    table = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
+    if table is None or not isinstance(entries, list) or not entries:
         return None
     if name == "force" and any(isinstance(e, dict) and e.keys() & _OF_FORCES for e in entries):
         return None  # on a body
@@ -58,18 +58,18 @@ def array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
     for entry in entries:
         if not isinstance(entry, dict):
             return None
-        called = entry.get("name")
-        if isinstance(called, str):
-            merged[called] = {key: value for key, value in entry.items() if key != "name"}
+        entry_name = entry.get("name")
+        if isinstance(entry_name, str):
+            merged[entry_name] = {key: value for key, value in entry.items() if key != "name"}
         else:
             merged |= entry
-    return meant, merged
+    return table, merged
 
 
-def one_table(name: str, meant: str) -> str:
+def one_table_message(name: str, table: str) -> str:
     """What to say of [[name]], which is one table."""
-    start = "" if name == meant else f"unknown table '{name}': "
-    return f"{start}write [{meant}] once, and a line such as {_ONE_TABLE[meant]} for each entry"
+    start = "" if name == table else f"unknown table '{name}': "
+    return f"{start}write [{table}] once, and a line such as {_ONE_TABLE[table]} for each entry"
 
 
 # --- numbers with units ---------------------------------------------------------------------------
@@ -89,58 +89,58 @@ _NUMBER = r"[+\-−]?\s*(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([^\s\d.+\-−].*?)\s*")
 
 
-def quantity(text: str, declared: Collection[str] = ()) -> str | None:
+def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
     """What to say of a number with its unit, such as `30 deg` or `1 kg`; None of anything else.
 
     declared: names that a letter behind a number may mean: `2 m` is a product where there is an m.
     """
-    found = _QUANTITY.fullmatch(text) if len(text) <= LONGEST else None
-    if found is None or found[2] in declared:
+    match = _QUANTITY.fullmatch(text) if len(text) <= MAX_QUANTITY_LENGTH else None
+    if match is None or match[2] in declared:
         return None
-    number, unit = found[1].replace("−", "-").replace(" ", ""), found[2]
+    number, unit = match[1].replace("−", "-").replace(" ", ""), match[2]
     if unit in _DEGREES:
-        return f"angles are in radians, nothing is converted: write {radians(number)}"
+        return f"angles are in radians, nothing is converted: write {degrees_formula(number)}"
     if unit == "rpm":
         return f'nothing is converted: write "{number}*2*pi/60", in rad/s'
     if unit in _POWERS:
-        number, unit = _shifted(number, _POWERS[unit]), _SI[unit]
+        number, unit = _scaled(number, _POWERS[unit]), _SI[unit]
     elif unit not in _SI and not _UNITS.fullmatch(unit):
         return None
     unit = _SI.get(unit, unit)
     return f"a number stands without quotes and without its unit, {unit} in SI: write {number}"
 
 
-def radians(number: str) -> str:
+def degrees_formula(number: str) -> str:
     """Degrees as the formula that gives them, in quotes."""
     return f'"{number}*pi/180"'
 
 
-def number(text: object) -> str:
+def number_remedy(text: object) -> str:
     """The number in a text such as "1 ms", in SI, as `: write 0.001`; else the empty string."""
     if not isinstance(text, str) or not (
-        found := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
+        match := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
     ):
         return ""
-    plain = found[1].replace("−", "-").replace(" ", "")
-    return f": write {_shifted(plain, _POWERS.get(found[2], 0))}, without quotes"
+    plain = match[1].replace("−", "-").replace(" ", "")
+    return f": write {_scaled(plain, _POWERS.get(match[2], 0))}, without quotes"
 
 
-def _shifted(number: str, power: int) -> str:
+def _scaled(number: str, power: int) -> str:
     try:
         return f"{float(f'{number}e{power}'):.15g}" if power else number
     except ValueError:  # it has an exponent already
         return f"{float(number) * 10.0**power:.15g}"
 
 
-def bare(line: str) -> str | None:
+def toml_remedy(line: str) -> str | None:
     """The remedy for a line of TOML with a number and what numbers do not have there."""
     line = line[:200]
     if re.search(r"[=,[]\s*−", line):
         return "this dash is not a minus sign: write '-'"
     if re.match(r"\s*[\w.]+\s*:", line):
         return "entries are written name = value"
-    found = re.search(rf"=\s*({_NUMBER})\s*([^\s,}}\]#=\d][^,}}\]#=]*)", line)
-    return quantity(f"{found[1]} {found[2]}") if found else None
+    match = re.search(rf"=\s*({_NUMBER})\s*([^\s,}}\]#=\d][^,}}\]#=]*)", line)
+    return quantity_remedy(f"{match[1]} {match[2]}") if match else None
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -152,17 +152,17 @@ _VELOCITY = (
 )  # fmt: skip
 
 
-def velocity(name: str, tables: Mapping[str, str]) -> str:
+def intended_velocity(name: str, tables: Mapping[str, str]) -> str:
     """The velocity that `dot_theta`, `dtheta`, `thetadot` may mean, or the empty string."""
-    found = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
-    owners = (match[1] for match in found if match)
+    match = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
+    owners = (match[1] for match in match if match)
     return next((f"{owner}_dot" for owner in owners if tables.get(owner) == "coordinates"), "")
 
 
 # --- files ----------------------------------------------------------------------------------------
 
 
-def file(path: Path) -> str:
+def intended_file(path: Path) -> str:
     """The scene that a path that is none may mean: `cartpole` is scenes/cartpole.toml."""
     name = path.name if path.suffix == ".toml" else f"{path.name}.toml"
     for folder in (path.parent, path.parent / "scenes", Path("scenes")):
@@ -171,7 +171,7 @@ def file(path: Path) -> str:
     return ""
 
 
-def shipped(path: Path) -> str:
+def shipped_remedy(path: Path) -> str:
     """Where the scene of that name comes with eomc: how to have it, else the empty string."""
     name = path.name.removesuffix(".toml")
     remedy = f"; eomc new --from {name} writes the one that comes with eomc"

@@ -29,15 +29,15 @@ from eomc.scene import (
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Input, Output, Quantity, Run, Scene
 from eomc.scene.scope import (
-    DOUBT,
     INPUT,
     NOTHING,
     POSITION,
     TIME,
+    UNKNOWN,
     VELOCITY,
     Checker,
-    ring_text,
-    rings,
+    cycle_text,
+    find_cycles,
 )
 from eomc.scene.source_map import SourceMap
 from eomc.scene.toml_text import MAX_BYTES
@@ -56,8 +56,12 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
-        meant = messages.file(path)
-        near = f"; did you mean '{texts.line(meant)}'?" if meant else messages.shipped(path)
+        intended = messages.intended_file(path)
+        near = (
+            f"; did you mean '{texts.line(intended)}'?"
+            if intended
+            else messages.shipped_remedy(path)
+        )
         near = near or suggest(path.name, others)
         raise EomcError(f"{shown}: there is no such file{near}") from None
     except IsADirectoryError:
@@ -75,16 +79,16 @@ def parse(
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     text, tree = toml_text.text_and_tree(data, file)
-    check = _Check(tree, SourceMap(text, file), parameters or {})
+    check = _SceneChecker(tree, SourceMap(text, file), parameters or {})
     return check.scene(hashlib.sha256(data).hexdigest())
 
 
-def of_tree(tree: dict[str, Any], called: str) -> Scene:
+def check_tree(tree: dict[str, Any], name: str) -> Scene:
     """Check a scene that is given as a tree, as `parse` one of text; its faults have no lines."""
-    return _Check(tree, SourceMap("", called), {}).scene("")
+    return _SceneChecker(tree, SourceMap("", name), {}).scene("")
 
 
-class _Check(Checker):
+class _SceneChecker(Checker):
     """Everything that is checked in one scene, faults collected on the way."""
 
     def __init__(
@@ -92,7 +96,7 @@ class _Check(Checker):
     ) -> None:
         super().__init__(places)
         self.values = parameters
-        tables.mend(tree, self)
+        tables.repair(tree, self)
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
@@ -109,25 +113,25 @@ class _Check(Checker):
             **{f"{c}_dot": frozenset({VELOCITY}) for c in doc.coordinates},
             "t": frozenset({TIME}),
         }
-        self.centers = validate_bodies.centers(doc)
+        self.centers = validate_bodies.center_names(doc)
         self.kinds |= dict.fromkeys(self.centers - {*self.tables}, frozenset({POSITION}))
         known: dict[str, float] = {}
         constants = self._quantities("constants", known)
         parameters = self._quantities("parameters", known)
-        coordinates = list(validate_coordinates.coordinates(self, doc, known))
+        coordinates = list(validate_coordinates.check_coordinates(self, doc, known))
         self._definitions()
         inputs = self._inputs(known)
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
-        events = list(validate_events.events(self, doc))
-        constraints = list(validate_constraints.constraints(self, doc))
-        validate_constraints.guesses(self, doc)
+        events = list(validate_events.check_events(self, doc))
+        constraints = list(validate_constraints.check_constraints(self, doc))
+        validate_constraints.check_guesses(self, doc)
         run = self._run()
-        picture = validate_picture.picture(self, doc, known)
-        outputs = self._outputs(validate_constraints.forces(doc, assembly))
-        self._asked()
-        self._unused()
+        picture = validate_picture.check_picture(self, doc, known)
+        outputs = self._outputs(validate_constraints.force_names(doc, assembly))
+        self._check_requests()
+        self._warn_unused()
         if any(p.severity == "error" for p in self.problems):
             raise SceneError(self.problems)
         return Scene(
@@ -156,26 +160,26 @@ class _Check(Checker):
 
     def _run(self) -> Run:
         """How it is run; events, and methods "auto", are by adaptive steps."""
-        asked = self.doc.run.model_dump()
-        single = asked["real"] == "float"
-        exact, auto = asked["friction"] == "stick", "auto" in asked["methods"]
-        asked["methods"] = tuple(m for m in asked["methods"] if m != "auto") or ("rk4",)
-        if (self.doc.event or exact or auto) and asked["tolerance"] is None:
-            asked["tolerance"] = schema.OF_EVENTS[asked["real"]]
-        if single and (asked["tolerance"] or 1) < schema.LEAST_OF_FLOAT:
-            least = schema.LEAST_OF_FLOAT
+        settings = self.doc.run.model_dump()
+        single = settings["real"] == "float"
+        sticks, auto = settings["friction"] == "stick", "auto" in settings["methods"]
+        settings["methods"] = tuple(m for m in settings["methods"] if m != "auto") or ("rk4",)
+        if (self.doc.event or sticks or auto) and settings["tolerance"] is None:
+            settings["tolerance"] = schema.DEFAULT_TOLERANCE[settings["real"]]
+        if single and (settings["tolerance"] or 1) < schema.MIN_FLOAT_TOLERANCE:
+            least = schema.MIN_FLOAT_TOLERANCE
             why = f'a float can keep {least:g} at best: take that, or real = "double"'
-            self.say(("run", "tolerance"), why)
-        rubs: list[object] = [c.friction for c in self.doc.coordinates.values()]
-        rubs += [body.friction for body in self.doc.body.values()]
-        if exact and all(friction is None for friction in rubs):
+            self.report(("run", "tolerance"), why)
+        frictions: list[object] = [c.friction for c in self.doc.coordinates.values()]
+        frictions += [body.friction for body in self.doc.body.values()]
+        if sticks and all(friction is None for friction in frictions):
             why = "there is no friction: add it to a [[body]] with a joint, or to a coordinate"
-            self.say(("run", "friction"), why)
+            self.report(("run", "friction"), why)
         for key in ("linearize", "discretize"):
-            if exact and asked[key]:
+            if sticks and settings[key]:
                 why = 'friction that sticks has no derivatives: take friction = "smooth" for that'
-                self.say(("run", key), why)
-        return Run(**asked)
+                self.report(("run", key), why)
+        return Run(**settings)
 
     # document and names
 
@@ -190,55 +194,58 @@ class _Check(Checker):
             errors.sort(key=lambda error: error["type"] != "extra_forbidden")
             reported: set[tuple[str, ...]] = set()
             for error in errors:
-                path = schema.place(error)
-                if path in reported or (error["type"] == "missing" and schema.has(tree, path)):
+                path = schema.error_path(error)
+                if path in reported or (
+                    error["type"] == "missing" and schema.has_entry(tree, path)
+                ):
                     continue
                 reported.add(path)
-                self.say(path, schema.say(error, path))
+                self.report(path, schema.explain(error, path))
                 if error["type"] == "extra_forbidden":
-                    self._misspelt(tree, path)
+                    self._replace_misspelt_key(tree, path)
                 else:
-                    self.mended.add(path)
-                    schema.mend(tree, path)
-            if ("coordinates",) in self.mended:
+                    self.repaired.add(path)
+                    schema.repair(tree, path)
+            if ("coordinates",) in self.repaired:
                 break  # everything else depends on them
         raise SceneError(self.problems)
 
-    def _misspelt(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
+    def _replace_misspelt_key(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
         """Take an unknown key for the one that was meant, or out."""
         table = schema.table_at(tree, path[:-1])
         value = table.pop(path[-1])
-        meant = schema.meant(path)
-        if meant and meant not in table:
-            table[meant] = value
-            self.places.rename(path, (*path[:-1], meant))
+        intended = schema.intended_key(path)
+        if intended and intended not in table:
+            table[intended] = value
+            self.places.rename(path, (*path[:-1], intended))
         elif isinstance(value, dict):
-            self.kinds |= dict.fromkeys(value, frozenset({DOUBT}))
+            self.kinds |= dict.fromkeys(value, frozenset({UNKNOWN}))
 
     def _names(self) -> dict[str, str]:
         """Every declared name and its table."""
         doc = self.doc
         if why := names.module_fault(doc.name):
-            self.say(("name",), why, text=doc.name)
-        seen: dict[str, str] = {}
+            self.report(("name",), why, text=doc.name)
+        tables_by_name: dict[str, str] = {}
         for table in ("coordinates", "parameters", "constants", "inputs", "definitions"):
             for name in getattr(doc, table):
                 if why := names.fault(name):
-                    self.say((table, name), why)
-                elif name in seen:
-                    self.say(
+                    self.report((table, name), why)
+                elif name in tables_by_name:
+                    self.report(
                         (table, name),
-                        f"'{name}' stands in [{seen[name]}] already: rename one of the two",
+                        f"'{name}' stands in [{tables_by_name[name]}] already: "
+                        "rename one of the two",
                     )
-                seen.setdefault(name, table)
+                tables_by_name.setdefault(name, table)
         for name in doc.coordinates:
             velocity = f"{name}_dot"
-            if velocity in seen:
-                self.say(
-                    (seen[velocity], velocity),
+            if velocity in tables_by_name:
+                self.report(
+                    (tables_by_name[velocity], velocity),
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
-        self._output_names(seen)
+        self._output_names(tables_by_name)
         for table in ("coordinates", "parameters", "constants", "inputs", "constraints"):
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
@@ -247,20 +254,22 @@ class _Check(Checker):
         for name, output in doc.outputs.items():
             if (formula := str(output.formula).strip()) in states:
                 self._unit(("outputs", name), output.unit, formula=formula)
-        return seen
+        return tables_by_name
 
-    def _output_names(self, seen: Mapping[str, str]) -> None:
+    def _output_names(self, tables_by_name: Mapping[str, str]) -> None:
         """They stand beside t, coordinates, velocities, inputs and energy in tables and plots."""
-        columns = {n: f"in [{t}]" for n, t in seen.items() if t in ("coordinates", "inputs")}
-        columns |= {n: "a parameter" for n, t in seen.items() if t == "parameters"}
+        columns = {
+            n: f"in [{t}]" for n, t in tables_by_name.items() if t in ("coordinates", "inputs")
+        }
+        columns |= {n: "a parameter" for n, t in tables_by_name.items() if t == "parameters"}
         columns |= {f"{c}_dot": f"the velocity of '{c}'" for c in self.doc.coordinates}
         columns |= {"t": "the time", "energy": "K + P"}
         for name in self.doc.outputs:
             if name in columns:
                 message = f"'{name}' is {columns[name]} already: give the output a name of its own"
-                self.say(("outputs", name), message)
+                self.report(("outputs", name), message)
             elif why := names.fault(name):
-                self.say(("outputs", name), why)
+                self.report(("outputs", name), why)
 
     def _unit(
         self, path: tuple[str, ...], unit: str, start: float | str = 0, formula: str = ""
@@ -272,14 +281,16 @@ class _Check(Checker):
         plain = unit.strip().lower()
         if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
-            remedy = f'write {number} degrees as {messages.radians(number)}, with unit = "rad"'
+            remedy = (
+                f'write {number} degrees as {messages.degrees_formula(number)}, with unit = "rad"'
+            )
             remedy = f'write formula = "{formula}*180/pi"' if formula else remedy
-            self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
+            self.report((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
         elif plain in _NOT_SI:
             message = (
                 f"'{unit}' is not an SI unit: numbers are taken as they stand, none is converted"
             )
-            self.say((*path, "unit"), message, severity="warning")
+            self.report((*path, "unit"), message, severity="warning")
 
     # tables
 
@@ -307,38 +318,38 @@ class _Check(Checker):
     def _definitions(self) -> None:
         parsed = {n: self.parse(("definitions", n), v) for n, v in self.doc.definitions.items()}
         sound = {name: formula for name, formula in parsed.items() if formula}
-        circular = self._circular(sound)
-        self.kinds |= dict.fromkeys(circular, frozenset({DOUBT}))
+        circular = self._find_circular(sound)
+        self.kinds |= dict.fromkeys(circular, frozenset({UNKNOWN}))
         for name in parsed:
             formula = sound.get(name)
             path = ("definitions", name)
-            if formula is None or name in circular or path in self.mended:
-                self.kinds[name] = frozenset({DOUBT})
-            elif self.checked(path, formula):
+            if formula is None or name in circular or path in self.repaired:
+                self.kinds[name] = frozenset({UNKNOWN})
+            elif self.check_names(path, formula):
                 self.definitions[name] = formula
                 self.kinds[name] = self.kinds_of(formula.tree)
             else:
-                self.kinds[name] = frozenset({DOUBT})
+                self.kinds[name] = frozenset({UNKNOWN})
 
-    def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
+    def _find_circular(self, definitions: Mapping[str, Formula]) -> set[str]:
         """The names that depend on themselves, each ring reported once; beyond MOST, all."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
         }
-        lost: set[str] = set()
-        for count, ring in enumerate(rings(graph)):
+        circular: set[str] = set()
+        for count, cycle in enumerate(find_cycles(graph)):
             if count == MOST:
                 return set(definitions)
-            formula = definitions[ring[0]]
-            self.say(
-                ("definitions", ring[0]),
-                f"circular definition: {ring_text(ring)}; one of them must stand on its own",
-                next(n for n in formula.names() if n.id == ring[1]),
+            formula = definitions[cycle[0]]
+            self.report(
+                ("definitions", cycle[0]),
+                f"circular definition: {cycle_text(cycle)}; one of them must stand on its own",
+                next(n for n in formula.names() if n.id == cycle[1]),
                 formula.text,
             )
-            lost.update(ring)
-        return lost
+            circular.update(cycle)
+        return circular
 
     def _inputs(self, known: Mapping[str, float]) -> list[Input]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
@@ -352,16 +363,19 @@ class _Check(Checker):
         return out
 
     def _limits(
-        self, path: tuple[str, ...], given: Sequence[float | str | None], known: Mapping[str, float]
+        self,
+        path: tuple[str, ...],
+        limits: Sequence[float | str | None],
+        known: Mapping[str, float],
     ) -> tuple[Formula | None, ...]:
         """An input's limits, in their order at the values of the parameters."""
         rule = "limits are made of numbers, constants and parameters"
-        found = [None if x is None else self.formula(path, x, known, rule) for x in given]
-        values = [self.number(path, f, known) for f in found if f]
+        checked = [None if x is None else self.formula(path, x, known, rule) for x in limits]
+        values = [self.number(path, f, known) for f in checked if f]
         if len(values) == 2 and values[0] >= values[1]:
             why = f"the least value, {values[0]:g}, is not below the largest, {values[1]:g}"
-            self.say(path, why)
-        return tuple(found)
+            self.report(path, why)
+        return tuple(checked)
 
     def _energy(self, key: str) -> Formula:
         path = ("energy", key)
@@ -369,8 +383,8 @@ class _Check(Checker):
         if formula is None:
             return formulas.parse("0")
         kinds = self.kinds_of(formula.tree)
-        sure = DOUBT not in kinds and not {path, ("energy",)} & self.mended
-        fault = partial(self.say, path, text=formula.text)
+        sure = UNKNOWN not in kinds and not {path, ("energy",)} & self.repaired
+        fault = partial(self.report, path, text=formula.text)
         if INPUT in kinds:
             fault(
                 "an energy can't depend on inputs: let them act through [forces]",
@@ -387,7 +401,7 @@ class _Check(Checker):
                 "the dissipation has no velocities, so it gives no force -dR/dq_dot: "
                 "viscous friction is b*x_dot**2/2",
             )
-        self.smooth(path, formula)
+        self.check_smooth(path, formula)
         return formula
 
     def _forces(self) -> dict[str, Formula]:
@@ -397,50 +411,52 @@ class _Check(Checker):
             formula = self.formula(("forces", name), value)
             if name not in known:
                 remedy = suggest(name, known) or f": a force acts along {' or '.join(known)}"
-                self.say(("forces", name), f"'{name}' is not a coordinate{remedy}")
+                self.report(("forces", name), f"'{name}' is not a coordinate{remedy}")
             elif formula:
                 out[name] = formula
         return out
 
     def _outputs(self, forces: Sequence[str]) -> list[Output]:
         """Formulas over everything, the accelerations, energies and forces of constraints too."""
-        self.solve([f"{name}_ddot" for name in self.doc.coordinates], forces)
+        self.allow_solved_quantities([f"{name}_ddot" for name in self.doc.coordinates], forces)
         out = []
         for name, entry in self.doc.outputs.items():
             path = ("outputs", name, "formula")
-            if validate_constraints.multiplier(self, self.doc, path, entry.formula, forces):
+            if validate_constraints.reports_unknown_multiplier(
+                self, self.doc, path, entry.formula, forces
+            ):
                 continue
             formula = self.formula(path, entry.formula)
             if name in self.centers and formula and formula.text.strip() != name:
                 message = (
                     f"'{name}' is a place of a body or point already: use that, or another name"
                 )
-                self.say(("outputs", name), message)
+                self.report(("outputs", name), message)
             if formula:
                 out.append(Output(name, entry.unit, formula, entry.note))
         return out
 
-    def _asked(self) -> None:
+    def _check_requests(self) -> None:
         """What [run] asks for of bodies."""
         run, doc = self.doc.run, self.doc
         for key in ("frames", "momentum"):
             if getattr(run, key) and not doc.body:
                 why = f"'{key}' is of bodies, and there is no [[body]]: remove it, or name what is "
-                self.say(("run", key), f"{why}asked for in [outputs]")
+                self.report(("run", key), f"{why}asked for in [outputs]")
                 return
         known = [entry.name for table in (doc.body, doc.point) for entry in table.values()]
         for name in run.frames if isinstance(run.frames, tuple) else ():
             if name not in known:
                 remedy = suggest(name, known) or f": known are {', '.join(known[:9])}"
                 message = f"'{name}' is no body or point{remedy}"
-                self.say(("run", "frames"), message, text=name)
+                self.report(("run", "frames"), message, text=name)
 
-    def _unused(self) -> None:
+    def _warn_unused(self) -> None:
         if any(p.severity == "error" for p in self.problems):
             return  # a name may be unused only because its formula was refused
         for name, table in self.tables.items():
             if table != "coordinates" and name not in self.used:
-                self.say(
+                self.report(
                     (table, name),
                     f"'{name}' is not used by any formula: remove it, or use it",
                     severity="warning",

@@ -28,7 +28,7 @@ _WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
 # no formulas
 _NAMED = ("body", "point", "loop")  # arrays whose entries have names
 _NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
-_ARRAYS_MEANT = {
+_ARRAY_ALIASES = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
     "Spring": "spring", "dampers": "damper", "Damper": "damper", "loops": "loop", "Loop": "loop",
     "points": "point", "Point": "point", "events": "event", "Event": "event", "Events": "event",
@@ -52,20 +52,20 @@ class _Expansion:
         self.check = check
         self.constants: dict[str, float] = {}  # those known so far
         self.declared: dict[str, str] = {}
-        self.made = 0
+        self.entry_count = 0
         self.characters = 0
         self.sound = True
 
     def run(self) -> bool:
-        for given, meant in _ARRAYS_MEANT.items():
-            if isinstance(self.tree.get(given), (dict, list)) and meant not in self.tree:
-                entries, unknown = self.tree.pop(given), f"unknown table '{given}': "
+        for written, array_name in _ARRAY_ALIASES.items():
+            if isinstance(self.tree.get(written), (dict, list)) and array_name not in self.tree:
+                entries, unknown = self.tree.pop(written), f"unknown table '{written}': "
                 if not _is_array(entries):
-                    self._fault((given,), unknown + _of_its_own(meant, entries))
+                    self._fault((written,), unknown + _array_remedy(array_name, entries))
                     continue
-                self.check.say((given,), f"{unknown}write [[{meant}]]")
-                self.tree[meant] = entries
-                self.check.places.rename((given,), (meant,))
+                self.check.report((written,), f"{unknown}write [[{array_name}]]")
+                self.tree[array_name] = entries
+                self.check.places.rename((written,), (array_name,))
         for table in _TABLES:
             if isinstance(self.tree.get(table), dict):
                 self.declared |= dict.fromkeys(self.tree[table], table)
@@ -77,39 +77,39 @@ class _Expansion:
                 self.tree[array] = self._array(array, self.tree[array])
         for key in ("energy", "gravity"):
             if key in self.tree:
-                self.tree[key] = self._once((key,), self.tree[key])
+                self.tree[key] = self._expanded_once((key,), self.tree[key])
         return self.sound
 
     def _fault(
         self, path: Path, message: str, at: FormulaError | None = None, text: str = ""
     ) -> None:
         self.sound = False
-        self.check.say(path, message, at, text)
+        self.check.report(path, message, at, text)
 
     def _table(self, table: str, entries: Mapping[str, Any]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for key, value in entries.items():
             path = (table, key)
             if not (isinstance(value, dict) and "repeat" in value):
-                name = self._once(path, key, bare=False)
-                made = [(name, self._once(path, value))]
+                name = self._expanded_once(path, key, bare=False)
+                entries_made = [(name, self._expanded_once(path, value))]
             else:
                 if table in _PLAIN and "value" not in value:
                     self._fault(path, 'missing: add value = "..." to repeat')
                     continue
-                made = self._repeated(path, key, value)
+                entries_made = self._repeat_entry(path, key, value)
                 if table in _PLAIN:
-                    made = [(name, entry["value"]) for name, entry in made]
-            self.check.places.repeat(path, [(table, name) for name, _ in made])
-            for name, entry in made:
+                    entries_made = [(name, entry["value"]) for name, entry in entries_made]
+            self.check.places.repeat(path, [(table, name) for name, _ in entries_made])
+            for name, entry in entries_made:
                 if name in out:
                     self._fault(path, f"'{name}' stands here a second time: remove one of the two")
                 out[name] = entry
                 if table == "constants":
-                    self._learn(name, entry)
+                    self._store_constant(name, entry)
         return out
 
-    def _learn(self, name: str, entry: Any) -> None:
+    def _store_constant(self, name: str, entry: Any) -> None:
         """Keep a constant's value; what has none is reported later."""
         value = entry.get("value") if isinstance(entry, dict) else entry
         try:
@@ -121,7 +121,7 @@ class _Expansion:
 
     def _array(self, array: str, entries: Any) -> dict[str, Any]:
         if not _is_array(entries):
-            self._fault((array,), _of_its_own(array, entries))
+            self._fault((array,), _array_remedy(array, entries))
             return {}
         out: dict[str, Any] = {}
         places = self.check.places
@@ -131,11 +131,11 @@ class _Expansion:
             shown = (array, name if isinstance(name, str) and name else str(len(out) + 1))
             places.repeat(written, [shown])
             if "repeat" in entry:
-                made = [e for _, e in self._repeated(shown, name, entry)]
+                entries_made = [e for _, e in self._repeat_entry(shown, name, entry)]
             else:
-                made = [self._once(shown, entry)]
+                entries_made = [self._expanded_once(shown, entry)]
             labels = []
-            for each in made:
+            for each in entries_made:
                 label = each.get("name") if array in _NAMED else None
                 if not isinstance(label, str) or not label or label in out:
                     label = str(len(out) + 1)
@@ -144,7 +144,7 @@ class _Expansion:
             places.repeat(written, labels)
         return out
 
-    def _repeated(self, path: Path, key: Any, entry: dict[str, Any]) -> list[tuple[str, Any]]:
+    def _repeat_entry(self, path: Path, key: Any, entry: dict[str, Any]) -> list[tuple[str, Any]]:
         """An entry with `repeat` written out: (name, entry) pairs."""
         key = key if isinstance(key, str) else ""
         text = entry["repeat"]
@@ -153,14 +153,14 @@ class _Expansion:
         except FormulaError as fault:
             self._fault((*path, "repeat"), fault.message, fault, str(text))
             return []
-        kept = {k: v for k, v in entry.items() if k != "repeat"}
+        without_repeat = {k: v for k, v in entry.items() if k != "repeat"}
         out = []
         for number in range(first, last + 1):
-            made = self._written(path, kept, {index: number})
-            name = self._written(path, key, {index: number}, bare=False)
-            if made is None or name is None:
+            expanded = self._expanded(path, without_repeat, {index: number})
+            name = self._expanded(path, key, {index: number}, bare=False)
+            if expanded is None or name is None:
                 return []
-            out.append((name, made))
+            out.append((name, expanded))
         if len(out) > 1 and key and out[0][0] == out[-1][0]:
             self._fault(path, f"each repetition needs a name of its own: write {key}[{index}]")
             return []
@@ -170,24 +170,24 @@ class _Expansion:
         """The index of a repetition, and its ends. Raises FormulaError."""
         if not isinstance(text, str):
             raise FormulaError(f'must be text, such as "i = 1..n", here {text!r:.40}')
-        found, width = _REPEAT.fullmatch(text), len(text)
-        if not found:
+        match, width = _REPEAT.fullmatch(text), len(text)
+        if not match:
             raise FormulaError(f"'{text}' is no repetition, which {_WRITTEN}", 0, width)
-        index = found[1]
+        index = match[1]
         if why := self._index_fault(index):
-            raise FormulaError(why, found.start(1), len(index))
+            raise FormulaError(why, match.start(1), len(index))
         try:
-            first, last = (self._whole(found[k].strip(), {}) for k in (2, 3))
+            first, last = (self._index_value(match[k].strip(), {}) for k in (2, 3))
         except FormulaError as fault:
             raise FormulaError(fault.message, 0, width) from None
         if last < first - 1:
             why = f"runs from {first} to {last}, and counts up only: exchange the ends"
             raise FormulaError(why, 0, width)
-        self.made += last - first + 1
-        if self.made > MAX_ENTRIES:
+        self.entry_count += last - first + 1
+        if self.entry_count > MAX_ENTRIES:
             raise FormulaError(
-                f"repetition makes {self.made} entries up to here, and {MAX_ENTRIES} are the most: "
-                "let it end sooner",
+                f"repetition makes {self.entry_count} entries up to here, and "
+                f"{MAX_ENTRIES} are the most: let it end sooner",
                 0,
                 width,
             )
@@ -200,12 +200,12 @@ class _Expansion:
             return f"'{index}' can't be an index: use another, such as i"
         return ""
 
-    def _once(self, path: Path, value: Any, bare: bool = True) -> Any:
+    def _expanded_once(self, path: Path, value: Any, bare: bool = True) -> Any:
         """A value outside of repetition, its indices written out."""
-        made = self._written(path, value, {}, bare)
-        return value if made is None else made
+        expanded = self._expanded(path, value, {}, bare)
+        return value if expanded is None else expanded
 
-    def _written(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
+    def _expanded(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
         """The value with its indices written out; None where that fails, which is reported."""
         if isinstance(value, str):
             try:
@@ -217,17 +217,17 @@ class _Expansion:
                 self.check.places.rewrite(text, value)
             return text
         if isinstance(value, list):
-            inside = [self._written(path, each, index, bare) for each in value]
+            inside = [self._expanded(path, each, index, bare) for each in value]
             return None if None in inside else inside
         if isinstance(value, dict):
             out = {}
             for key, each in value.items():
-                made = each
+                expanded = each
                 if key not in _WORDS:
-                    made = self._written((*path, key), each, index, bare and key not in _NAMES)
-                if made is None:
+                    expanded = self._expanded((*path, key), each, index, bare and key not in _NAMES)
+                if expanded is None:
                     return None
-                out[key] = made
+                out[key] = expanded
             return out
         return value
 
@@ -236,27 +236,27 @@ class _Expansion:
         if len(text) > formulas.MAX_LENGTH or not (index or "[" in text):
             return text  # too long ones are reported later
 
-        def number_behind(found: re.Match[str]) -> str:
-            name, inside = found[1], found[2]
-            at, width = found.start(), len(found[0])
+        def replace_index(match: re.Match[str]) -> str:
+            name, inside = match[1], match[2]
+            at, width = match.start(), len(match[0])
             try:
-                number = self._whole(inside, index)
+                number = self._index_value(inside, index)
             except FormulaError as fault:
                 raise FormulaError(fault.message, at, width) from None
             if name[-1].isdigit():
                 raise FormulaError(
-                    f"'{found[0]}' would be {name}{number}, as others may be: a name with an index "
+                    f"'{match[0]}' would be {name}{number}, as others may be: a name with an index "
                     f"can't end in a digit, {name}_[{inside}] is {name}_{number}",
                     at,
                     width,
                 )
             if number < 0:
                 raise FormulaError(
-                    f"the index of '{found[0]}' is {number}: it can't be negative", at, width
+                    f"the index of '{match[0]}' is {number}: it can't be negative", at, width
                 )
             return f"{name}{number}"
 
-        out = _INDEXED.sub(number_behind, text)
+        out = _INDEXED.sub(replace_index, text)
         for name, number in index.items() if bare else ():
             shown = str(number) if number >= 0 else f"({number})"
             out = re.sub(rf"(?<![\w.]){name}(?!\w)", shown, out, flags=re.ASCII)
@@ -265,7 +265,7 @@ class _Expansion:
             raise FormulaError(f"repetition makes more than {MAX_TEXT:,} characters of text")
         return out
 
-    def _whole(self, text: str, index: Mapping[str, int]) -> int:
+    def _index_value(self, text: str, index: Mapping[str, int]) -> int:
         """The value of an index or an end: whole numbers, constants, the index, + and -."""
         if not _SUM.fullmatch(text):
             raise FormulaError(
@@ -304,7 +304,7 @@ class _Expansion:
         raise FormulaError(f"'{term}' is not known in an index{near or remedy}")
 
 
-def _of_its_own(array: str, entries: Any) -> str:
+def _array_remedy(array: str, entries: Any) -> str:
     """What to say of [array], in single brackets."""
     inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
     named = (

@@ -17,7 +17,7 @@ from eomc.scene.source_map import SourceMap
 class Coordinate:
     """A generalized coordinate; its velocity is `<name>_dot`. Start in `unit`, rate in unit/s.
 
-    held, held_rate: whether constraints leave them as they are when a start is assembled.
+    held, rate_fixed: whether constraints leave them as they are when a start is assembled.
     friction: Coulomb's, N or N m; friction_width: the rate within which it is smoothed.
     """
 
@@ -26,8 +26,8 @@ class Coordinate:
     start: Formula
     rate: Formula
     note: str
-    held: bool = True
-    held_rate: bool = True
+    start_fixed: bool = True
+    rate_fixed: bool = True
     friction: Formula | None = None
     friction_width: Formula | None = None
 
@@ -119,7 +119,7 @@ class Run:
     friction: str = "smooth"
 
     @property
-    def sloped(self) -> bool:
+    def needs_derivatives(self) -> bool:
         """Whether derivatives of the accelerations are wanted; those of steps are made of them."""
         return bool(self.linearize) or self.discretize
 

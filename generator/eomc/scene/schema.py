@@ -16,9 +16,9 @@ from eomc.scene.formulas import nearest
 
 REALS, FRICTIONS = ("double", "float"), ("smooth", "stick")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
-LEAST_TOLERANCE, LOOSEST = 1e-15, 1e-2
-LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
-OF_EVENTS = {"double": 1e-9, "float": 1e-5}  # the tolerance of a scene that gives none
+MIN_TOLERANCE, MAX_TOLERANCE = 1e-15, 1e-2
+MIN_FLOAT_TOLERANCE = 5e-7  # a tolerance, of single precision
+DEFAULT_TOLERANCE = {"double": 1e-9, "float": 1e-5}  # the tolerance of a scene that gives none
 _NAMES = (*METHODS, "auto")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -30,7 +30,7 @@ _Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=Fal
 
 
 _Tolerance = Annotated[
-    float, pydantic.Field(strict=True, ge=LEAST_TOLERANCE, le=LOOSEST, allow_inf_nan=False)
+    float, pydantic.Field(strict=True, ge=MIN_TOLERANCE, le=MAX_TOLERANCE, allow_inf_nan=False)
 ]
 
 
@@ -80,7 +80,7 @@ class _Energy(_Table):
     dissipation: _Value = 0.0
 
 
-def _listed(value: object) -> object:
+def _as_tuple(value: object) -> object:
     """`method = "rk4"` says the same as `method = ["rk4"]`; the first is what runs use."""
     if isinstance(value, list) and value:
         return tuple(dict.fromkeys(map(str, value)))
@@ -89,7 +89,7 @@ def _listed(value: object) -> object:
 
 _Methods = Annotated[
     tuple[Literal[_NAMES], ...],  # type: ignore[valid-type]
-    pydantic.BeforeValidator(_listed),
+    pydantic.BeforeValidator(_as_tuple),
 ]
 
 
@@ -101,20 +101,22 @@ class _Run(_Table):
     batch: pydantic.StrictBool = False
     linearize: Annotated[bool | str, pydantic.PlainValidator(spelling.linearized)] = False
     discretize: pydantic.StrictBool = False
-    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(spelling.asked)] = False
+    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(spelling.frame_selection)] = (
+        False
+    )
     inverse_dynamics: pydantic.StrictBool = False
     momentum: pydantic.StrictBool = False
     tolerance: _Tolerance | None = None
     friction: Literal[FRICTIONS] = "smooth"  # type: ignore[valid-type]
 
 
-def _spelled_out(key: str, value: object) -> object:
+def _as_table(key: str, value: object) -> object:
     """`m = 2.0` says the same as `m = { value = 2.0 }`."""
     return value if isinstance(value, dict) else {key: value}
 
 
-_Short = Annotated[QuantityTable, pydantic.BeforeValidator(partial(_spelled_out, "value"))]
-_Formula = Annotated[OutputTable, pydantic.BeforeValidator(partial(_spelled_out, "formula"))]
+_Short = Annotated[QuantityTable, pydantic.BeforeValidator(partial(_as_table, "value"))]
+_Formula = Annotated[OutputTable, pydantic.BeforeValidator(partial(_as_table, "formula"))]
 
 
 _Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(spelling.vector)]
@@ -311,21 +313,21 @@ def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
     return tree if isinstance(tree, dict) else {}
 
 
-def has(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
+def has_entry(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
     """Whether the entry at `path` is there."""
     return path[-1] in table_at(tree, path[:-1])
 
 
-def place(error: Mapping[str, Any]) -> tuple[str, ...]:
+def error_path(error: Mapping[str, Any]) -> tuple[str, ...]:
     """pydantic's place without the branch of a union."""
     path = tuple(map(str, error["loc"]))
     if path[:2] == ("run", "method"):  # whichever of a list
         return path[:2]
-    branch = path[-1] in ("float", "str") and error["type"] in _OF_BRANCHES
+    branch = path[-1] in ("float", "str") and error["type"] in _UNION_ERRORS
     return path[:-1] if branch else path
 
 
-_OF_BRANCHES = ("float_type", "string_type", "finite_number")
+_UNION_ERRORS = ("float_type", "string_type", "finite_number")
 
 
 def _keys(path: tuple[str, ...]) -> list[str]:
@@ -334,21 +336,21 @@ def _keys(path: tuple[str, ...]) -> list[str]:
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
-def meant(path: tuple[str, ...]) -> str:
+def intended_key(path: tuple[str, ...]) -> str:
     """The key that the last of `path` may have been meant for, or the empty string."""
     known, last = _keys(path), path[-1]
     alias = ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
     alias = alias or ALIASES.get(last, "")
     near = alias if alias in known else nearest(path[-1], known)
     # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
-    far = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
-    return "" if far else near
+    is_unrelated = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
+    return "" if is_unrelated else near
 
 
-def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
+def explain(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     """One of pydantic's faults in our words, with the remedy."""
-    kind, given, last = str(error["type"]), error.get("input"), path[-1]
-    here = spelling.toml(given)
+    kind, received, last = str(error["type"]), error.get("input"), path[-1]
+    here = spelling.short_toml(received)
     if kind == "missing":
         where = (path[0], last) if path[0] in ALIASES_OF else path
         return "missing: " + _MISSING.get(where, f"add {last} = ...")
@@ -364,9 +366,9 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
             "potential can have terms linear in the velocities"
         )
     if kind == "extra_forbidden":
-        near = meant(path)
+        near = intended_key(path)
         remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"
-        return f"unknown {'table' if isinstance(given, dict) else 'key'} '{last}'{remedy}"
+        return f"unknown {'table' if isinstance(received, dict) else 'key'} '{last}'{remedy}"
     if path == ("eomc",):
         return f"format {here} is not known to this version, which reads eomc = 1"
     if kind == "too_short":
@@ -389,12 +391,12 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         if len(path) == 1:
             return f"'{last}' is a table: write [{last}] and its entries below"
         key = _FIRST_KEY.get(path[0], "value")
-        value = here if isinstance(given, (int, float, str)) else "..."
+        value = here if isinstance(received, (int, float, str)) else "..."
         return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
     if kind == "bool_type":
         return f"must be true or false, here {here}"
     if path[0] == "run":
-        return f"must be a number, here {here}{messages.number(given)}"
+        return f"must be a number, here {here}{messages.number_remedy(received)}"
     if last == "frame":
         return f'must be "world" or "body", whose axes the entries are along, here {here}'
     if last in ("unit", "note", "name", "title", "parent", "joint", "coordinate"):
@@ -422,18 +424,18 @@ _MISSING: Mapping[tuple[str, ...], str] = {
 }
 
 
-_NEEDED = ("name", "stiffness", "damping", "when")  # of what stands in an array
+_REQUIRED = ("name", "stiffness", "damping", "when")  # of what stands in an array
 
 
-def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
+def repair(tree: dict[str, Any], path: tuple[str, ...]) -> None:
     """Put something harmless in a faulty entry's place, so that the rest can be checked."""
     table, last = table_at(tree, path[:-1]), path[-1]
-    given = table.get(last)
-    if len(path) == 1 and isinstance(given, list) and all(isinstance(g, dict) for g in given):
-        table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
-    elif path in _HARMLESS:
-        table[last] = _HARMLESS[path]
-    elif len(path) == 3 and last in _NEEDED:
+    value = table.get(last)
+    if len(path) == 1 and isinstance(value, list) and all(isinstance(g, dict) for g in value):
+        table[last] = {key: value for g in value for key, value in g.items()}  # [[parameters]]
+    elif path in _PLACEHOLDERS:
+        table[last] = _PLACEHOLDERS[path]
+    elif len(path) == 3 and last in _REQUIRED:
         table[last] = f"{path[0]}_{path[1]}" if last == "name" else 1.0
     elif path[0] == "loop" and last == "joint":
         table[last] = ""
@@ -450,7 +452,7 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
         table.pop(last, None)
 
 
-_HARMLESS: Mapping[tuple[str, ...], Any] = {
+_PLACEHOLDERS: Mapping[tuple[str, ...], Any] = {
     ("eomc",): 1,
     ("name",): "scene",
     ("energy",): {"kinetic": "0"},

@@ -17,14 +17,14 @@ from eomc.scene.source_map import SourceMap
 # the kinds of thing a formula can depend on; what depends on something faulty is in doubt
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
 ACCELERATION, FORCE = "accelerations", "forces of constraints"
-DOUBT = "something faulty"
+UNKNOWN = "something faulty"
 
 NOTHING: frozenset[str] = frozenset()
 
 # what outputs can use besides all other names, unless the scene has these for something else
 ENERGIES = ("kinetic_energy", "potential_energy", "energy")
 
-SUGGESTED = 20  # faults, the first, for which near names are looked for
+MAX_SUGGESTIONS = 20  # faults, the first, for which near names are looked for
 
 Path = tuple[str, ...]
 
@@ -42,12 +42,12 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
         fault = "is too large for a double"
     except (ValueError, TypeError):
         fault = "has no real value"
-    given = {n.id: known[n.id] for n in formula.names()}
-    where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
+    values = {n.id: known[n.id] for n in formula.names()}
+    where = ", ".join(f"{name} = {value:g}" for name, value in values.items())
     return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "")
 
 
-def rings(graph: dict[str, list[str]]) -> Iterator[list[str]]:
+def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
     """Each ring of names that depend on one another, its first name again at its end.
 
     graph: what each name depends on; rings are taken out of it.
@@ -56,14 +56,14 @@ def rings(graph: dict[str, list[str]]) -> Iterator[list[str]]:
         try:
             return TopologicalSorter(graph).prepare()
         except CycleError as cycle:
-            ring = cycle.args[1][::-1]
-            yield ring
-            graph |= {name: [] for name in ring}
+            names = cycle.args[1][::-1]
+            yield names
+            graph |= {name: [] for name in names}
 
 
-def ring_text(ring: list[str]) -> str:
+def cycle_text(cycle: list[str]) -> str:
     """A ring in a line, of a long one its ends."""
-    return " -> ".join(ring if len(ring) <= 20 else [*ring[:10], "...", *ring[-9:]])
+    return " -> ".join(cycle if len(cycle) <= 20 else [*cycle[:10], "...", *cycle[-9:]])
 
 
 class Checker:
@@ -80,14 +80,16 @@ class Checker:
         self.faults = 0  # reported, each repetition of one counted
         self.reported: set[tuple[Path, str]] = set()
         self.used: dict[str, list[Path]] = defaultdict(list)
-        self.mended: set[Path] = set()
+        self.repaired: set[Path] = set()
         self.tables: dict[str, str] = {}
         self.kinds: dict[str, frozenset[str]] = {}
         self.centers: set[str] = set()
         self.definitions: dict[str, Formula] = {}
         self.solved = False  # whether formulas may use accelerations
 
-    def solve(self, accelerations: Collection[str], forces: Collection[str]) -> None:
+    def allow_solved_quantities(
+        self, accelerations: Collection[str], forces: Collection[str]
+    ) -> None:
         """From here on formulas may use accelerations, energies and forces of constraints.
 
         They are computed last.
@@ -101,7 +103,7 @@ class Checker:
             **self.kinds,
         }
 
-    def say(
+    def report(
         self,
         path: Path,
         message: str,
@@ -122,16 +124,16 @@ class Checker:
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
             # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
-            self.say(path, "LaTeX is not read: write names without backslash (theta)")
+            self.report(path, "LaTeX is not read: write names without backslash (theta)")
             return None
         try:
             return formulas.parse(text)
-        except FormulaError as found:
+        except FormulaError as fault_found:
             # a parameter is no product of others: "2 m" is a length
             declared = () if path[0] in ("parameters", "constants") else {*self.tables, *self.kinds}
-            meant = messages.quantity(text, declared)
-            fault = FormulaError(meant, 0, len(text)) if meant else found
-            self.say(path, fault.message, fault, text)
+            remedy = messages.quantity_remedy(text, declared)
+            fault = FormulaError(remedy, 0, len(text)) if remedy else fault_found
+            self.report(path, fault.message, fault, text)
             return None
 
     def formula(
@@ -146,9 +148,9 @@ class Checker:
         `rule` says in words which names are `allowed`, where not all are.
         """
         formula = self.parse(path, value)
-        return formula if formula and self.checked(path, formula, allowed, rule) else None
+        return formula if formula and self.check_names(path, formula, allowed, rule) else None
 
-    def checked(
+    def check_names(
         self,
         path: Path,
         formula: Formula,
@@ -160,17 +162,17 @@ class Checker:
         for node in formula.names():
             self.used[node.id].append(path)
             if node.id not in (self.kinds if allowed is None else allowed):
-                self.say(path, self._refused(node.id, rule), node, formula.text)
+                self.report(path, self._refusal(node.id, rule), node, formula.text)
         if self.faults == before:
             for call in formula.calls("dot"):
-                still = allowed is not None and not any(
+                is_constant = allowed is not None and not any(
                     self.tables.get(name) == "coordinates" for name in allowed
                 )
-                if why := rule if still else self._no_rate(call.args[0]):
-                    self.say(path, f"dot(...) can't be used here: {why}", call, formula.text)
+                if why := rule if is_constant else self._rate_fault(call.args[0]):
+                    self.report(path, f"dot(...) can't be used here: {why}", call, formula.text)
         return self.faults == before
 
-    def _refused(self, name: str, rule: str) -> str:
+    def _refusal(self, name: str, rule: str) -> str:
         """Why `name` can't be used."""
         if rule and (name in self.tables or name in self.kinds):
             return f"'{name}' can't be used here: {rule}"
@@ -189,23 +191,23 @@ class Checker:
                 return f"{start}: nobody knows the rate of an input; add it as a further input"
             case "parameters" | "constants" as table:
                 return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
-        if meant := self._respelt(name) or messages.velocity(name, self.tables):
-            return f"{start}; did you mean '{meant}'?"
+        if similar := self._similar_name(name) or messages.intended_velocity(name, self.tables):
+            return f"{start}; did you mean '{similar}'?"
         if name == "time":
             return f"{start}; did you mean 't'?"
-        if self.faults < SUGGESTED and (near := suggest(name, self.kinds)):
+        if self.faults < MAX_SUGGESTIONS and (near := suggest(name, self.kinds)):
             return start + near
         if name in ("e", "E"):
             return f"{start}: write exp(1), or declare it in [constants]"
         return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
 
-    def _respelt(self, name: str) -> str:
+    def _similar_name(self, name: str) -> str:
         """The known name that differs by underscores only, or the empty string."""
         plain = name.replace("_", "")
-        known = self.kinds if self.faults < SUGGESTED else ()
+        known = self.kinds if self.faults < MAX_SUGGESTIONS else ()
         return next((k for k in known if k.replace("_", "") == plain), "")
 
-    def _no_rate(self, inside: ast.expr) -> str:
+    def _rate_fault(self, inside: ast.expr) -> str:
         """Why there is no dot(inside), or the empty string."""
         kinds = self.kinds_of(inside)
         if INPUT in kinds:
@@ -233,8 +235,8 @@ class Checker:
     def where(self, formula: Formula, kind: str) -> ast.expr:
         """The first part of the formula that brings in `kind`."""
         parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
-        found = [part for part in parts if kind in self.kinds_of(part)]
-        return min(found, key=lambda part: part.col_offset, default=formula.tree)
+        parts_of_kind = [part for part in parts if kind in self.kinds_of(part)]
+        return min(parts_of_kind, key=lambda part: part.col_offset, default=formula.tree)
 
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
         """The formula's value; nan where it has none, which is reported."""
@@ -242,19 +244,19 @@ class Checker:
             return math.nan  # reported already
         value, fault = value_of(formula, known)
         if fault:
-            self.say(path, fault, text=formula.text)
+            self.report(path, fault, text=formula.text)
         return value
 
-    def smooth(self, path: Path, formula: Formula) -> None:
+    def check_smooth(self, path: Path, formula: Formula) -> None:
         """What is differentiated may not jump, nor anything that it is made of."""
         queue = [(path, formula)]
-        seen: set[str] = set()
+        visited: set[str] = set()
         while queue:
             where, f = queue.pop()
             for call in f.calls("sign", "heaviside"):
                 if {TIME, POSITION, VELOCITY} & self.kinds_of(call):
                     function = ast.unparse(call.func)
-                    self.say(
+                    self.report(
                         where,
                         f"{function}(...) jumps, and {'.'.join(path)} that uses it is "
                         "differentiated: use abs, min or max (max(x, 0)**2 for a stop), a smooth "
@@ -263,6 +265,6 @@ class Checker:
                         f.text,
                     )
             for node in f.names():
-                if node.id in self.definitions and node.id not in seen:
-                    seen.add(node.id)
+                if node.id in self.definitions and node.id not in visited:
+                    visited.add(node.id)
                     queue.append((("definitions", node.id), self.definitions[node.id]))

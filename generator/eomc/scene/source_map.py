@@ -12,7 +12,7 @@ from eomc.base.errors import Problem
 from eomc.scene.formulas import FormulaError
 
 MAX_STATEMENT = 500  # lines
-MAX_TRIED = 4_000_000  # characters given to tomllib, some seconds
+MAX_PARSED = 4_000_000  # characters given to tomllib, some seconds
 MAX_SEARCHED = 20_000_000  # characters searched for the columns of faults; then lines do
 
 # tables that may stand many times, in [[two brackets]]
@@ -40,7 +40,7 @@ class SourceMap:
             if self.lines[start].strip().startswith("#") or not self.lines[start].strip():
                 start += 1
                 continue
-            end, tree = self._end(start)
+            end, tree = self._statement_end(start)
             if end == start:
                 break  # hundreds of lines in one statement: no scene; the rest keeps no places
             header = self.lines[start].lstrip().startswith("[")
@@ -51,19 +51,19 @@ class SourceMap:
             if header:
                 paths = [_numbered(path, counts) for path in paths]
             for path in paths:
-                self._put((() if header else prefix) + path, (start, end))
+                self._store((() if header else prefix) + path, (start, end))
             if header:
                 prefix = max(paths, key=len)
             start = end
 
-    def _put(self, path: Path, place: tuple[int, int]) -> None:
+    def _store(self, path: Path, place: tuple[int, int]) -> None:
         if path not in self._line:
             self._line[path] = place
             for length in (1, 2):
                 if len(path) >= length:
                     self._under.setdefault(path[:length], []).append(path)
 
-    def _end(self, start: int) -> tuple[int, dict[str, Any]]:
+    def _statement_end(self, start: int) -> tuple[int, dict[str, Any]]:
         """The line after the statement that begins at `start`, and its tree.
 
         `start` itself where none is found.
@@ -71,7 +71,7 @@ class SourceMap:
         for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
             statement = "\n".join(self.lines[start:end])
             self._tried += len(statement)
-            if end > start + 1 and self._tried > MAX_TRIED:
+            if end > start + 1 and self._tried > MAX_PARSED:
                 break
             try:
                 return end, tomllib.loads(statement)
@@ -79,30 +79,32 @@ class SourceMap:
                 continue
         return start, {}
 
-    def rename(self, given: Path, meant: Path) -> None:
-        """Let `meant` and what is under it stand where the misspelt `given` stands."""
-        for path in list(self._under.get(given[:2], ())):
-            if path[: len(given)] == given:
-                self._stand(meant + path[len(given) :], path)
+    def rename(self, written: Path, intended: Path) -> None:
+        """Let `intended` and what is under it stand where the misspelt `written` stands."""
+        for path in list(self._under.get(written[:2], ())):
+            if path[: len(written)] == written:
+                self._place_like(intended + path[len(written) :], path)
 
-    def repeat(self, given: Path, made: Sequence[Path]) -> None:
-        """Let each of `made` and what is under it stand where the entry `given` stands."""
-        under = list(self._under.get(given, ()))
-        named = (*given, "name")
-        for path in (path for path in made if path != given):
-            self._from[path] = given
-            if named in self._line and given[0] in ARRAYS:
-                self._stand(path, named)  # an entry of an array stands where its name stands
+    def repeat(self, entry: Path, copies: Sequence[Path]) -> None:
+        """Let each of `copies` and what is under it stand where the entry `entry` stands."""
+        under = list(self._under.get(entry, ()))
+        name_path = (*entry, "name")
+        for path in (path for path in copies if path != entry):
+            self._from[path] = entry
+            if name_path in self._line and entry[0] in ARRAYS:
+                self._place_like(
+                    path, name_path
+                )  # an entry of an array stands where its name stands
             for old in under:
-                self._stand(path + old[len(given) :], old)
+                self._place_like(path + old[len(entry) :], old)
 
-    def _stand(self, made: Path, written: Path) -> None:
-        self._put(made, self._line[written])
-        self._key.setdefault(made, self._key.get(written, written[-1]))
+    def _place_like(self, new: Path, written: Path) -> None:
+        self._store(new, self._line[written])
+        self._key.setdefault(new, self._key.get(written, written[-1]))
 
-    def rewrite(self, made: str, written: str) -> None:
+    def rewrite(self, text: str, written: str) -> None:
         """Let a text made by repetition be looked for as it is written."""
-        self._text.setdefault(made, written)
+        self._text.setdefault(text, written)
 
     def origin(self, path: Path) -> Path:
         """The entry as it is written that an entry comes from."""
@@ -135,7 +137,7 @@ class SourceMap:
         self._searched += len(source) + 20_000  # a thousand faults at most
         offset, width = -1, 1
         if self._searched < MAX_SEARCHED:
-            offset, width = _spot(source, key_written, at, text, self._text.get(text or ""))
+            offset, width = _find_fault(source, key_written, at, text, self._text.get(text or ""))
         line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
         column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1
         return Problem(
@@ -143,7 +145,7 @@ class SourceMap:
         )
 
 
-def _spot(
+def _find_fault(
     source: str,
     key: str,
     at: FormulaError | ast.expr | None,
@@ -165,8 +167,8 @@ def _spot(
             return quoted.start(2) + len(written(text[:column])), width
     if before and (quoted := _quoted(before.strip(), source)):
         return quoted.start(2), len(quoted[2])
-    named = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
-    return (named.start(), len(key)) if named else (-1, 1)
+    match = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
+    return (match.start(), len(key)) if match else (-1, 1)
 
 
 def _quoted(text: str, source: str) -> re.Match[str] | None:
@@ -198,5 +200,5 @@ def _numbered(path: Path, counts: Mapping[str, int]) -> Path:
     """A path of a header: [[body]] and [body.x] belong to the last body so far."""
     if path[0] not in counts or len(path) < 2 or not counts[path[0]]:
         return path
-    behind = path[2:] if path[1].startswith("#") else path[1:]
-    return (path[0], f"#{counts[path[0]]}", *behind)
+    keys = path[2:] if path[1].startswith("#") else path[1:]
+    return (path[0], f"#{counts[path[0]]}", *keys)

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 
-def toml(value: object) -> str:
+def short_toml(value: object) -> str:
     """A value as TOML writes it, shortened."""
     if isinstance(value, bool):
         text = str(value).lower()
@@ -27,15 +27,15 @@ def entry(value: object) -> float | str:
                 return number
         except OverflowError:
             pass
-        raise ValueError(f"must be a finite number, here {toml(value)}")
-    raise ValueError(f"must be a number or a formula in quotes, here {toml(value)}")
+        raise ValueError(f"must be a finite number, here {short_toml(value)}")
+    raise ValueError(f"must be a number or a formula in quotes, here {short_toml(value)}")
 
 
 def vector(value: object) -> tuple[float | str, ...]:
     """A list of numbers and formulas."""
     if not isinstance(value, list) or not value:
         raise ValueError(
-            f"must be a list of numbers and formulas, such as [0, 1.5], here {toml(value)}"
+            f"must be a list of numbers and formulas, such as [0, 1.5], here {short_toml(value)}"
         )
     return tuple(map(entry, value))
 
@@ -54,7 +54,7 @@ def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]
         if not (isinstance(turn, list) and len(turn) == 2 and turn[0] in ("x", "y", "z")):
             raise ValueError(
                 'must be a list of turns, each an axis and an angle, such as [["z", "pi/2"]], '
-                f"here {toml(value)}"
+                f"here {short_toml(value)}"
             )
         turns.append((turn[0], entry(turn[1])))
     return tuple(turns)
@@ -67,7 +67,9 @@ def axes(value: object) -> tuple[tuple[float, ...], ...]:
         axes = value
     for axis in axes:
         if not (isinstance(axis, list) and axis and all(map(_is_number, axis))):
-            raise ValueError(f"must be a list of numbers, such as [0, 0, 1], here {toml(value)}")
+            raise ValueError(
+                f"must be a list of numbers, such as [0, 0, 1], here {short_toml(value)}"
+            )
     return tuple(tuple(float(entry) for entry in axis) for axis in axes)
 
 
@@ -82,7 +84,7 @@ def limits(value: object) -> tuple[float | str | None, ...]:
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(
             "must be the least and the largest value, such as [-1, 1] or [0, inf], "
-            f"here {toml(value)}"
+            f"here {short_toml(value)}"
         )
     unbounded = (("-inf", -math.inf), ("inf", "+inf", math.inf))
     return tuple(None if x in none else entry(x) for x, none in zip(value, unbounded, strict=True))
@@ -90,32 +92,38 @@ def limits(value: object) -> tuple[float | str | None, ...]:
 
 def names(value: object) -> tuple[str, ...]:
     """A name, or a list of names."""
-    given = value if isinstance(value, list) else [value]
-    if not all(isinstance(name, str) for name in given):
-        raise ValueError(f"must be a name in quotes, or a list of names, here {toml(value)}")
-    return tuple(given)
+    names_ = value if isinstance(value, list) else [value]
+    if not all(isinstance(name, str) for name in names_):
+        raise ValueError(f"must be a name in quotes, or a list of names, here {short_toml(value)}")
+    return tuple(names_)
 
 
 def two_names(value: object) -> tuple[str, ...]:
     """Two bodies."""
-    found = names(value)
-    if len(found) != 2:
-        raise ValueError(f'must name two bodies, such as ["world", "cart"], here {toml(value)}')
-    return found
+    names_ = names(value)
+    if len(names_) != 2:
+        raise ValueError(
+            f'must name two bodies, such as ["world", "cart"], here {short_toml(value)}'
+        )
+    return names_
 
 
 def two_coordinates(value: object) -> tuple[str, ...]:
     """Two coordinates."""
-    found = names(value)
-    if len(found) != 2:
-        raise ValueError(f'must name two coordinates, such as ["phi", "psi"], here {toml(value)}')
-    return found
+    names_ = names(value)
+    if len(names_) != 2:
+        raise ValueError(
+            f'must name two coordinates, such as ["phi", "psi"], here {short_toml(value)}'
+        )
+    return names_
 
 
 def points(value: object) -> tuple[tuple[float | str, ...], ...]:
     """Two points."""
     if not (isinstance(value, list) and len(value) == 2):
-        raise ValueError(f'must be two points, such as [[0, 0], ["l", 0]], here {toml(value)}')
+        raise ValueError(
+            f'must be two points, such as [[0, 0], ["l", 0]], here {short_toml(value)}'
+        )
     return tuple(map(vector, value))
 
 
@@ -126,17 +134,17 @@ def linearized(value: object) -> bool | str:
     """Whether derivatives are wanted, those along the parameters too."""
     if isinstance(value, bool) or value == "parameters":
         return value
-    raise ValueError(f'must be true, false or "parameters", here {toml(value)}')
+    raise ValueError(f'must be true, false or "parameters", here {short_toml(value)}')
 
 
-def asked(value: object) -> bool | tuple[str, ...]:
+def frame_selection(value: object) -> bool | tuple[str, ...]:
     """Whether all frames are wanted, or which."""
     if isinstance(value, bool):
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
         return tuple(dict.fromkeys(value))
     example = 'true, or a list of bodies and points such as ["tip"]'
-    raise ValueError(f"must be {example}, here {toml(value)}")
+    raise ValueError(f"must be {example}, here {short_toml(value)}")
 
 
 # --- [picture] ------------------------------------------------------------------------------------
@@ -148,7 +156,7 @@ def named_points(value: object) -> dict[str, tuple[float | str, ...]]:
     """A table of vectors."""
     if not isinstance(value, dict):
         raise ValueError(
-            f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {toml(value)}'
+            f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {short_toml(value)}'
         )
     return {name: vector(entries) for name, entries in value.items()}
 
@@ -160,7 +168,7 @@ def _place(value: object) -> Place:
 def places(value: object) -> tuple[Place, ...]:
     """A list of points, each by its name or as a vector."""
     if not isinstance(value, list):
-        raise ValueError(f'must be a list of points, such as ["tip"], here {toml(value)}')
+        raise ValueError(f'must be a list of points, such as ["tip"], here {short_toml(value)}')
     return tuple(map(_place, value))
 
 
@@ -168,20 +176,22 @@ def lines(value: object) -> tuple[tuple[Place, ...], ...]:
     """A list of lines, each through two points or more."""
     example = 'a list of lines, such as [["cart", "tip"]]'
     if not isinstance(value, list):
-        raise ValueError(f"must be {example}, here {toml(value)}")
+        raise ValueError(f"must be {example}, here {short_toml(value)}")
     for line in value:
         if not (isinstance(line, list) and len(line) >= 2):
-            raise ValueError(f"must be {example}, each through two points or more: {toml(line)}")
+            raise ValueError(
+                f"must be {example}, each through two points or more: {short_toml(line)}"
+            )
     return tuple(map(places, value))
 
 
 def ends(value: object) -> tuple[tuple[Place, ...], ...]:
     """A list of pairs of points."""
-    found = lines(value)
-    for pair in found:
+    pairs = lines(value)
+    for pair in pairs:
         if len(pair) != 2:
             raise ValueError(f"each goes from a point to another, here there are {len(pair)}")
-    return found
+    return pairs
 
 
 Solid = tuple[Place, tuple[float | str, ...], object]  # where, how large, how it is rotated
@@ -200,16 +210,16 @@ def circles(value: object) -> tuple[Solid, ...]:
 def _solids(value: object, size: str, example: str) -> tuple[Solid, ...]:
     keys = ("at", size, "rotation")
     out = []
-    for given in value if isinstance(value, list) else [value]:
-        if not isinstance(given, dict) or not {"at", size} <= given.keys() <= {*keys}:
+    for table in value if isinstance(value, list) else [value]:
+        if not isinstance(table, dict) or not {"at", size} <= table.keys() <= {*keys}:
             raise ValueError(
                 f"must be a list of tables with {keys[0]}, {keys[1]} and perhaps {keys[2]}, "
-                f"such as [{example}], here {toml(given)}"
+                f"such as [{example}], here {short_toml(table)}"
             )
-        extent = given[size]
+        extent = table[size]
         large = vector(extent) if size == "size" else (entry(extent),)
-        turned = rotation(given["rotation"]) if "rotation" in given else None
-        out.append((_place(given["at"]), large, turned))
+        turned = rotation(table["rotation"]) if "rotation" in table else None
+        out.append((_place(table["at"]), large, turned))
     return tuple(out)
 
 
@@ -218,5 +228,6 @@ def plane_axes(value: object) -> str:
     if value in ("xy", "xz", "yz"):
         return str(value)
     raise ValueError(
-        f'must be "xy", "xz" or "yz", what is drawn to the right and upwards, here {toml(value)}'
+        'must be "xy", "xz" or "yz", what is drawn to the right and upwards, '
+        f"here {short_toml(value)}"
     )

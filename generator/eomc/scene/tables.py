@@ -8,20 +8,20 @@ from eomc.scene import messages
 from eomc.scene.scope import Checker
 
 
-def mend(tree: dict[str, Any], check: Checker) -> None:
+def repair(tree: dict[str, Any], check: Checker) -> None:
     """Report tables that scenes do not have, once each; take them out, or put them in place."""
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
-        if found := messages.array(name, tree[name]):
-            meant, entries = found
-            check.say((name,), messages.one_table(name, meant))
-            check.mended |= {(meant,), *((meant, key) for key in entries)}
+        if match := messages.merge_array(name, tree[name]):
+            table, entries = match
+            check.report((name,), messages.one_table_message(name, table))
+            check.repaired |= {(table,), *((table, key) for key in entries)}
             del tree[name]
-            there = tree.get(meant)
-            tree[meant] = {**entries, **(there if isinstance(there, dict) else {})}
-            check.places.rename((name,), (meant,))
+            existing = tree.get(table)
+            tree[table] = {**entries, **(existing if isinstance(existing, dict) else {})}
+            check.places.rename((name,), (table,))
         elif name in messages.TABLES:
-            check.say((name,), f"there is no [{name}] in a scene: {messages.TABLES[name]}")
+            check.report((name,), f"there is no [{name}] in a scene: {messages.TABLES[name]}")
             del tree[name]
             if messages.TABLES[name] == messages.ENERGY:
                 tree.setdefault("energy", {"kinetic": "0"})
-                check.mended.add(("energy",))
+                check.repaired.add(("energy",))

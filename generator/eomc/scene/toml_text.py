@@ -14,13 +14,13 @@ from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.scene import messages
 
 MAX_BYTES = 1_000_000
-MOST_PARTS = 8  # of a key, a.b.c; tomllib takes memory by their square
-MOST_TABLES = 10_000  # headers, [table] or [[body]]: more take seconds to check
+MAX_KEY_PARTS = 8  # of a key, a.b.c; tomllib takes memory by their square
+MAX_TABLES = 10_000  # headers, [table] or [[body]]: more take seconds to check
 
 _HEADER = re.compile(r"^[ \t]*\[[^\],\n]*\]\]?[ \t]*(?:#.*)?$", re.MULTILINE)
 
 _TEXTS = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'')
-_PARTS = re.compile(rf"\s*[\w-]+(?:\s*\.\s*[\w-]+){{{MOST_PARTS},}}\s*", re.ASCII)
+_PARTS = re.compile(rf"\s*[\w-]+(?:\s*\.\s*[\w-]+){{{MAX_KEY_PARTS},}}\s*", re.ASCII)
 
 
 def loads(text: str) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def loads(text: str) -> dict[str, Any]:
 def long_key(text: str) -> int:
     """The line, from 1, in which a key has more than MOST_PARTS parts; 0 where none has."""
     for number, line in enumerate(text.split("\n"), start=1):
-        if line.count(".") >= MOST_PARTS:
+        if line.count(".") >= MAX_KEY_PARTS:
             pieces = re.split(r"[\[\]{},=#]", _TEXTS.sub("x", line))
             if any(_PARTS.fullmatch(piece) for piece in pieces):
                 return number
@@ -52,12 +52,14 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
     return loads(data.decode("utf-8-sig")), hashlib.sha256(data).hexdigest()
 
 
-def events(given: Any, what: str) -> str:
+def events_to_toml(definitions: Any, what: str) -> str:
     """Tables of events, by name a formula or a dict of the keys of [[event]], as TOML."""
-    if not isinstance(given, Mapping):
-        raise EomcError(f'{what}: give a dict, such as {{"section": "theta"}}, here {given!r}')
+    if not isinstance(definitions, Mapping):
+        raise EomcError(
+            f'{what}: give a dict, such as {{"section": "theta"}}, here {definitions!r}'
+        )
     lines: list[str] = []
-    for name, entry in given.items():
+    for name, entry in definitions.items():
         table = {"name": name, **(entry if isinstance(entry, Mapping) else {"when": entry})}
         lines += ["", "[[event]]"]
         for key, value in table.items():
@@ -89,15 +91,15 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
         )
         raise SceneError([Problem(message, file=file)])
     if line := long_key(text):
-        message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
+        message = f"a key has more than {MAX_KEY_PARTS} parts: a scene's have three, a.b.c, at most"
         raise _in_line(message, text, line, file)
-    headers = [found.start() for found in _HEADER.finditer(text)]
-    if len(headers) > MOST_TABLES:
+    headers = [match.start() for match in _HEADER.finditer(text)]
+    if len(headers) > MAX_TABLES:
         message = (
-            f"this is table {MOST_TABLES + 1:,} of {len(headers):,}, and a scene has "
-            f'{MOST_TABLES:,} at most: write alike ones once, with repeat = "i = 1..n"'
+            f"this is table {MAX_TABLES + 1:,} of {len(headers):,}, and a scene has "
+            f'{MAX_TABLES:,} at most: write alike ones once, with repeat = "i = 1..n"'
         )
-        raise _in_line(message, text, text.count("\n", 0, headers[MOST_TABLES]) + 1, file)
+        raise _in_line(message, text, text.count("\n", 0, headers[MAX_TABLES]) + 1, file)
     try:
         tree = tomllib.loads(text)
     except ValueError as fault:
@@ -114,10 +116,10 @@ def _in_line(message: str, text: str, line: int, file: str) -> SceneError:
     return SceneError([Problem(message, "", file, line, 0, len(source), source)])
 
 
-def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
-    start = data.rfind(b"\n", 0, at) + 1
+def _encoding_problem(data: bytes, offset: int, file: str) -> Problem:
+    start = data.rfind(b"\n", 0, offset) + 1
     source = data[start:].split(b"\n")[0].decode("utf-8", "replace").rstrip()
-    column = len(data[start:at].decode())
+    column = len(data[start:offset].decode())
     line = data[:start].count(b"\n") + 1
     return Problem(
         "the file is not UTF-8 text: save it as UTF-8", "", file, line, column, source=source
@@ -126,13 +128,13 @@ def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
 
 def _has_huge(tree: dict[str, Any]) -> bool:
     """Whether there is a whole number beyond all doubles; Python may not even print one."""
-    left: list[Any] = [tree]
-    while left:
-        value = left.pop()
+    pending: list[Any] = [tree]
+    while pending:
+        value = pending.pop()
         if isinstance(value, dict):
-            left += value.values()
+            pending += value.values()
         elif isinstance(value, list):
-            left += value
+            pending += value
         elif isinstance(value, int) and value.bit_length() > 1024:
             return True
     return False
@@ -151,8 +153,8 @@ def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
     if not isinstance(fault, tomllib.TOMLDecodeError):  # an int beyond Python's 4,300 digits
         return _huge_problem(text, file)
     lines = text.split("\n")
-    found = re.search(r" \(at line (\d+), column (\d+)\)", str(fault))
-    line, column = (int(found[1]), int(found[2]) - 1) if found else (len(lines), -1)
+    match = re.search(r" \(at line (\d+), column (\d+)\)", str(fault))
+    line, column = (int(match[1]), int(match[2]) - 1) if match else (len(lines), -1)
     message = re.sub(r" \(at .*\)", "", str(fault))
     source = lines[line - 1].rstrip()
     key = re.match(r"\s*([^=\s]+)\s*=", source)
@@ -168,9 +170,9 @@ def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
     elif "Invalid value" in message and (truth := re.match("True|False", source[column:])):
         remedy, width = f": write {truth[0].lower()}, in small letters", len(truth[0])
     else:
-        meant = messages.bare(source)
+        hint = messages.toml_remedy(source)
         remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
-        remedy = f": {meant}" if meant else remedy
+        remedy = f": {hint}" if hint else remedy
     return Problem(f"not TOML: {message}{remedy}", "", file, line, column, width, source)
 
 

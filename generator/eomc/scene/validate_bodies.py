@@ -12,18 +12,18 @@ from eomc.base import names
 from eomc.base.errors import MOST
 from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.schema import BodyTable, Document, PointTable
-from eomc.scene.scope import Checker, Path, ring_text, rings
+from eomc.scene.scope import Checker, Path, cycle_text, find_cycles
 from eomc.scene.validate_coordinates import FRICTION_WIDTH, check_width
-from eomc.scene.validate_joints import Joints
+from eomc.scene.validate_joints import JointChecks
 from eomc.scene.validate_values import ORIGIN, ZERO
 
-_OF_JOINTS = (
+_JOINT_KEYS = (
     "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
     "friction_width", "actuator",
 )  # fmt: skip
 
 
-def centers(doc: Document) -> set[str]:
+def center_names(doc: Document) -> set[str]:
     """The names that bodies on joints give to the position of their centres of mass, and points."""
     letters = "xy" if doc.gravity and len(doc.gravity) == 2 else "xyz"
     named = [body.name for body in doc.body.values() if body.position is None]
@@ -39,7 +39,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     """
     if not (doc.body or doc.point or doc.spring or doc.damper or doc.force or doc.loop):
         if doc.gravity is not None:
-            check.say(
+            check.report(
                 ("gravity",),
                 "acts on bodies, and there is no [[body]]: remove it, or write the weight "
                 "into the potential energy",
@@ -48,7 +48,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     return _Bodies(check, doc, known).assembly()
 
 
-class _Bodies(Joints):
+class _Bodies(JointChecks):
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         super().__init__(check, doc, known)
         self.bodies: dict[str, Body] = {}
@@ -59,20 +59,20 @@ class _Bodies(Joints):
         for name, path in self.names.items():
             entry = self._entry(name)
             if isinstance(entry, PointTable):
-                self._point(path, entry)
+                self._check_point(path, entry)
             elif entry.position is None:
-                self._jointed(path, entry)
+                self._check_jointed_body(path, entry)
             else:
-                self._placed(path, entry)
-        self._shared()
-        ordered = self._ordered()
-        self._inertia_of_joints(ordered)
+                self._check_placed_body(path, entry)
+        self._check_shared_coordinates()
+        ordered = self._sorted_bodies()
+        self._check_inertia(ordered)
         springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
         dampers = [self._damper(("damper", k), e) for k, e in self.doc.damper.items()]
         forces = [self._force(("force", k), e) for k, e in self.doc.force.items()]
         loops = [self._loop(("loop", k), e) for k, e in self.doc.loop.items()]
         return Assembly(
-            plane=self.wide == 2,
+            plane=self.dimension == 2,
             gravity=gravity,
             bodies=tuple(ordered),
             springs=tuple(springs),
@@ -84,26 +84,26 @@ class _Bodies(Joints):
     # --- the scene ------------------------------------------------------------------------------
 
     def _gravity(self) -> Vector:
-        given = self.doc.gravity
-        if given is None:
+        entries = self.doc.gravity
+        if entries is None:
             if self.doc.body:
-                self.wide = None
-                if ("gravity",) not in self.check.mended:
-                    self.check.say(
+                self.dimension = None
+                if ("gravity",) not in self.check.repaired:
+                    self.check.report(
                         ("gravity",),
                         'missing: add gravity = [0, "-9.81"] above the first [table] for a plane '
                         'scene, [0, 0, "-9.81"] for one in space, [0, 0] or [0, 0, 0] for none',
                     )
             return ORIGIN
-        if len(given) not in (2, 3):
-            self.wide = None
-            self.check.say(
+        if len(entries) not in (2, 3):
+            self.dimension = None
+            self.check.report(
                 ("gravity",),
-                f"has two entries in a plane scene and three in space, here {len(given)}",
+                f"has two entries in a plane scene and three in space, here {len(entries)}",
             )
             return ORIGIN
-        self.wide = len(given)
-        return self._vector(("gravity",), given)
+        self.dimension = len(entries)
+        return self._vector(("gravity",), entries)
 
     def _names(self) -> None:
         entries = [(("body", label), entry.name) for label, entry in self.doc.body.items()]
@@ -111,36 +111,36 @@ class _Bodies(Joints):
         for place, name in entries:
             path = (*place, "name")
             if why := names.fault(name):
-                self.check.say(path, why)
+                self.check.report(path, why)
             elif name == WORLD:
-                self.check.say(
+                self.check.report(
                     path, "'world' is the frame that does not move: name the body otherwise"
                 )
                 continue
             elif name in self.names:
                 what = f"{self.names[name][0]} above"
-                self.check.say(path, f"'{name}' is the name of a {what}: rename one of the two")
+                self.check.report(path, f"'{name}' is the name of a {what}: rename one of the two")
                 continue
             self.names[name] = place
         for name in sorted(self.check.centers & {*self.check.tables}):
             body = name[:-2]
-            self.check.say(
+            self.check.report(
                 (self.check.tables[name], name),
-                f"'{name}' is where {self._what(body)} is: use that, or choose another name",
+                f"'{name}' is where {self._center_text(body)} is: use that, or choose another name",
             )
 
     # --- bodies -----------------------------------------------------------------------------------
 
-    def _placed(self, path: Path, entry: BodyTable) -> None:
+    def _check_placed_body(self, path: Path, entry: BodyTable) -> None:
         """A body placed by formulas."""
         if entry.joint is not None:
-            self.check.say(
+            self.check.report(
                 (*path, "position"),
                 "a body is held by a joint or placed by 'position', not both: remove one of the "
                 "two (a joint's place in the parent's frame is 'offset')",
             )
             return
-        for key in _OF_JOINTS:
+        for key in _JOINT_KEYS:
             if getattr(entry, key) is not None:
                 why = (
                     "'position' is the centre of mass already"
@@ -148,28 +148,28 @@ class _Bodies(Joints):
                     else "the body is placed by 'position' and has no joint"
                 )
                 remedy = ", and let forces act through [forces]" if key == "actuator" else ""
-                self.check.say((*path, key), f"{why}: remove '{key}'{remedy}")
+                self.check.report((*path, key), f"{why}: remove '{key}'{remedy}")
         mass, inertia = self._mass(path, entry)
         self.bodies[entry.name] = Body(
             name=entry.name,
             mass=mass,
             inertia=inertia,
             center=ORIGIN,
-            rotation=self._rotation((*path, "rotation"), entry.rotation, self._moving),
-            position=self._vector((*path, "position"), entry.position, self._moving),
+            rotation=self._rotation((*path, "rotation"), entry.rotation, self._position_formula),
+            position=self._vector((*path, "position"), entry.position, self._position_formula),
             note=entry.note,
         )
 
-    def _what(self, name: str) -> str:
+    def _center_text(self, name: str) -> str:
         point = self.names.get(name, ("body",))[0] == "point"
         return f"point '{name}'" if point else f"the centre of mass of body '{name}'"
 
-    def _point(self, path: Path, entry: PointTable) -> None:
+    def _check_point(self, path: Path, entry: PointTable) -> None:
         """A frame on a body, which is one without mass on a fixed joint."""
         place = self._vector((*path, "place"), entry.place)
         rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
         parent = self._parent((*path, "body"), entry.name, entry.body)
-        self.heavy[entry.name] = False
+        self.has_inertia[entry.name] = False
         if parent is not None:
             self.bodies[entry.name] = Body(
                 name=entry.name,
@@ -184,7 +184,7 @@ class _Bodies(Joints):
                 point=True,
             )
 
-    def _jointed(self, path: Path, entry: BodyTable) -> None:
+    def _check_jointed_body(self, path: Path, entry: BodyTable) -> None:
         """A body held by a joint."""
         check = self.check
         joint = self._joint(path, entry)
@@ -197,12 +197,12 @@ class _Bodies(Joints):
             return
         coordinates = self._coordinates((*path, "coordinates"), joint, entry)
         axes = self._axes((*path, "axis"), joint, entry)
-        of_joint: dict[str, Any] = {
-            key: self._each((*path, key), joint, getattr(entry, key))
+        per_coordinate: dict[str, Any] = {
+            key: self._per_coordinate((*path, key), joint, getattr(entry, key))
             for key in ("armature", "damping", "friction", "actuator")
         }
         width = None
-        if of_joint["friction"]:
+        if per_coordinate["friction"]:
             width = FRICTION_WIDTH
         if entry.friction_width is not None:
             width, value = self._value((*path, "friction_width"), entry.friction_width)
@@ -222,18 +222,18 @@ class _Bodies(Joints):
             offset=offset,
             friction_width=width,
             note=entry.note,
-            **of_joint,
+            **per_coordinate,
         )
 
-    def _shared(self) -> None:
+    def _check_shared_coordinates(self) -> None:
         """Joints that move by one coordinate while another moves none: a slip."""
-        taken = {*self.moved_by, *self.check.used}
+        taken = {*self.first_body, *self.check.used}
         idle = [c for c in self.doc.coordinates if not {c, f"{c}_dot"} & taken]
         for body in self.bodies.values() if idle else ():
             for text in (formula.text for formula in body.coordinates):
-                first = self.moved_by.get(text, body.name)
+                first = self.first_body.get(text, body.name)
                 if first != body.name:
-                    self.check.say(
+                    self.check.report(
                         (*self.names[body.name], "coordinates"),
                         f"'{text}' moves the joint of '{first}' already, and '{idle[0]}' moves "
                         f"none; did you mean '{idle[0]}'?",
@@ -242,14 +242,14 @@ class _Bodies(Joints):
 
     # --- the tree ---------------------------------------------------------------------------------
 
-    def _ordered(self) -> list[Body]:
+    def _sorted_bodies(self) -> list[Body]:
         """Parents before children, else as written; rings of parents are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
-        for ring in islice(rings(graph), MOST):
+        for ring in islice(find_cycles(graph), MOST):
             place = self.names[ring[0]]
-            self.check.say(
+            self.check.report(
                 (*place, "body" if place[0] == "point" else "parent"),
-                f"the parents form a loop: {ring_text(ring)}; let one of them be held by the "
+                f"the parents form a loop: {cycle_text(ring)}; let one of them be held by the "
                 "world, and close the loop with a [[loop]]",
                 text=ring[1],
             )
@@ -267,7 +267,7 @@ class _Bodies(Joints):
                 out.append(self.bodies[name])
         return out
 
-    def _inertia_of_joints(self, ordered: Iterable[Body]) -> None:
+    def _check_inertia(self, ordered: Iterable[Body]) -> None:
         """Every joint that moves needs something to move, unless energies are given besides.
 
         What rows hold may have no inertia, such as a massless rod that closes a loop.
@@ -276,21 +276,21 @@ class _Bodies(Joints):
         rows = self.doc.loop or self.doc.constraints
         if self.doc.energy.kinetic != 0.0 or rows or any(body.position for body in ordered):
             return
-        carries = dict(self.heavy)
+        carries = dict(self.has_inertia)
         for body in reversed(ordered):
             if body.parent in carries:
                 carries[body.parent] |= carries[body.name]
         reported: set[str] = set()
         heavy = [b for b in ordered if carries[b.name] or b.armature]
-        resisted = self._moved(formula for body in heavy for formula in body.coordinates)
+        resisted = self._coordinates_in(formula for body in heavy for formula in body.coordinates)
         for body in ordered:
-            moved = self._moved(body.coordinates)
+            moved = self._coordinates_in(body.coordinates)
             if body.parent in reported or not moved or moved.keys() & resisted:
                 continue
             reported.add(body.name)
             resisted |= moved  # once
             by = " and ".join(formula.text for formula in body.coordinates)
-            self.check.say(
+            self.check.report(
                 self.names[body.name],
                 f"nothing that {by} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",

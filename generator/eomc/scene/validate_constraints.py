@@ -15,32 +15,32 @@ from eomc.scene.scope import INPUT, Checker, Path
 _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
-def constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
+def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
     """The rows of [constraints]; faults are reported."""
     for name, entry in doc.constraints.items():
-        if why := fault_of_row(check, doc, name):
+        if why := row_name_fault(check, doc, name):
             end = "" if names.fault(name) else ": give the constraint a name of its own"
-            check.say(("constraints", name), why + end)
+            check.report(("constraints", name), why + end)
         path = ("constraints", name, "formula")
-        if isinstance(entry.formula, str) and (why := _equation(entry.formula)):
-            check.say(path, why, text=entry.formula)
+        if isinstance(entry.formula, str) and (why := _equation_remedy(entry.formula)):
+            check.report(path, why, text=entry.formula)
             continue
         formula = check.formula(path, entry.formula)
-        if formula is None or path in check.mended:  # which is reported
+        if formula is None or path in check.repaired:  # which is reported
             continue
         if INPUT in check.kinds_of(formula.tree):
-            check.say(
+            check.report(
                 path,
                 "a constraint can't depend on inputs, whose rates nobody knows: let them act "
                 "through [forces], or write the motion wanted as a function of t",
                 check.where(formula, INPUT),
                 formula.text,
             )
-        check.smooth(path, formula)
+        check.check_smooth(path, formula)
         yield Constraint(name, entry.unit, formula, entry.note)
 
 
-def _equation(text: str) -> str:
+def _equation_remedy(text: str) -> str:
     """What to write in place of an equation, or the empty string."""
     sides = [side.strip() for side in text.replace("==", "=").split("=")]
     if len(sides) != 2 or not all(sides):
@@ -52,7 +52,7 @@ def _equation(text: str) -> str:
     return f"a constraint is what is zero: write {left} - {right}"
 
 
-def fault_of_row(check: Checker, doc: Document, name: str) -> str:
+def row_name_fault(check: Checker, doc: Document, name: str) -> str:
     """Why a row can't have a name; the empty string where it can."""
     taken = {n: f"stands in [{table}]" for n, table in check.tables.items()}
     taken |= dict.fromkeys(doc.outputs, "stands in [outputs]")
@@ -65,23 +65,25 @@ def fault_of_row(check: Checker, doc: Document, name: str) -> str:
     return f"'{name}' {taken[name]} already" if name in taken else ""
 
 
-def forces(doc: Document, assembly: Assembly | None) -> list[str]:
+def force_names(doc: Document, assembly: Assembly | None) -> list[str]:
     """What outputs call multipliers and the entries of reactions."""
     plane, loops = (assembly.plane, assembly.loops) if assembly else (True, ())
     rows = [*doc.constraints, *(row for loop in loops for row in loop.rows(plane).values())]
     if doc.run.friction == "stick":
-        rubbed = {n for b in doc.body.values() if b.friction is not None for n in _along(b)}
-        rubbed |= {name for name, c in doc.coordinates.items() if c.friction is not None}
-        rows += [f"{name}_sticks" for name in doc.coordinates if name in rubbed]
+        with_friction = {
+            n for b in doc.body.values() if b.friction is not None for n in _coordinates_of(b)
+        }
+        with_friction |= {name for name, c in doc.coordinates.items() if c.friction is not None}
+        rows += [f"{name}_sticks" for name in doc.coordinates if name in with_friction]
     reactions = [name for loop in loops for name in loop.reactions(plane)]
     return [*(f"lambda_{row}" for row in rows), *reactions]
 
 
-def _along(body: BodyTable) -> tuple[str, ...]:
+def _coordinates_of(body: BodyTable) -> tuple[str, ...]:
     return body.coordinates or ()
 
 
-def multiplier(
+def reports_unknown_multiplier(
     check: Checker, doc: Document, path: Path, text: float | str, known: Sequence[str]
 ) -> bool:
     """Whether an output names a multiplier or reaction by another name than those `known`.
@@ -95,22 +97,22 @@ def multiplier(
     for word in re.finditer(r"(?<![\w.])[A-Za-z_]\w*", text):
         named = word[0] in rows or re.fullmatch(_MULTIPLIER, word[0])
         if named and word[0] not in check.kinds:
-            mine = [name for name in known if word[0] in rows and word[0] in name]
+            matching = [name for name in known if word[0] in rows and word[0] in name]
             message = (
                 f"'{word[0]}' can't be used here: multipliers and reactions are called "
-                f"{texts.listed(mine or known, 6)}"
+                f"{texts.listed(matching or known, 6)}"
             )
-            check.say(path, message, FormulaError(message, word.start(), len(word[0])), text)
+            check.report(path, message, FormulaError(message, word.start(), len(word[0])), text)
             return True
     return False
 
 
-def guesses(check: Checker, doc: Document) -> None:
+def check_guesses(check: Checker, doc: Document) -> None:
     """A warning of each `guess` where nothing is assembled."""
     if not (doc.constraints or doc.loop):
         for name, entry in doc.coordinates.items():
             if entry.guess:
-                check.say(
+                check.report(
                     ("coordinates", name, "guess"),
                     "changes nothing: a guess is what [constraints] or a [[loop]] may move, and "
                     "there are none",

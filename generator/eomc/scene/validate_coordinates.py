@@ -11,50 +11,52 @@ from eomc.scene.scene import Coordinate
 from eomc.scene.schema import Document
 from eomc.scene.scope import Checker
 
-MANY_TURNS = 7.0  # rad: more than one, as a bare number
+SUSPICIOUS_ANGLE = 7.0  # rad: more than one, as a bare number
 FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 
-def coordinates(check: Checker, doc: Document, known: Mapping[str, float]) -> Iterator[Coordinate]:
+def check_coordinates(
+    check: Checker, doc: Document, known: Mapping[str, float]
+) -> Iterator[Coordinate]:
     """The coordinates of a document; faults are reported. known: values of parameters."""
 
     def formula(name: str, key: str, value: float | str) -> tuple[Formula | None, float]:
         path = ("coordinates", name, key)
         rule = f"a {key} is made of numbers, constants and parameters"
-        found = check.formula(path, value, known, rule)
-        return found, check.number(path, found, known)
+        checked = check.formula(path, value, known, rule)
+        return checked, check.number(path, checked, known)
 
     free = not (doc.constraints or doc.loop)
     for name, entry in doc.coordinates.items():
         start, rate = (formula(name, key, getattr(entry, key))[0] for key in ("start", "rate"))
         if entry.unit == "rad" and isinstance(entry.start, (int, float)):
             check_turns(check, ("coordinates", name, "start"), entry.start)
-        given = () if entry.guess else entry.model_fields_set
-        held, held_rate = (free or key in given for key in ("start", "rate"))
-        rubs, width = None, FRICTION_WIDTH
+        fixed_keys = () if entry.guess else entry.model_fields_set
+        is_fixed, is_rate_fixed = (free or key in fixed_keys for key in ("start", "rate"))
+        friction, width = None, FRICTION_WIDTH
         if entry.friction is not None:
-            rubs, value = formula(name, "friction", entry.friction)
-            if rubs and value < 0:
+            friction, value = formula(name, "friction", entry.friction)
+            if friction and value < 0:
                 path = ("coordinates", name, "friction")
-                check.say(path, f"is {value:g}, and can't be negative", text=rubs.text)
+                check.report(path, f"is {value:g}, and can't be negative", text=friction.text)
         if entry.friction_width is not None:
-            found, value = formula(name, "friction_width", entry.friction_width)
-            width = found or FRICTION_WIDTH
-            check_width(check, ("coordinates", name), value, found, entry.friction)
+            checked, value = formula(name, "friction_width", entry.friction_width)
+            width = checked or FRICTION_WIDTH
+            check_width(check, ("coordinates", name), value, checked, entry.friction)
         if start and rate:
             yield Coordinate(
-                name, entry.unit, start, rate, entry.note, held, held_rate, rubs, width
+                name, entry.unit, start, rate, entry.note, is_fixed, is_rate_fixed, friction, width
             )
 
 
 def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
     """Warn of an angle of a turn and more, written as a number: degrees may be meant."""
-    if MANY_TURNS <= abs(angle) < math.inf:
+    if SUSPICIOUS_ANGLE <= abs(angle) < math.inf:
         message = (
             f"{angle:.6g} rad are {abs(angle) / math.tau:.3g} turns; for degrees write "
-            f"{messages.radians(f'{angle:.15g}')}"
+            f"{messages.degrees_formula(f'{angle:.15g}')}"
         )
-        check.say(path, message, severity="warning")
+        check.report(path, message, severity="warning")
 
 
 def check_width(
@@ -63,11 +65,11 @@ def check_width(
     """Report the width of a friction that is none, or has none."""
     path = (*path, "friction_width")
     if value <= 0:
-        check.say(
+        check.report(
             path,
             f"is {value:g}, and must be greater than zero: the rate within which friction is "
             "smoothed",
             text=width.text if width else None,
         )
     if friction is None:
-        check.say(path, "there is no 'friction' with it: add it")
+        check.report(path, "there is no 'friction' with it: add it")

@@ -7,19 +7,19 @@ from typing import Any
 
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import Formula, nearest, suggest
-from eomc.scene.joints import JOINTS, MEANT, Z
+from eomc.scene.joints import JOINT_ALIASES, JOINTS, Z
 from eomc.scene.schema import BodyTable, Document, PointTable
 from eomc.scene.scope import Checker, Path
-from eomc.scene.validate_loops import Loops
+from eomc.scene.validate_loops import LoopChecks
 from eomc.scene.validate_values import ZERO
 
 
-class Joints(Loops):
+class JointChecks(LoopChecks):
     """Checks what holds and moves bodies."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         super().__init__(check, doc, known)
-        self.moved_by: dict[str, str] = {}  # each coordinate: the first body that it moves
+        self.first_body: dict[str, str] = {}  # each coordinate: the first body that it moves
 
     def _entry(self, name: str) -> BodyTable | PointTable:
         array, label = self.names[name]
@@ -29,23 +29,23 @@ class Joints(Loops):
     def _joint(self, path: Path, entry: BodyTable) -> str:
         """The kind of joint, or the empty string where it is not known."""
         check, joint = self.check, entry.joint
-        known = [k for k, kind in JOINTS.items() if kind.plane or self.wide != 2]
+        known = [k for k, kind in JOINTS.items() if kind.plane or self.dimension != 2]
         if joint is None:
-            if {(*path, "joint"), (*path, "position")} & check.mended:
+            if {(*path, "joint"), (*path, "position")} & check.repaired:
                 return ""  # reported already
-            check.say(
+            check.report(
                 path,
                 'say how the body is held: joint = "revolute" or another, or position = [...] with '
                 "formulas in the coordinates",
             )
             return ""
         if joint not in JOINTS:
-            near = MEANT.get(joint.lower(), "") or nearest(joint, JOINTS)
+            near = JOINT_ALIASES.get(joint.lower(), "") or nearest(joint, JOINTS)
             remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
-            check.say((*path, "joint"), f"there is no joint '{joint}'{remedy}", text=joint)
+            check.report((*path, "joint"), f"there is no joint '{joint}'{remedy}", text=joint)
             return ""
         if joint not in known:
-            check.say(
+            check.report(
                 (*path, "joint"),
                 f"a {joint} joint moves in space, and gravity has two entries, so the scene is "
                 f"plane: give gravity a third, or use {', '.join(known)}",
@@ -60,13 +60,13 @@ class Joints(Loops):
             return WORLD
         if parent not in self.names:
             remedy = suggest(parent, [WORLD, *self.names]) or ": declare it as a [[body]]"
-            self.check.say(path, f"there is no body '{parent}'{remedy}", text=parent)
+            self.check.report(path, f"there is no body '{parent}'{remedy}", text=parent)
         elif parent == name:
-            self.check.say(
+            self.check.report(
                 path, f"'{parent}' is its own parent: name another body, or world", text=parent
             )
         elif getattr(self._entry(parent), "position", None) is not None:
-            self.check.say(
+            self.check.report(
                 path,
                 f"'{parent}' is placed by formulas, and can't be a parent: give it a joint, "
                 "or place this body by formulas too",
@@ -77,24 +77,24 @@ class Joints(Loops):
         return None
 
     def _coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[Formula, ...] | None:
-        check, given, wanted = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
-        if path in check.mended:
+        check, written, count = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
+        if path in check.repaired:
             return None
-        if len(given) != wanted:
-            count = "one coordinate" if wanted == 1 else f"{wanted or 'no'} coordinates"
+        if len(written) != count:
+            count_text = "one coordinate" if count == 1 else f"{count or 'no'} coordinates"
             order = f" ({JOINTS[joint].order})" if JOINTS[joint].order else ""
-            here = ", ".join(given) or "none"
-            listed = ", ".join(f'"q{k}"' for k in range(1, wanted + 1))
-            example = listed if wanted == 1 else f"[{listed}]"
-            remedy = f": add coordinates = {example}" if not given else ""
-            remedy = remedy if wanted else ": remove it"
-            check.say(path, f"a {joint} joint has {count}{order}, here {here}{remedy}")
+            here = ", ".join(written) or "none"
+            listed = ", ".join(f'"q{k}"' for k in range(1, count + 1))
+            example = listed if count == 1 else f"[{listed}]"
+            remedy = f": add coordinates = {example}" if not written else ""
+            remedy = remedy if count else ": remove it"
+            check.report(path, f"a {joint} joint has {count_text}{order}, here {here}{remedy}")
             return None
-        made = [self._coordinate(path, text) for text in given]
-        sound = tuple(formula for formula in made if formula)
-        for name in self._moved(sound):
-            self.moved_by.setdefault(name, entry.name)
-        return sound if len(sound) == len(made) else None
+        checked = [self._coordinate(path, text) for text in written]
+        sound = tuple(formula for formula in checked if formula)
+        for name in self._coordinates_in(sound):
+            self.first_body.setdefault(name, entry.name)
+        return sound if len(sound) == len(checked) else None
 
     def _coordinate(self, path: Path, text: str) -> Formula | None:
         """A coordinate, or a formula of coordinates; None where it has a fault."""
@@ -105,7 +105,7 @@ class Joints(Loops):
             why = f"'{text}' is not a coordinate{near}"
             if table:
                 why = f"'{text}' stands in [{table}]: a joint moves by what is in [coordinates]"
-            check.say(path, why, text=text)
+            check.report(path, why, text=text)
             return None
         rule = "a joint moves by coordinates, or formulas of coordinates, parameters and constants"
         formula = check.formula(path, text, {*self.known, *coordinates}, rule)
@@ -117,67 +117,67 @@ class Joints(Loops):
         elif not any(node.id in coordinates for node in formula.names()):
             fault = f"'{formula.shown}' has no coordinate in it: what does not move is 'fixed'"
         if fault:
-            check.say(path, fault, text=formula.text)
+            check.report(path, fault, text=formula.text)
             return None
-        check.smooth(path, formula)
+        check.check_smooth(path, formula)
         return formula
 
-    def _moved(self, formulas_: Iterable[Formula]) -> dict[str, None]:
+    def _coordinates_in(self, formulas_: Iterable[Formula]) -> dict[str, None]:
         """The coordinates in formulas."""
-        found = (node.id for formula in formulas_ for node in formula.names())
-        return dict.fromkeys(name for name in found if name in self.doc.coordinates)
+        names_used = (node.id for formula in formulas_ for node in formula.names())
+        return dict.fromkeys(name for name in names_used if name in self.doc.coordinates)
 
     def _axes(
         self, path: Path, joint: str, entry: BodyTable
     ) -> tuple[tuple[float, float, float], ...]:
         """Unit axes; the joint's own where none are written."""
-        check, wanted = self.check, JOINTS[joint].given
-        if path in check.mended or self.wide is None:
+        check, axis_count = self.check, JOINTS[joint].axis_count
+        if path in check.repaired or self.dimension is None:
             return ()
-        given = entry.axis
-        if given is None:
-            if wanted and not JOINTS[joint].defaults:
-                example = "[1, 0]" if self.wide == 2 else "[1, 0, 0]"
-                check.say(path, f"missing: a {joint} joint slides along one, axis = {example}")
-                return (Z,) * wanted
+        written = entry.axis
+        if written is None:
+            if axis_count and not JOINTS[joint].defaults:
+                example = "[1, 0]" if self.dimension == 2 else "[1, 0, 0]"
+                check.report(path, f"missing: a {joint} joint slides along one, axis = {example}")
+                return (Z,) * axis_count
             return JOINTS[joint].defaults
-        if not wanted:
-            check.say(path, f"a {joint} joint has no axis to choose: remove it")
+        if not axis_count:
+            check.report(path, f"a {joint} joint has no axis to choose: remove it")
             return ()
-        if joint == "revolute" and self.wide == 2:
-            check.say(path, "in a plane scene joints turn about z: remove it")
+        if joint == "revolute" and self.dimension == 2:
+            check.report(path, "in a plane scene joints turn about z: remove it")
             return ()
-        if len(given) != wanted:
-            count = "one axis" if wanted == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
-            check.say(path, f"a {joint} joint has {count}, here {len(given)}")
+        if len(written) != axis_count:
+            count = "one axis" if axis_count == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
+            check.report(path, f"a {joint} joint has {count}, here {len(written)}")
             return ()
-        axes = [found for axis in given if (found := self._unit(path, axis))]
-        if len(axes) < len(given):
+        axes = [names_used for axis in written if (names_used := self._unit(path, axis))]
+        if len(axes) < len(written):
             return ()
         if len(axes) == 2 and abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1 - 1e-9:
-            check.say(
+            check.report(
                 path, "the two axes are parallel, so the two angles are one: turn one of them"
             )
         return tuple(axes)
 
-    def _each(self, path: Path, joint: str, given: Any) -> tuple[Formula, ...]:
+    def _per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
         """One formula for each coordinate of the joint."""
         count, key = len(JOINTS[joint].motions), path[-1]
-        if given is None:
+        if written is None:
             return ()
         if not count:
-            self.check.say(path, f"a fixed joint does not move: remove '{key}'")
+            self.check.report(path, f"a fixed joint does not move: remove '{key}'")
             return ()
-        entries = given if isinstance(given, tuple) else (given,) * count
+        entries = written if isinstance(written, tuple) else (written,) * count
         if len(entries) != count:
             each = f", or a list of {count}, one for each coordinate" if count > 1 else ""
-            self.check.say(path, f"give one for the joint{each}, here {len(entries)}")
+            self.check.report(path, f"give one for the joint{each}, here {len(entries)}")
             return ()
         if key == "actuator":
             return tuple(self.check.formula(path, entry) or ZERO for entry in entries)
-        made = [self._value(path, entry) for entry in entries]
-        for formula, value in made:
+        checked = [self._value(path, entry) for entry in entries]
+        for formula, value in checked:
             if value < 0 and key != "damping":
-                self.check.say(path, f"is {value:g}, and can't be negative", text=formula.text)
+                self.check.report(path, f"is {value:g}, and can't be negative", text=formula.text)
                 break
-        return tuple(formula for formula, _ in made)
+        return tuple(formula for formula, _ in checked)

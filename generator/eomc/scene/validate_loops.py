@@ -8,17 +8,20 @@ from typing import Any
 from eomc.base import names
 from eomc.scene.assembly import WORLD, Loop, Vector
 from eomc.scene.formulas import nearest, suggest
-from eomc.scene.joints import CLOSING_MEANT, CLOSINGS
+from eomc.scene.joints import CLOSING_ALIASES, CLOSINGS
 from eomc.scene.schema import Document, LoopTable
 from eomc.scene.scope import Checker, Path
-from eomc.scene.validate_constraints import fault_of_row
-from eomc.scene.validate_springs import Springs
+from eomc.scene.validate_constraints import row_name_fault
+from eomc.scene.validate_springs import SpringChecks
 from eomc.scene.validate_values import ORIGIN, ZERO
 
-_ALONG = {1: "one axis, or one in each body's frame", 2: "two axes, one in each body's frame"}
+_AXES_IN_WORDS = {
+    1: "one axis, or one in each body's frame",
+    2: "two axes, one in each body's frame",
+}
 
 
-class Loops(Springs):
+class LoopChecks(SpringChecks):
     """Checks the table [[loop]]."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
@@ -28,29 +31,29 @@ class Loops(Springs):
     def _loop(self, path: Path, entry: LoopTable) -> Loop | None:
         """What closes a loop; None where its joint is not known, which is reported."""
         kind = self._closing(path, entry)
-        if not kind or self.wide is None:
+        if not kind or self.dimension is None:
             return None
         if kind == "gear":
-            made = self._gear(path, entry)
+            parts = self._gear(path, entry)
         else:
-            bodies = self._closed(path, entry)
-            made = {
+            bodies = self._bodies_of_loop(path, entry)
+            parts = {
                 "bodies": bodies,
                 "points": self._ends(path, entry),
-                "axes": self._along((*path, "axis"), kind, entry),
+                "axes": self._axes_of_loop((*path, "axis"), kind, entry),
                 "rotation": self._rotation((*path, "rotation"), entry.rotation, self._formula),
                 "length": self._distance((*path, "length"), kind, entry),
             }
-        self._foreign(path, kind, entry)
-        loop = Loop(entry.name, kind, note=entry.note, **made)
-        self._row_names(path, loop)
+        self._report_foreign_keys(path, kind, entry)
+        loop = Loop(entry.name, kind, note=entry.note, **parts)
+        self._check_row_names(path, loop)
         return loop
 
     def _closing(self, path: Path, entry: LoopTable) -> str:
         """The kind of joint, or the empty string where there is none such."""
-        if (*path, "joint") in self.check.mended:
+        if (*path, "joint") in self.check.repaired:
             return ""
-        known = [k for k, kind in CLOSINGS.items() if kind.plane or self.wide != 2]
+        known = [k for k, kind in CLOSINGS.items() if kind.plane or self.dimension != 2]
         joint = entry.joint
         if joint in known:
             return joint
@@ -61,22 +64,22 @@ class Loops(Springs):
                 f"is plane: give gravity a third, or use {instead}"
             )
         else:
-            near = CLOSING_MEANT.get(joint.lower(), "") or nearest(joint, CLOSINGS)
+            near = CLOSING_ALIASES.get(joint.lower(), "") or nearest(joint, CLOSINGS)
             near = near if near in known else ""
             remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
             why = f"there is no joint '{joint}' that closes a loop{remedy}"
-        self.check.say((*path, "joint"), why, text=joint)
+        self.check.report((*path, "joint"), why, text=joint)
         return ""
 
-    def _closed(self, path: Path, entry: LoopTable) -> tuple[str, ...]:
+    def _bodies_of_loop(self, path: Path, entry: LoopTable) -> tuple[str, ...]:
         """The two bodies."""
         check = self.check
         if entry.bodies is None:
-            if (*path, "bodies") not in check.mended:
+            if (*path, "bodies") not in check.repaired:
                 what = 'missing: name the two that it joins, bodies = ["coupler", "rocker"]'
-                check.say((*path, "bodies"), what)
+                check.report((*path, "bodies"), what)
             return (WORLD, WORLD)
-        return self._two((*path, "bodies"), entry.bodies, "a loop closes")
+        return self._two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
 
     def _ends(self, path: Path, entry: LoopTable) -> tuple[Vector, ...]:
         """Where the joint is in the frame of each; of a [[point]] it is that point."""
@@ -87,123 +90,123 @@ class Loops(Springs):
         if (
             entry.bodies
             and not declared.issuperset(entry.bodies)
-            and (*path, "points") not in self.check.mended
+            and (*path, "points") not in self.check.repaired
         ):
-            example = '[[0, 0], ["l", 0]]' if self.wide == 2 else '[[0, 0, 0], ["l", 0, 0]]'
-            self.check.say(
+            example = '[[0, 0], ["l", 0]]' if self.dimension == 2 else '[[0, 0, 0], ["l", 0, 0]]'
+            self.check.report(
                 (*path, "points"),
                 f"missing: add points = {example}, where the joint is in the frame of each body",
             )
         return ORIGIN, ORIGIN
 
-    def _along(
+    def _axes_of_loop(
         self, path: Path, kind: str, entry: LoopTable
     ) -> tuple[tuple[float, float, float], ...]:
         """The axis in the frame of each body."""
-        check, joint, given = self.check, CLOSINGS[kind], entry.axis
-        across = "u" in joint.rows(self.wide == 2)
-        wanted = joint.axes if self.wide == 3 or across else 0
-        if path in check.mended:
+        check, joint, written = self.check, CLOSINGS[kind], entry.axis
+        across = "u" in joint.rows(self.dimension == 2)
+        axis_count = joint.axes if self.dimension == 3 or across else 0
+        if path in check.repaired:
             return ()
-        if given is None:
-            if wanted and not joint.defaults:
-                example = "[1, 0]" if self.wide == 2 else "[1, 0, 0]"
+        if written is None:
+            if axis_count and not joint.defaults:
+                example = "[1, 0]" if self.dimension == 2 else "[1, 0, 0]"
                 why = f"missing: a {kind} joint slides along one, of the first body"
-                check.say(path, f"{why}: axis = {example}")
-            return joint.defaults if wanted else ()
-        if not wanted:
-            plane = joint.axes and self.wide == 2
+                check.report(path, f"{why}: axis = {example}")
+            return joint.defaults if axis_count else ()
+        if not axis_count:
+            plane = joint.axes and self.dimension == 2
             why = (
                 "in a plane scene joints turn about z"
                 if plane
                 else f"a {kind} joint has no axis to choose"
             )
-            check.say(path, f"{why}: remove it")
+            check.report(path, f"{why}: remove it")
             return ()
-        axes = [found for axis in given if (found := self._unit(path, axis))]
-        if len(axes) < len(given):
+        axes = [unit for axis in written if (unit := self._unit(path, axis))]
+        if len(axes) < len(written):
             return ()
         single = not joint.defaults  # the first body's alone
         if len(axes) > 2 or len(axes) < joint.axes or (single and len(axes) > 1):
-            what = "one axis, of the first body" if single else _ALONG[joint.axes]
-            check.say(path, f"a {kind} joint has {what}, here {len(axes)}")
+            what = "one axis, of the first body" if single else _AXES_IN_WORDS[joint.axes]
+            check.report(path, f"a {kind} joint has {what}, here {len(axes)}")
             return ()
         return (axes[0], axes[-1])
 
     def _distance(self, path: Path, kind: str, entry: LoopTable) -> Any:
         """The length of a distance, and of nothing else."""
-        if kind != "distance" or path in self.check.mended:
+        if kind != "distance" or path in self.check.repaired:
             return None
         if entry.length is None:
-            self.check.say(path, 'missing: add length = "l", between the two points, m')
+            self.check.report(path, 'missing: add length = "l", between the two points, m')
             return None
         length, value = self._value(path, entry.length)
         if value <= 0:
-            meet = "revolute" if self.wide == 2 else "spherical"
+            meet = "revolute" if self.dimension == 2 else "spherical"
             why = f"is {value:g}, and must be greater than zero: points that meet are '{meet}'"
-            self.check.say(path, why, text=length.text)
+            self.check.report(path, why, text=length.text)
         return length
 
     def _gear(self, path: Path, entry: LoopTable) -> dict[str, Any]:
         """The coordinates of a gear, its ratio and offset."""
         check, coordinates = self.check, entry.coordinates or ()
-        if not coordinates and (*path, "coordinates") not in check.mended:
+        if not coordinates and (*path, "coordinates") not in check.repaired:
             what = 'missing: name the two that it couples, coordinates = ["phi", "psi"]'
-            check.say((*path, "coordinates"), what)
+            check.report((*path, "coordinates"), what)
         for name in coordinates:
             if name not in self.doc.coordinates:
                 remedy = suggest(name, self.doc.coordinates)
                 remedy = remedy or f": known are {', '.join([*self.doc.coordinates][:9])}"
                 why = f"'{name}' is not a coordinate{remedy}"
-                check.say((*path, "coordinates"), why, text=name)
+                check.report((*path, "coordinates"), why, text=name)
             check.used[name].append((*path, "coordinates"))
         if coordinates and coordinates[0] == coordinates[1]:
             why = f"a gear couples two coordinates, here both are '{coordinates[0]}'"
-            check.say((*path, "coordinates"), why)
+            check.report((*path, "coordinates"), why)
         ratio = ZERO
         if entry.ratio is not None:
             ratio, value = self._value((*path, "ratio"), entry.ratio)
             if value == 0:
                 why = "is 0, so that the second coordinate does not move: give it no coordinate"
-                check.say((*path, "ratio"), why, text=ratio.text)
-        elif (*path, "ratio") not in check.mended:
+                check.report((*path, "ratio"), why, text=ratio.text)
+        elif (*path, "ratio") not in check.repaired:
             why = 'missing: add ratio = "n", of the second coordinate over the first'
-            check.say((*path, "ratio"), why)
+            check.report((*path, "ratio"), why)
         offset = self._formula((*path, "offset"), entry.offset) if entry.offset else ZERO
         return {"coordinates": coordinates, "ratio": ratio, "offset": offset}
 
-    def _foreign(self, path: Path, kind: str, entry: LoopTable) -> None:
+    def _report_foreign_keys(self, path: Path, kind: str, entry: LoopTable) -> None:
         """Report keys of other kinds of joints."""
-        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.wide == 2))
+        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.dimension == 2))
         of_bodies = kind != "gear"
         belongs = {
             "bodies": of_bodies, "points": of_bodies, "axis": of_bodies, "rotation": turned,
             "length": kind == "distance", "coordinates": not of_bodies, "ratio": not of_bodies,
             "offset": not of_bodies,
         }  # fmt: skip
-        for key, its in belongs.items():
-            if getattr(entry, key) is not None and not its:
+        for key, allowed in belongs.items():
+            if getattr(entry, key) is not None and not allowed:
                 remedy = "remove it"
                 if key == "rotation" and of_bodies and CLOSINGS[kind].axes:
                     remedy = "give axis in the frame of each body, [[0, 0, 1], [1, 0, 0]]"
-                self.check.say((*path, key), f"a {kind} joint has no '{key}': {remedy}")
+                self.check.report((*path, key), f"a {kind} joint has no '{key}': {remedy}")
 
-    def _row_names(self, path: Path, loop: Loop) -> None:
+    def _check_row_names(self, path: Path, loop: Loop) -> None:
         """Each row has a name of its own, and so has the loop."""
         check, path = self.check, (*path, "name")
-        if path in check.mended:
+        if path in check.repaired:
             return
         others = [e.name for e in self.doc.loop.values()]
         if why := names.fault(loop.name):
-            check.say(path, why, text=loop.name)
+            check.report(path, why, text=loop.name)
         elif others.count(loop.name) > 1:
             why = f"'{loop.name}' is a loop already: rename one of the two"
-            check.say(path, why, text=loop.name)
+            check.report(path, why, text=loop.name)
         else:
-            for name in loop.rows(self.wide == 2).values():
-                why = fault_of_row(check, self.doc, name)
+            for name in loop.rows(self.dimension == 2).values():
+                why = row_name_fault(check, self.doc, name)
                 if not why and name in self.rows:
                     why = f"'{name}' is a row of another constraint"
                 if why:
-                    check.say(path, f"a row of the loop: {why}: rename the loop", text=loop.name)
+                    check.report(path, f"a row of the loop: {why}: rename the loop", text=loop.name)
                 self.rows.add(name)

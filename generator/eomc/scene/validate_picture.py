@@ -17,7 +17,7 @@ from eomc.scene.validate_values import ORIGIN, ZERO
 _SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", "path"))
 
 
-def picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
+def check_picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
     """What the scene wants drawn; None where it says nothing. Faults are reported to `check`.
 
     known: the values of constants and parameters.
@@ -30,8 +30,8 @@ class _Picture:
         assert doc.picture is not None
         self.check, self.known, self.table = check, known, doc.picture
         self.bodies = [e.name for table in (doc.body, doc.point) for e in table.values()]
-        wide = len(doc.gravity) if doc.body and doc.gravity else 0
-        self.wide = wide if wide in (2, 3) else 0  # 0: the first vector says
+        dimension = len(doc.gravity) if doc.body and doc.gravity else 0
+        self.dimension = dimension if dimension in (2, 3) else 0  # 0: the first vector says
         self.points: dict[str, Vector] = {}
 
     def checked(self) -> Picture:
@@ -39,29 +39,29 @@ class _Picture:
             self._declare(name, at)
         shapes = [*self._simple(), *self._solids()]
         if not shapes and not self.check.faults:
-            self.check.say(
+            self.check.report(
                 ("picture",),
                 "draws nothing: add dots, lines, springs, boxes, circles or paths, "
                 'such as lines = [["cart", "tip"]]',
             )
-        axes = "xyz" if self.wide == 3 else self.table.axes or "xy"
-        if self.table.axes and self.wide == 3:
-            self.check.say(("picture", "axes"), "is for pictures in the plane: remove it")
+        axes = "xyz" if self.dimension == 3 else self.table.axes or "xy"
+        if self.table.axes and self.dimension == 3:
+            self.check.report(("picture", "axes"), "is for pictures in the plane: remove it")
         return Picture(tuple(shapes), axes)
 
     def _declare(self, name: str, at: tuple[float | str, ...]) -> None:
         path = ("picture", "points", name)
         if why := names.fault(name):
-            self.check.say(path, why)
+            self.check.report(path, why)
         elif name == WORLD or name in self.bodies:
             what = "the frame that does not move" if name == WORLD else "a body or point already"
-            self.check.say(path, f"'{name}' is {what}: name the point otherwise")
+            self.check.report(path, f"'{name}' is {what}: name the point otherwise")
         self.points[name] = self._vector(path, at)
 
     def _simple(self) -> Iterator[Shape]:
         for key, kind in _SIMPLE:
-            for given in getattr(self.table, key):
-                many = given if key in ("lines", "springs") else (given,)
+            for entry in getattr(self.table, key):
+                many = entry if key in ("lines", "springs") else (entry,)
                 places = tuple(self._place(("picture", key), written) for written in many)
                 yield Shape(kind, places)
 
@@ -70,10 +70,10 @@ class _Picture:
             path = ("picture", key)
             for at, size, rotation in getattr(self.table, key):
                 place = self._place(path, at)
-                if kind == "box" and self.wide and len(size) != self.wide:
-                    where = "in the plane" if self.wide == 2 else "in space"
-                    words = "two edges" if self.wide == 2 else "three edges"
-                    self.check.say(path, f"a box {where} has {words}, here {len(size)}")
+                if kind == "box" and self.dimension and len(size) != self.dimension:
+                    where = "in the plane" if self.dimension == 2 else "in space"
+                    words = "two edges" if self.dimension == 2 else "three edges"
+                    self.check.report(path, f"a box {where} has {words}, here {len(size)}")
                 large = tuple(self._size(path, entry) for entry in size)
                 yield Shape(kind, (place,), large, self._rotation(path, rotation))
 
@@ -87,18 +87,18 @@ class _Picture:
         known = [*self.points, *self.bodies]
         near = suggest(written, known)
         remedy = near or ': add it to [picture.points], such as tip = ["x", "l*cos(theta)"]'
-        self.check.say(path, f"'{written}' is no point{remedy}", text=written)
+        self.check.report(path, f"'{written}' is no point{remedy}", text=written)
         return Place(written, ORIGIN)
 
-    def _vector(self, path: Path, given: tuple[float | str, ...]) -> Vector:
-        self.wide = self.wide or (len(given) if len(given) in (2, 3) else 0)
-        if len(given) != self.wide:
+    def _vector(self, path: Path, entries: tuple[float | str, ...]) -> Vector:
+        self.dimension = self.dimension or (len(entries) if len(entries) in (2, 3) else 0)
+        if len(entries) != self.dimension:
             words = {2: "two entries, as the others here", 3: "three entries, as the others here"}
-            wanted = words.get(self.wide, "two entries in the plane and three in space")
-            self.check.say(path, f"a point has {wanted}, not {len(given)}")
+            count_text = words.get(self.dimension, "two entries in the plane and three in space")
+            self.check.report(path, f"a point has {count_text}, not {len(entries)}")
             return ORIGIN
-        made = [self._formula(path, entry) for entry in given]
-        x, y, z = (*made, ZERO)[:3]
+        checked = [self._formula(path, entry) for entry in entries]
+        x, y, z = (*checked, ZERO)[:3]
         return x, y, z
 
     def _formula(self, path: Path, value: float | str) -> Formula:
@@ -111,7 +111,7 @@ class _Picture:
         for kind in (INPUT, VELOCITY):
             if kind in kinds:
                 why = f"a picture can't depend on {kind}: it shows where things are"
-                check.say(path, why, check.where(formula, kind), formula.text)
+                check.report(path, why, check.where(formula, kind), formula.text)
         return formula
 
     def _size(self, path: Path, value: float | str) -> Formula:
@@ -119,17 +119,17 @@ class _Picture:
         rule = "a size is made of numbers, constants and parameters"
         formula = self.check.formula(path, value, self.known, rule)
         if self.check.number(path, formula, self.known) < 0:
-            self.check.say(path, "a size is not negative", text=formula.text if formula else "")
+            self.check.report(path, "a size is not negative", text=formula.text if formula else "")
         return formula or ZERO
 
-    def _rotation(self, path: Path, given: Any) -> tuple[Turn, ...]:
-        if given is None:
+    def _rotation(self, path: Path, rotation: Any) -> tuple[Turn, ...]:
+        if rotation is None:
             return ()
-        if not isinstance(given, tuple):
-            if self.wide == 3:
+        if not isinstance(rotation, tuple):
+            if self.dimension == 3:
                 why = 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
-                self.check.say(path, why)
-            return (Turn("z", self._formula(path, given)),)
-        if self.wide == 2 and any(axis != "z" for axis, _ in given):
-            self.check.say(path, "in the plane a rotation is an angle: write it alone")
-        return tuple(Turn(axis, self._formula(path, angle)) for axis, angle in given)
+                self.check.report(path, why)
+            return (Turn("z", self._formula(path, rotation)),)
+        if self.dimension == 2 and any(axis != "z" for axis, _ in rotation):
+            self.check.report(path, "in the plane a rotation is an angle: write it alone")
+        return tuple(Turn(axis, self._formula(path, angle)) for axis, angle in rotation)

@@ -15,13 +15,13 @@ from eomc.scene.formulas import Formula
 from eomc.scene.schema import BodyTable, Document
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
 
-ROUNDING = 1e-6  # relative, of principal moments: files have them with six digits and more
+MOMENT_TOLERANCE = 1e-6  # relative, of principal moments: files have them with six digits and more
 
 ZERO = formulas.parse("0")
 ORIGIN: Vector = (ZERO, ZERO, ZERO)
 
 
-class Values:
+class ValueChecks:
     """Checks what is written for a vector, a rotation or a mass; faults go to `check`."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
@@ -30,9 +30,9 @@ class Values:
         self.known = known
         self.names: dict[str, Path] = {}  # of each body and point, and where it stands
         # entries of a vector; None where gravity doesn't say whether the scene is plane
-        self.wide: int | None = 2
+        self.dimension: int | None = 2
         self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text
-        self.heavy: dict[str, bool] = {}
+        self.has_inertia: dict[str, bool] = {}
 
     def _value(self, path: Path, value: float | str) -> tuple[Formula, float]:
         """A formula of parameters and its value at their defaults; 0 and nan where it is faulty."""
@@ -48,7 +48,7 @@ class Values:
     def _formula(self, path: Path, value: float | str) -> Formula:
         return self._value(path, value)[0]
 
-    def _moving(self, path: Path, value: float | str) -> Formula:
+    def _position_formula(self, path: Path, value: float | str) -> Formula:
         """A formula of everything but inputs and velocities, without dot."""
         check = self.check
         formula = check.formula(path, value)
@@ -56,7 +56,7 @@ class Values:
             return ZERO
         kinds = check.kinds_of(formula.tree)
         if INPUT in kinds:
-            check.say(
+            check.report(
                 path,
                 f"'{path[-1]}' can't depend on inputs, whose rates nobody knows: "
                 "let them act through an actuator or [forces]",
@@ -64,36 +64,37 @@ class Values:
                 formula.text,
             )
         elif VELOCITY in kinds or any(formula.calls("dot")):
-            check.say(
+            check.report(
                 path,
                 f"'{path[-1]}' can't depend on velocities: it is made of coordinates, "
                 "t, parameters, constants and definitions of these",
                 check.where(formula, VELOCITY),
                 formula.text,
             )
-        check.smooth(path, formula)
+        check.check_smooth(path, formula)
         return formula
 
     def _vector(
         self,
         path: Path,
-        given: Sequence[float | str] | None,
+        entries: Sequence[float | str] | None,
         formula: Callable[[Path, float | str], Formula] | None = None,
     ) -> Vector:
-        if given is None or not self._fits(path, len(given)):
+        if entries is None or not self._fits(path, len(entries)):
             return ORIGIN
-        made = [(formula or self._formula)(path, entry) for entry in given]
-        x, y, z = (*made, ZERO, ZERO, ZERO)[:3]
+        checked = [(formula or self._formula)(path, entry) for entry in entries]
+        x, y, z = (*checked, ZERO, ZERO, ZERO)[:3]
         return x, y, z
 
     def _fits(self, path: Path, entries: int) -> bool:
-        if self.wide is None or entries == self.wide:
-            return self.wide is not None
-        scene = "a plane scene" if self.wide == 2 else "space"
+        if self.dimension is None or entries == self.dimension:
+            return self.dimension is not None
+        scene = "a plane scene" if self.dimension == 2 else "space"
         words = {2: "two", 3: "three"}
-        self.check.say(
+        self.check.report(
             path,
-            f"vectors have {words[self.wide]} entries in {scene}, as gravity has, here {entries}",
+            f"vectors have {words[self.dimension]} entries in {scene}, as gravity has, "
+            f"here {entries}",
         )
         return False
 
@@ -103,68 +104,68 @@ class Values:
             return None
         size = math.hypot(*axis)
         if size < 1e-9:
-            self.check.say(path, "the axis has no length, so no direction: give it one")
+            self.check.report(path, "the axis has no length, so no direction: give it one")
             return None
         x, y, *third = (entry / size for entry in axis)
         return x, y, third[0] if third else 0.0
 
     def _rotation(
-        self, path: Path, given: Any, formula: Callable[[Path, float | str], Formula]
+        self, path: Path, rotation: Any, formula: Callable[[Path, float | str], Formula]
     ) -> tuple[Turn, ...]:
-        if given is None:
+        if rotation is None:
             return ()
-        if not isinstance(given, tuple):
-            if self.wide == 3:
-                self.check.say(
+        if not isinstance(rotation, tuple):
+            if self.dimension == 3:
+                self.check.report(
                     path, 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
                 )
-            return (Turn("z", formula(path, given)),)
-        for axis, _ in given:
-            if axis != "z" and self.wide == 2:
-                self.check.say(path, f"a plane scene turns about z only, here about {axis}")
+            return (Turn("z", formula(path, rotation)),)
+        for axis, _ in rotation:
+            if axis != "z" and self.dimension == 2:
+                self.check.report(path, f"a plane scene turns about z only, here about {axis}")
                 break
-        return tuple(Turn(axis, formula(path, angle)) for axis, angle in given)
+        return tuple(Turn(axis, formula(path, angle)) for axis, angle in rotation)
 
     def _mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
         """Mass and inertia."""
         mass, value = self._value((*path, "mass"), entry.mass)
         if value < 0:
-            self.check.say(
+            self.check.report(
                 (*path, "mass"), f"is {value:g} kg, and no mass is negative", text=mass.text
             )
         inertia, moments = self._inertia((*path, "inertia"), entry.inertia)
-        self.heavy[entry.name] = value != 0 or any(m != 0 for m in moments)
+        self.has_inertia[entry.name] = value != 0 or any(m != 0 for m in moments)
         return mass, inertia
 
-    def _inertia(self, path: Path, given: Any) -> tuple[tuple[Formula, ...], list[float]]:
+    def _inertia(self, path: Path, inertia: Any) -> tuple[tuple[Formula, ...], list[float]]:
         nothing = (ZERO,) * 6
-        if given is None or self.wide is None:
-            return nothing, [math.nan] if self.wide is None else [0.0]
-        single = not isinstance(given, tuple)
-        entries = (given,) if single else given
-        if self.wide == 2 and not single:
-            self.check.say(path, "a plane scene has one number for it, about z: write it alone")
+        if inertia is None or self.dimension is None:
+            return nothing, [math.nan] if self.dimension is None else [0.0]
+        single = not isinstance(inertia, tuple)
+        entries = (inertia,) if single else inertia
+        if self.dimension == 2 and not single:
+            self.check.report(path, "a plane scene has one number for it, about z: write it alone")
             return nothing, [math.nan]
-        if self.wide == 3 and (single or len(entries) not in (3, 6)):
+        if self.dimension == 3 and (single or len(entries) not in (3, 6)):
             here = "one number" if single else str(len(entries))
-            self.check.say(
+            self.check.report(
                 path,
                 "in space it has three entries, [Ixx, Iyy, Izz], or six, "
                 f"[Ixx, Iyy, Izz, Ixy, Ixz, Iyz], here {here}",
             )
             return nothing, [math.nan]
-        made = [self._value(path, entry) for entry in entries]
-        found, numbers = [f for f, _ in made], [v for _, v in made]
-        if self.wide == 2:
+        checked = [self._value(path, entry) for entry in entries]
+        moments, numbers = [f for f, _ in checked], [v for _, v in checked]
+        if self.dimension == 2:
             if numbers[0] < 0:
-                self.check.say(
+                self.check.report(
                     path,
                     f"is {numbers[0]:g} kg m^2, and no inertia is negative",
-                    text=found[0].text,
+                    text=moments[0].text,
                 )
-            return (ZERO, ZERO, found[0], ZERO, ZERO, ZERO), numbers
+            return (ZERO, ZERO, moments[0], ZERO, ZERO, ZERO), numbers
         self._moments(path, [*numbers, 0.0, 0.0, 0.0][:6])
-        return (*found, ZERO, ZERO, ZERO)[:6], numbers
+        return (*moments, ZERO, ZERO, ZERO)[:6], numbers
 
     def _moments(self, path: Path, inertia: Sequence[float]) -> None:
         """What no body can have: a negative principal moment, one above the sum of the others."""
@@ -172,16 +173,16 @@ class Values:
             return
         tensor = mp.matrix(spatial.tensor(inertia))  # NumPy takes 0.1 s to load
         small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
-        tiny = ROUNDING * max(abs(small), abs(large))
+        tolerance = MOMENT_TOLERANCE * max(abs(small), abs(large))
         shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"
-        if small < -tiny:
-            self.check.say(
+        if small < -tolerance:
+            self.check.report(
                 path,
                 f"its principal moments are {shown}, and none can be negative: "
                 "check signs and order, [Ixx, Iyy, Izz, Ixy, Ixz, Iyz]",
             )
-        elif large > small + middle + tiny:
-            self.check.say(
+        elif large > small + middle + tolerance:
+            self.check.report(
                 path,
                 f"its principal moments are {shown}, and one is larger than the two others "
                 "together, which no body has: check it, about the centre of mass",

@@ -44,7 +44,7 @@ def report(of: Comparison) -> None:
         of.row(name, LIMIT, UNITS, partial(of.value, name))
     if of.dtype == np.float64:  # single precision leaves differences too few digits
         of.row("A beside differences", SLOPE, "of A", rows.slopes)
-        if of.system.run.sloped and not of.system.modes:
+        if of.system.run.needs_derivatives and not of.system.modes:
             of.row("tangent", SLOPE, "of the rows' slopes", rows.tangent)
     of.row("power of multipliers", LIMIT, UNITS, rows.power)
     if of.system.reactions:

@@ -31,7 +31,7 @@ def _has(check: Comparison, name: str) -> bool:
     run = check.system.run
     if name == "sensitivity":
         return run.linearize == "parameters" and bool(check.system.parameters)
-    return run.sloped or any(METHODS[method].newton for method in check.methods)
+    return run.needs_derivatives or any(METHODS[method].newton for method in check.methods)
 
 
 def slopes(check: Comparison, name: str) -> float | Finding:

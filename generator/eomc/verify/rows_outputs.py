@@ -41,7 +41,7 @@ def report(of: Comparison) -> None:
     limit = max(OF_MULTIPLIERS if formulas.multipliers else SLOPE_LIMIT, LIMIT * of.eps)
     for module, form in of.forms:
         of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
-        if of.system.run.sloped:
+        if of.system.run.needs_derivatives:
             unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
             of.row(f"{form}outputs: C, D", limit, unit, slopes)
             if of.system.run.linearize == "parameters" and of.system.parameters:

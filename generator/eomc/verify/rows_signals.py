@@ -19,7 +19,7 @@ from eomc.verify.sampling import Expected
 
 def report(of: Comparison) -> None:
     """Add the rows of a scene with a smooth feedback."""
-    if not of.system.run.sloped or not _is_feedback(of.system):
+    if not of.system.run.needs_derivatives or not _is_feedback(of.system):
         return
     signals = tuple(Output(i.name, i.signal) for i in of.system.inputs)
     formulas = Formulas(replace(of.system, outputs=signals, inputs=()))

@@ -8,7 +8,7 @@ from eomc.emit.adaptive import METHOD, Stepping, SweepInterface
 from eomc.emit.fast import runs, views
 from eomc.emit.fast.lanes import INLINE, NOINLINE
 from eomc.emit.fast.steppers import Steppers
-from eomc.scene.schema import LOOSEST
+from eomc.scene.schema import MAX_TOLERANCE
 
 
 def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
@@ -21,7 +21,7 @@ def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
         inline=wide.qualifiers[INLINE],
         noinline=wide.qualifiers[NOINLINE],
         roughest=s.target.literal(adaptive.REJECT_AFTER_TWO),
-        loosest=s.target.literal(LOOSEST),
+        loosest=s.target.literal(MAX_TOLERANCE),
         tightest=s.target.literal(adaptive.tightest(s.target.real)),
         inputs=bool(s.target.system.inputs),
         constants=bool(s.constants),

@@ -47,7 +47,7 @@ def view(
         "tool": f"eomc {__version__}",
         "about": _free(about),
         "exchange": not s.constraints,
-        "derivatives": "true" if s.run.sloped else "false",
+        "derivatives": "true" if s.run.needs_derivatives else "false",
         "experiment": _free(experiment),
         "units": _units(known),
         # that of FMI 2 needs no time, and some importers take it for a fault

@@ -69,7 +69,7 @@ def view(target: Target, token: str) -> SceneCalls:
         sensitivity=_called(target, "sensitivity"),
         output_sensitivity=_called(target, "output_sensitivity"),
         signals_of_parameters=_signals_read_parameters(target),
-        linearization=public.linearization.call() if s.run.sloped else "",
+        linearization=public.linearization.call() if s.run.needs_derivatives else "",
         output_slopes=_called(target, "output_slopes"),
         refuses=refuses(target, "outputs"),
         slopes_refuse=refuses(target, "output_slopes"),
