@@ -1,4 +1,4 @@
-"""Words that people write instead of our keys, and the keys that they mean."""
+"""Keys of other programs and textbooks, and the keys of a scene that they stand for."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Bodies, joints, springs and dampers of a scene: checked data. No SymPy, no C.
+"""Bodies, joints, springs and dampers of a scene as checked data. Independent of SymPy and C.
 
-Every vector has three entries and every inertia six; in a plane scene those out of the plane are
-zero. Formulas depend on numbers, constants and parameters, save where it is said otherwise.
+Every vector has three components and every inertia six; in a plane scene, the components out of the
+plane are zero. Formulas depend on numbers, constants and parameters unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import CLOSINGS, REACTIONS
 
-WORLD = "world"  # the frame that does not move, as a parent and at the ends of springs
+WORLD = "world"  # the inertial frame, as a parent or at the end of a spring
 
 Vector = tuple[Formula, Formula, Formula]
 
@@ -26,21 +26,35 @@ class Turn:
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body, held by a joint in a tree or placed by formulas.
+    """A rigid body, attached by a joint in a tree or placed by formulas.
 
-    parent: a body's name or "world". joint: a key of joints.JOINTS, with `coordinates` in its
-    order, each one of the scene or a formula of these, and unit `axes` in the joint's frame, which
-    stands at `offset` (m) in the parent's frame, rotated by `rotation`. The body's frame is the
-    joint's frame, moved by the coordinates. A body
-    placed by formulas has joint "", no parent, the `position` (m) of its centre of mass in the
-    world and the `rotation` of its frame there; these depend on coordinates, t and definitions too.
-
-    mass: kg. center: the centre of mass in the body's frame, m; zero where placed by formulas.
-    inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass along the body's axes, kg m^2;
-    the off-diagonal entries are those of the tensor, -sum m x y.
-    armature (kg or kg m^2), damping (N s/m or N m s/rad), friction (N or N m; Coulomb's, smoothed
-    as friction*tanh(rate/friction_width)) and actuator (a force along the coordinate, of all
-    names): empty, or one a coordinate. A `point` is a body without mass on a fixed joint.
+    Attributes
+    ----------
+    parent : str
+        Name of a body, or "world".
+    joint : str
+        Key of joints.JOINTS; "" if the body is placed by formulas.
+    coordinates : tuple of Formula
+        One for each motion of the joint: a coordinate of the scene or a formula of coordinates.
+    axes : tuple of vectors
+        Unit vectors in the joint's frame.
+    offset, rotation : vector in m, and tuple of Turn
+        Pose of the joint's frame in the parent's frame. The body's frame is the joint's frame,
+        moved by the coordinates. For a body placed by formulas, the rotation of its frame in the
+        world.
+    position : vector or None
+        Centre of mass in the world, m, of a body placed by formulas. It and the rotation may then
+        depend on coordinates, t and definitions.
+    mass, center, inertia : Formula, vector and six Formulas
+        kg; centre of mass in the body's frame, m; Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of
+        mass along the body's axes, kg m^2. Off-diagonal elements are those of the tensor, -sum m x
+        y.
+    armature, damping, friction, actuator : tuple of Formula
+        Empty, or one for each coordinate: kg or kg m^2; N s/m or N m s/rad; N or N m (Coulomb
+        friction, smoothed as friction*tanh(rate/friction_width)); a force along the coordinate,
+        which may use all names.
+    point : bool
+        True for a [[point]], a massless body on a fixed joint.
     """
 
     name: str
@@ -65,11 +79,11 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """What a spring or damper acts on: a coordinate, or points of two bodies, or their angles.
+    """Where a spring or damper acts: along a coordinate, between points, or between angles.
 
-    coordinate: the coordinate it acts on, "" where it is between `bodies`; then `points` (m) are
-    its ends in their frames (the world's for "world"). turning: it acts on the difference of two
-    bodies' angles in the plane, of the second over the first, and there are no points.
+    coordinate: the coordinate, "" if it acts between `bodies`. points: its ends in the frames of
+    the bodies, m. turning: True if it acts on the angle of the second body minus that of the first,
+    in the plane; then there are no points.
     """
 
     coordinate: str = ""
@@ -80,7 +94,7 @@ class Between:
 
 @dataclass(frozen=True, kw_only=True)
 class Spring(Between):
-    """stiffness: N/m or N m/rad. length: the rest length, or the rest angle or position."""
+    """A spring. stiffness: N/m or N m/rad. length: rest length, rest angle or rest position."""
 
     stiffness: Formula
     length: Formula
@@ -88,16 +102,16 @@ class Spring(Between):
 
 @dataclass(frozen=True, kw_only=True)
 class Damper(Between):
-    """As a spring, with the force -damping times the rate. damping: N s/m or N m s/rad."""
+    """A damper with the force -damping times the rate. damping: N s/m or N m s/rad."""
 
     damping: Formula
 
 
 @dataclass(frozen=True)
 class Force:
-    """What acts on a body: a force (N) at a `point` (m, in the body's frame) and a torque (N m).
+    """A force (N) at a `point` (m, in the body's frame) and a torque (N m) on a body.
 
-    Formulas of all names, along the world's axes, or where `in_body` the body's.
+    Their components are formulas of all names, along the world's axes or, if `in_body`, the body's.
     """
 
     body: str
@@ -109,12 +123,12 @@ class Force:
 
 @dataclass(frozen=True)
 class Loop:
-    """A joint that closes a tree of bodies, or a gear between two coordinates.
+    """A joint that closes a loop in a tree of bodies, or a gear between two coordinates.
 
-    joint: a key of joints.CLOSINGS. points (m) and axes (unit vectors) are in the frames of the
-    first and the second of the `bodies`, "world" among them. rotation: how the second body's frame
-    stands in the first's. length: m, of a distance. A gear holds the second of its `coordinates` at
-    ratio times the first plus offset.
+    joint: key of joints.CLOSINGS. points (m) and axes (unit vectors): in the frames of the first
+    and the second of the `bodies`, one of which may be "world". rotation: of the second body's
+    frame relative to the first. length: of a distance, m. A gear keeps the second of its
+    `coordinates` at ratio times the first plus offset.
     """
 
     name: str
@@ -130,21 +144,21 @@ class Loop:
     note: str = ""
 
     def rows(self, plane: bool) -> dict[str, str]:
-        """What it keeps at zero, and the name of the row of each."""
+        """Return the constraint equations and the name of each."""
         kinds = CLOSINGS[self.joint].rows(plane)
         if len(kinds) == 1:
             return {kinds[0]: self.name}
         return {kind: f"{self.name}_{kind}" for kind in kinds}
 
     def reactions(self, plane: bool) -> tuple[str, ...]:
-        """What outputs call the entries of its reaction; a gear has none."""
+        """Return the names of the reaction components for outputs; a gear has none."""
         parts = () if self.joint == "gear" else REACTIONS[plane]
         return tuple(f"{self.name}_{part}" for part in parts)
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The bodies, parents before children, and what acts between them; gravity in m/s^2."""
+    """The bodies, parents before children, and what acts on them; gravity in m/s^2."""
 
     plane: bool
     gravity: Vector

@@ -1,8 +1,8 @@
-"""Formula text to a checked syntax tree, and a tree to a value in any algebra.
+"""Parse formulas to checked syntax trees, and evaluate trees in any algebra.
 
-Scene text is data: it is parsed with `ast`, every node is compared with a whitelist, and the
-tree is walked by `evaluate`; nothing is ever executed. The same tree gives a float with
-`NUMERIC` and a SymPy expression with that of `model/algebra.py`.
+The text of a scene is data: it is parsed with `ast`, every node is checked against a whitelist, and
+the tree is evaluated by `evaluate`; nothing is executed. The same tree gives a float with `NUMERIC`
+and a SymPy expression with the algebra of `model/algebra.py`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from eomc.base import names, texts
 MAX_LENGTH = 10_000
 MAX_DEPTH = 150
 MAX_EXPONENT = 64
-MAX_DIGITS = 1_000  # of a number as it is written
-MAX_CANDIDATES = 1_000  # names, among which near ones are looked for
-MAX_LOG10 = 300  # no number in a formula, folded or written, may pass 1e300
+MAX_DIGITS = 1_000  # of a literal
+MAX_CANDIDATES = 1_000  # names that are compared for similarity
+MAX_LOG10 = 300  # numbers in a formula, folded or written, must be below 1e300
 
-# called the same in Python's math, in SymPy and in C
+# functions with the same name in Python's math, SymPy and C
 ELEMENTARY = "sin cos tan asin acos atan sinh cosh tanh exp log sqrt atan2".split()
 # name -> (fewest, most) arguments
 FUNCTIONS: Mapping[str, tuple[int, int]] = {
@@ -48,7 +48,7 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.USub: operator.neg,
 }
 
-# what people write instead, and the remedy: characters, then functions, then syntax
+# remedies for what newcomers write: characters, then functions, then syntax
 _QUOTE = "quotes and primes are not used here: write {}_dot for a velocity, dot(e) for de/dt"
 _ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
 _CHARACTER_REMEDIES: Mapping[str, str] = {
@@ -112,7 +112,7 @@ _TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
 
 
 class FormulaError(ValueError):
-    """What is wrong with a formula, and where: `column` and `width` count its characters."""
+    """An error in a formula, at characters `column` to `column + width`."""
 
     def __init__(self, message: str, column: int = 0, width: int = 1) -> None:
         super().__init__(message)
@@ -123,24 +123,24 @@ class FormulaError(ValueError):
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula that has passed the whitelist. `tree` is never changed after it is made."""
+    """A formula that has passed the whitelist. `tree` must not be changed."""
 
     text: str
     tree: ast.expr
 
     @property
     def shown(self) -> str:
-        """The text, of a long one the beginning."""
+        """The text, shortened if it is long."""
         return self.text if len(self.text) <= 80 else self.text[:79] + "…"
 
     def names(self) -> Iterator[ast.Name]:
-        """The names used as values (not functions, not pi), in reading order."""
+        """Yield the names used as values (not functions, not pi), in reading order."""
         called = {id(n.func) for n in ast.walk(self.tree) if isinstance(n, ast.Call)}
         nodes = [n for n in ast.walk(self.tree) if isinstance(n, ast.Name) and id(n) not in called]
         yield from sorted((n for n in nodes if n.id != "pi"), key=lambda n: n.col_offset)
 
     def calls(self, *functions: str) -> Iterator[ast.Call]:
-        """The calls of the given functions."""
+        """Yield the calls of the given functions."""
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 if node.func.id in functions:
@@ -148,7 +148,7 @@ class Formula:
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """The known name that `name` may have been meant for, or the empty string."""
+    """Return the known name most similar to `name`, or ""."""
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
     with_prefix = [k for k in known if k.startswith(name)] if len(name) > 2 else []  # tol, dir
@@ -161,13 +161,13 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
+    """Return `"; did you mean 'm_c'?"` if a known name is similar, else ""."""
     near = nearest(name, known)
     return f"; did you mean '{texts.line(near)}'?" if near else ""
 
 
 def parse(text: str) -> Formula:
-    """Check `text`, blanks around it apart. Raises FormulaError with the place of a fault."""
+    """Parse and check a formula. Raises FormulaError with the place of the error."""
     # newlines are layout in a multi-line TOML string, as inside parentheses
     line = text.replace("\n", " ").replace("\t", " ").strip(" ")
     if len(line) > MAX_LENGTH:
@@ -196,7 +196,7 @@ def parse(text: str) -> Formula:
 
 
 def _character_error(line: str, at: int) -> FormulaError:
-    """What to write instead of the character at `at`, by what stands before it."""
+    """Return the error for the character at `at`; the remedy depends on the text before it."""
     before = line[max(at - 40, 0) : at]
     if line[at] == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", before)):
         start = at - len(before) + number.start()
@@ -249,7 +249,7 @@ def _fault(node: ast.expr, message: str) -> FormulaError:
 
 
 def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> None:
-    """Compare `node` with the whitelist; `power` is the product of the exponents around it."""
+    """Check `node` against the whitelist; `power` is the product of the exponents around it."""
     if depth > MAX_DEPTH:
         raise FormulaError(
             f"the formula is nested more than {MAX_DEPTH} deep, each term of a sum counted: "
@@ -338,7 +338,7 @@ def _in_range(value: float) -> bool:
 
 
 def _exponent_product(node: ast.expr, exponent: float, power: float) -> float:
-    """The product of the exponents, within bounds."""
+    """Return the product of the exponents. Raises FormulaError if it is too large."""
     if not abs(exponent) <= MAX_EXPONENT:
         raise _fault(node, f"an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}")
     if abs(power * exponent) > MAX_EXPONENT:
@@ -353,7 +353,7 @@ def _check_value(formula: Formula, node: ast.expr) -> None:
 
 
 def _number(formula: Formula, node: ast.expr) -> float | None:
-    """The value of a subtree, nan where it is not real and finite, None where it has names."""
+    """Return the value of a subtree; nan if not real and finite, None if it has names."""
     names_used = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
     if any(name not in FUNCTIONS and name != "pi" for name in names_used):
         return None
@@ -365,16 +365,16 @@ def _number(formula: Formula, node: ast.expr) -> float | None:
 
 
 def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str], Any]) -> Any:
-    """The value of the formula.
+    """Return the value of a formula.
 
-    `algebra` maps function names, "pi" and "number" (text of a literal -> value) to callables and
-    values; `lookup` gives the value of every other name. Raises what these raise.
+    `algebra` maps function names, "pi" and "number" (a function of the literal's text) to callables
+    and values; `lookup` returns the value of every other name. Exceptions of these are passed on.
     """
     return _walk(formula, formula.tree, algebra, lookup)
 
 
 def fold_values(formula: Formula, values: Mapping[str, float]) -> str:
-    """The formula as text, with these values in place of their names."""
+    """Return the formula as text, with names replaced by values."""
 
     class Folded(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:
@@ -408,7 +408,7 @@ def _walk(
 
 
 def _literal_of(formula: Formula, node: ast.Constant) -> str:
-    """A number as it was written, so that 0.1 may stay exact."""
+    """Return the text of a number as written, so that 0.1 may stay exact."""
     return formula.text[node.col_offset : node.end_col_offset].replace("_", "").lower()
 
 
@@ -426,4 +426,4 @@ NUMERIC: Mapping[str, Any] = {
     "min": min,
     "max": max,
 }
-_CONSTANT_ALGEBRA = {**NUMERIC, "dot": lambda _: 0.0}  # which do not change
+_CONSTANT_ALGEBRA = {**NUMERIC, "dot": lambda _: 0.0}  # numbers have no rate

@@ -1,7 +1,7 @@
-"""The kinds of joints: the tables of what moves each, and of what closes each in a loop.
+"""Tables of joints: the motions of each kind, and the constraints of each kind that closes a loop.
 
-A joint is a row of elementary motions, turns and slides, each along or about an axis of the frame
-that those before it have moved. A new kind made of these is one more entry here.
+A joint is a sequence of elementary motions, rotations and translations, each about or along an axis
+of the frame that the previous ones have moved. A kind of joint made of these is one entry here.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 class Joint:
     """A kind of joint.
 
-    motions: one "r" (turns) or "t" (slides) for each coordinate, in the scene's order.
-    axes: of each motion its axis, or which of the axes that the scene gives it takes (0, 1).
-    defaults: the axes of a scene that gives none; empty where it has to give them, or has none.
-    plane: whether a plane scene may have it. order: what its coordinates are, where that is not
-    plain. aliases: what other tools and textbooks call it.
+    motions: "r" (rotation) or "t" (translation) for each coordinate, in the scene's order. axes:
+    the axis of each motion, or the index (0, 1) of the scene's axis that it takes. defaults: axes
+    of a scene that gives none; empty if it must give them. plane: True if plane scenes may have it.
+    order: explains the order of the coordinates. aliases: names in other programs and textbooks.
     """
 
     motions: str
@@ -34,11 +33,11 @@ class Joint:
 
     @property
     def axis_count(self) -> int:
-        """How many axes the scene chooses: 0, 1 or 2."""
+        """Number of axes that the scene chooses: 0, 1 or 2."""
         return max((axis + 1 for axis in self.axes if isinstance(axis, int)), default=0)
 
     def motion_axes(self, scene_axes: Sequence[Axis]) -> tuple[Axis, ...]:
-        """The axis of each motion, `scene_axes` being those of the scene."""
+        """Return the axis of each motion, given the axes of the scene."""
         chosen = scene_axes or self.defaults
         return tuple(chosen[a] if isinstance(a, int) else a for a in self.axes)
 
@@ -69,14 +68,15 @@ JOINTS = {
 
 @dataclass(frozen=True)
 class Closing:
-    """What a joint between two bodies of a tree, which closes a loop, keeps at zero.
+    """Constraints of a joint that closes a loop between two bodies of a tree.
 
-    plane, space: its rows, empty where there is no such joint. x, y, z: from the first body's point
-    to the second's, along the axes of what both hang from; u, v: along two directions across the
-    first axis; ru, rv: the second axis out of the first, about u and v; rx, ry, rz: the second
-    frame out of the first; cross: the cosine between two axes; all others are the whole of it.
-    axes: how many it has in space; in the plane one, where u is a row. defaults: those of a scene
-    that gives none.
+    plane, space: the constraints in the plane and in space, empty if there is no such joint. x, y,
+    z: the vector from the first body's point to the second's, along the axes of their common
+    ancestor. u, v: the same along two directions perpendicular to the first axis. ru, rv: tilt of
+    the second axis from the first, about u and v. rx, ry, rz: rotation of the second frame relative
+    to the first. cross: the cosine between two axes. length, ratio: the only constraint of a
+    distance or gear. axes: number of axes in space; in the plane one, if u is a constraint.
+    defaults: axes of a scene that gives none.
     """
 
     plane: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class Closing:
     aliases: tuple[str, ...] = ()
 
     def rows(self, plane: bool) -> tuple[str, ...]:
-        """Those in the plane or in space."""
+        """Return the constraints in the plane or in space."""
         return self.plane if plane else self.space
 
 
@@ -110,7 +110,7 @@ CLOSINGS = {
     "gear": Closing(("ratio",), ("ratio",), aliases=("gears", "belt", "mimic", "coupling")),
 }
 
-# what a loop between bodies does to the second: names behind its own, in the plane and in space
+# suffixes of a loop's reactions on its second body, in the plane (True) and in space
 REACTIONS = {
     True: ("force_x", "force_y", "moment"),
     False: ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z"),

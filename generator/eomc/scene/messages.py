@@ -1,4 +1,4 @@
-"""What newcomers write in a scene instead of our words, and the remedy that fits it."""
+"""Remedies for common mistakes of newcomers in scenes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from eomc.base import resources
 
-MAX_QUANTITY_LENGTH = 60  # characters of a text that may be a number with its unit
+MAX_QUANTITY_LENGTH = 60  # characters of a number with its unit
 
 # --- tables ---------------------------------------------------------------------------------------
 
@@ -23,7 +23,7 @@ _LOSS = (
 _JOINT = 'a joint stands with the body that it moves, in [[body]]: joint = "revolute"'
 ENERGY = "write [energy] with kinetic and potential, of which it is the difference"
 
-# by the name of a table that scenes do not have
+# remedies by the names of tables that scenes do not have
 TABLES: Mapping[str, str] = {
     **dict.fromkeys(("contact", "contacts"), _CONTACT),
     **dict.fromkeys(("initial", "initial_conditions", "start", "starts", "ic", "state"), _START),
@@ -34,7 +34,7 @@ TABLES: Mapping[str, str] = {
     **dict.fromkeys(("joint", "joints"), _JOINT),
     **dict.fromkeys(("lagrangian", "Lagrangian", "L", "hamiltonian"), ENERGY),
 }
-# arrays of tables that are one table here: what an entry of each looks like
+# tables that newcomers write as arrays of tables, each with an example of an entry
 _ONE_TABLE: Mapping[str, str] = {
     "coordinates": 'x = { unit = "m", start = 0.0 }',
     "parameters": "m = 1.0",
@@ -48,7 +48,7 @@ _OF_FORCES = {"body", "point", "force", "torque", "frame"}
 
 
 def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
-    """Of [[parameter]]: the table that is meant, and its entries; None of anything else."""
+    """Return the intended table for [[parameter]] and the like, with its entries, or None."""
     table = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
     if table is None or not isinstance(entries, list) or not entries:
         return None
@@ -67,7 +67,7 @@ def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
 
 
 def one_table_message(name: str, table: str) -> str:
-    """What to say of [[name]], which is one table."""
+    """Return the message for [[name]] instead of a single table."""
     start = "" if name == table else f"unknown table '{name}': "
     return f"{start}write [{table}] once, and a line such as {_ONE_TABLE[table]} for each entry"
 
@@ -75,7 +75,7 @@ def one_table_message(name: str, table: str) -> str:
 # --- numbers with units ---------------------------------------------------------------------------
 
 _DEGREES = ("deg", "degs", "degree", "degrees", "°", "grad")
-# in SI: whole powers of ten only, so that the number advised has the digits that were written
+# to SI units: powers of ten only, so that the suggested number keeps its digits
 _POWERS = {"mm": -3, "cm": -2, "dm": -1, "km": 3, "g": -3, "gram": -3, "grams": -3, "mg": -6,
            "t": 3, "ms": -3, "us": -6, "µs": -6, "kN": 3, "mN": -3, "kJ": 3, "kPa": 3}  # fmt: skip
 _SI = {"mm": "m", "cm": "m", "dm": "m", "km": "m", "g": "kg", "gram": "kg", "grams": "kg",
@@ -90,9 +90,10 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([^\s\d.+\-−].*?)\s*")
 
 
 def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
-    """What to say of a number with its unit, such as `30 deg` or `1 kg`; None of anything else.
+    """Return the remedy for a number with a unit, such as `30 deg` or `1 kg`, or None.
 
-    declared: names that a letter behind a number may mean: `2 m` is a product where there is an m.
+    `declared` are the names that a letter after a number may stand for: `2 m` is a product if m is
+    declared.
     """
     match = _QUANTITY.fullmatch(text) if len(text) <= MAX_QUANTITY_LENGTH else None
     if match is None or match[2] in declared:
@@ -111,12 +112,12 @@ def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
 
 
 def degrees_formula(number: str) -> str:
-    """Degrees as the formula that gives them, in quotes."""
+    """Return an angle in degrees as a formula in quotes."""
     return f'"{number}*pi/180"'
 
 
 def number_remedy(text: object) -> str:
-    """The number in a text such as "1 ms", in SI, as `: write 0.001`; else the empty string."""
+    """Return the number in a text such as "1 ms", in SI units, as `: write 0.001`; else ""."""
     if not isinstance(text, str) or not (
         match := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
     ):
@@ -133,7 +134,7 @@ def _scaled(number: str, power: int) -> str:
 
 
 def toml_remedy(line: str) -> str | None:
-    """The remedy for a line of TOML with a number and what numbers do not have there."""
+    """Return the remedy for a line of TOML with a number in a form that TOML does not have."""
     line = line[:200]
     if re.search(r"[=,[]\s*−", line):
         return "this dash is not a minus sign: write '-'"
@@ -153,7 +154,7 @@ _VELOCITY = (
 
 
 def intended_velocity(name: str, tables: Mapping[str, str]) -> str:
-    """The velocity that `dot_theta`, `dtheta`, `thetadot` may mean, or the empty string."""
+    """Return the velocity that `dot_theta`, `dtheta` or `thetadot` may stand for, or ""."""
     match = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
     owners = (match[1] for match in match if match)
     return next((f"{owner}_dot" for owner in owners if tables.get(owner) == "coordinates"), "")
@@ -163,7 +164,7 @@ def intended_velocity(name: str, tables: Mapping[str, str]) -> str:
 
 
 def intended_file(path: Path) -> str:
-    """The scene that a path that is none may mean: `cartpole` is scenes/cartpole.toml."""
+    """Return the scene that a missing path may stand for: `cartpole` is scenes/cartpole.toml."""
     name = path.name if path.suffix == ".toml" else f"{path.name}.toml"
     for folder in (path.parent, path.parent / "scenes", Path("scenes")):
         if path.name and (folder / name).is_file():
@@ -172,7 +173,7 @@ def intended_file(path: Path) -> str:
 
 
 def shipped_remedy(path: Path) -> str:
-    """Where the scene of that name comes with eomc: how to have it, else the empty string."""
+    """Return how to get the scene of this name if eomc provides it, else ""."""
     name = path.name.removesuffix(".toml")
     remedy = f"; eomc new --from {name} writes the one that comes with eomc"
     return remedy if name in resources.scenes() else ""

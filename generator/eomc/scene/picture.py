@@ -1,4 +1,4 @@
-"""What a scene's [picture] draws: checked data. No SymPy, no C."""
+"""A scene's [picture] as checked data. Independent of SymPy and C."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eomc.scene.formulas import Formula
 
 @dataclass(frozen=True)
 class Place:
-    """A point: three formulas in m, or where `at` is None the frame of the body or point `name`."""
+    """A point: three formulas in m, or, if `at` is None, the frame of the body or point `name`."""
 
     name: str
     at: Vector | None
@@ -18,11 +18,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Shape:
-    """One thing that is drawn.
+    """One shape of a picture.
 
-    kind: "dot", "path" (of one place), "line" (through places), "spring" (between two), "box",
-    "circle" (about one). size: edges of a box, the radius of a circle, m. rotation: of a box or
-    circle, from the axes of the world, or of the body that it is about.
+    kind: "dot" or "path" (of one place), "line" (through places), "spring" (between two), "box" or
+    "circle" (about one). size: edges of a box or radius of a circle, m. rotation: of a box or
+    circle, from the world's axes or those of its body.
     """
 
     kind: str
@@ -33,7 +33,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn. axes: what the scene calls the axes, two in the plane and three in space."""
+    """The shapes of a picture, and the names of its axes: two in the plane, three in space."""
 
     shapes: tuple[Shape, ...]
     axes: str

@@ -1,4 +1,4 @@
-"""A scene file read and checked: every fault is reported at its place. No SymPy, no C."""
+"""Read and check a scene file; every error is reported at its place. Independent of SymPy and C."""
 
 from __future__ import annotations
 
@@ -46,9 +46,24 @@ _NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
 
 
 def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
-    """Read and check a scene file, with other values in place of those of its parameters.
+    """Read and check a scene file.
 
-    Raises SceneError with every fault, EomcError if unreadable.
+    Parameters
+    ----------
+    file : path
+    parameters : mapping from names to numbers, optional
+        Replace the values of parameters.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    SceneError
+        With all errors in the scene.
+    EomcError
+        If the file can't be read.
     """
     path, shown = Path(file), texts.line(str(file))
     try:
@@ -75,7 +90,7 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
 def parse(
     data: bytes | str, file: str = "scene.toml", parameters: Mapping[str, float] | None = None
 ) -> Scene:
-    """Check the text of a scene, as `read` does. Raises SceneError with every fault."""
+    """Check the text of a scene, as `read` does. Raises SceneError with all errors."""
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     text, tree = toml_text.text_and_tree(data, file)
@@ -84,12 +99,12 @@ def parse(
 
 
 def check_tree(tree: dict[str, Any], name: str) -> Scene:
-    """Check a scene that is given as a tree, as `parse` one of text; its faults have no lines."""
+    """Check a scene given as a tree, as `parse` does a text; errors have no line numbers."""
     return _SceneChecker(tree, SourceMap("", name), {}).scene("")
 
 
 class _SceneChecker(Checker):
-    """Everything that is checked in one scene, faults collected on the way."""
+    """Checks one scene, and collects all errors."""
 
     def __init__(
         self, tree: dict[str, Any], places: SourceMap, parameters: Mapping[str, float]
@@ -104,7 +119,7 @@ class _SceneChecker(Checker):
         self.tables = self._names()
 
     def scene(self, digest: str) -> Scene:
-        """The checked scene. Raises SceneError with every fault."""
+        """Return the checked scene. Raises SceneError with all errors."""
         doc = self.doc
         self.kinds |= {
             **dict.fromkeys((*doc.constants, *doc.parameters), NOTHING),
@@ -159,7 +174,7 @@ class _SceneChecker(Checker):
         )
 
     def _run(self) -> Run:
-        """How it is run; events, and methods "auto", are by adaptive steps."""
+        """Return the settings of a run; events and the method "auto" require adaptive steps."""
         settings = self.doc.run.model_dump()
         single = settings["real"] == "float"
         sticks, auto = settings["friction"] == "stick", "auto" in settings["methods"]
@@ -184,7 +199,7 @@ class _SceneChecker(Checker):
     # document and names
 
     def _document(self, tree: dict[str, Any]) -> schema.Document:
-        """The document; faulty entries are reported, taken out or mended, the rest is checked."""
+        """Return the document; faulty entries are reported, then removed or replaced."""
         for _ in range(100):
             try:
                 return schema.read(tree)
@@ -211,7 +226,7 @@ class _SceneChecker(Checker):
         raise SceneError(self.problems)
 
     def _replace_misspelt_key(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
-        """Take an unknown key for the one that was meant, or out."""
+        """Replace an unknown key by the intended one, or remove it."""
         table = schema.table_at(tree, path[:-1])
         value = table.pop(path[-1])
         intended = schema.intended_key(path)
@@ -222,7 +237,7 @@ class _SceneChecker(Checker):
             self.kinds |= dict.fromkeys(value, frozenset({UNKNOWN}))
 
     def _names(self) -> dict[str, str]:
-        """Every declared name and its table."""
+        """Return the table of every declared name."""
         doc = self.doc
         if why := names.module_fault(doc.name):
             self.report(("name",), why, text=doc.name)
@@ -257,7 +272,7 @@ class _SceneChecker(Checker):
         return tables_by_name
 
     def _output_names(self, tables_by_name: Mapping[str, str]) -> None:
-        """They stand beside t, coordinates, velocities, inputs and energy in tables and plots."""
+        """Report output names that are in use: outputs are columns beside all other quantities."""
         columns = {
             n: f"in [{t}]" for n, t in tables_by_name.items() if t in ("coordinates", "inputs")
         }
@@ -274,9 +289,9 @@ class _SceneChecker(Checker):
     def _unit(
         self, path: tuple[str, ...], unit: str, start: float | str = 0, formula: str = ""
     ) -> None:
-        """Report a unit that suggests a conversion: units are texts, nothing is converted.
+        """Report a unit that suggests a conversion: units are text, nothing is converted.
 
-        formula: of an output, the coordinate or velocity that it consists of.
+        `formula` is the coordinate or velocity that an output consists of.
         """
         plain = unit.strip().lower()
         if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
@@ -295,7 +310,7 @@ class _SceneChecker(Checker):
     # tables
 
     def _quantities(self, table: str, known: dict[str, float]) -> list[Quantity]:
-        """Constants may use constants above them; parameters any constant. Adds to `known`."""
+        """Check constants (over earlier ones) or parameters (over constants); extends `known`."""
         allowed, rule = {
             "constants": (known, "a constant is made of numbers and of constants above it"),
             "parameters": (
@@ -332,7 +347,7 @@ class _SceneChecker(Checker):
                 self.kinds[name] = frozenset({UNKNOWN})
 
     def _find_circular(self, definitions: Mapping[str, Formula]) -> set[str]:
-        """The names that depend on themselves, each ring reported once; beyond MOST, all."""
+        """Return names that depend on themselves; each cycle is reported, up to MOST of them."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
@@ -368,7 +383,7 @@ class _SceneChecker(Checker):
         limits: Sequence[float | str | None],
         known: Mapping[str, float],
     ) -> tuple[Formula | None, ...]:
-        """An input's limits, in their order at the values of the parameters."""
+        """Return an input's checked limits, which must be in order at the parameters' values."""
         rule = "limits are made of numbers, constants and parameters"
         checked = [None if x is None else self.formula(path, x, known, rule) for x in limits]
         values = [self.number(path, f, known) for f in checked if f]
@@ -417,7 +432,7 @@ class _SceneChecker(Checker):
         return out
 
     def _outputs(self, forces: Sequence[str]) -> list[Output]:
-        """Formulas over everything, the accelerations, energies and forces of constraints too."""
+        """Check the outputs, whose formulas may use all quantities of the motion."""
         self.allow_solved_quantities([f"{name}_ddot" for name in self.doc.coordinates], forces)
         out = []
         for name, entry in self.doc.outputs.items():
@@ -437,7 +452,7 @@ class _SceneChecker(Checker):
         return out
 
     def _check_requests(self) -> None:
-        """What [run] asks for of bodies."""
+        """Report settings of [run] that request bodies or points which do not exist."""
         run, doc = self.doc.run, self.doc
         for key in ("frames", "momentum"):
             if getattr(run, key) and not doc.body:

@@ -1,8 +1,8 @@
-"""Repetition: `repeat = "i = 1..n"` and `theta[i]` written out, on the plain tree of a scene.
+"""Expand `repeat = "i = 1..n"` and `theta[i]` in the tree of a scene.
 
-Entries that repeat become entries of their own, and `name[index]` becomes the name with the number
-behind it. The arrays of tables [[body]], [[spring]], ... become tables: of the names of bodies and
-points, else of numbers from 1.
+Repeated entries become separate entries, and `name[index]` becomes the name followed by the number.
+The arrays of tables [[body]], [[spring]], ... become tables, with the names of bodies and points as
+keys, or else numbers from 1.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from eomc.scene.formulas import FormulaError, suggest
 from eomc.scene.scope import Checker, Path, value_of
 from eomc.scene.source_map import ARRAYS
 
-MAX_ENTRIES = 10_000  # that repetition makes
-MAX_TEXT = 5_000_000  # characters of these
+MAX_ENTRIES = 10_000  # produced by repetition
+MAX_TEXT = 5_000_000  # characters produced by repetition
 
 _TABLES = (
     "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
 )  # fmt: skip
-_PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
-_WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
+_PLAIN = ("definitions", "forces")  # tables with formulas as entries
+_WORDS = ("unit", "note", "title", "repeat")  # keys with free text
 # no formulas
 _NAMED = ("body", "point", "loop")  # arrays whose entries have names
 _NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
@@ -42,7 +42,7 @@ _WRITTEN = 'is written repeat = "i = 1..n"'
 
 
 def expand(tree: dict[str, Any], check: Checker) -> bool:
-    """Write out all repetition in `tree`. Reports faults; False where the rest depends on them."""
+    """Expand all repetition in `tree`. Returns False after errors that prevent further checks."""
     return _Expansion(tree, check).run()
 
 
@@ -50,7 +50,7 @@ class _Expansion:
     def __init__(self, tree: dict[str, Any], check: Checker) -> None:
         self.tree = tree
         self.check = check
-        self.constants: dict[str, float] = {}  # those known so far
+        self.constants: dict[str, float] = {}  # values of constants so far
         self.declared: dict[str, str] = {}
         self.entry_count = 0
         self.characters = 0
@@ -110,7 +110,7 @@ class _Expansion:
         return out
 
     def _store_constant(self, name: str, entry: Any) -> None:
-        """Keep a constant's value; what has none is reported later."""
+        """Store a constant's value; if it has none, that is reported later."""
         value = entry.get("value") if isinstance(entry, dict) else entry
         try:
             formula = formulas.parse(value if isinstance(value, str) else repr(value))
@@ -145,7 +145,7 @@ class _Expansion:
         return out
 
     def _repeat_entry(self, path: Path, key: Any, entry: dict[str, Any]) -> list[tuple[str, Any]]:
-        """An entry with `repeat` written out: (name, entry) pairs."""
+        """Expand an entry with `repeat` into (name, entry) pairs."""
         key = key if isinstance(key, str) else ""
         text = entry["repeat"]
         try:
@@ -167,7 +167,7 @@ class _Expansion:
         return out
 
     def _span(self, text: Any) -> tuple[str, int, int]:
-        """The index of a repetition, and its ends. Raises FormulaError."""
+        """Return the index of a repetition, its first and its last value. Raises FormulaError."""
         if not isinstance(text, str):
             raise FormulaError(f'must be text, such as "i = 1..n", here {text!r:.40}')
         match, width = _REPEAT.fullmatch(text), len(text)
@@ -201,12 +201,12 @@ class _Expansion:
         return ""
 
     def _expanded_once(self, path: Path, value: Any, bare: bool = True) -> Any:
-        """A value outside of repetition, its indices written out."""
+        """Return a value outside of repetition with its indices expanded."""
         expanded = self._expanded(path, value, {}, bare)
         return value if expanded is None else expanded
 
     def _expanded(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
-        """The value with its indices written out; None where that fails, which is reported."""
+        """Return the value with its indices expanded; None after an error, which is reported."""
         if isinstance(value, str):
             try:
                 text = self._text(value, index, bare)
@@ -232,7 +232,7 @@ class _Expansion:
         return value
 
     def _text(self, text: str, index: Mapping[str, int], bare: bool) -> str:
-        """A formula or a name; raises FormulaError."""
+        """Return a formula or name with its indices expanded. Raises FormulaError."""
         if len(text) > formulas.MAX_LENGTH or not (index or "[" in text):
             return text  # too long ones are reported later
 
@@ -266,7 +266,7 @@ class _Expansion:
         return out
 
     def _index_value(self, text: str, index: Mapping[str, int]) -> int:
-        """The value of an index or an end: whole numbers, constants, the index, + and -."""
+        """Return the value of an index or bound: integers, constants and the index with + and -."""
         if not _SUM.fullmatch(text):
             raise FormulaError(
                 f"'{text.strip()}' is no index: it is made of whole numbers, constants, + and -"
@@ -305,7 +305,7 @@ class _Expansion:
 
 
 def _array_remedy(array: str, entries: Any) -> str:
-    """What to say of [array], in single brackets."""
+    """Return the message for [array] in single brackets."""
     inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
     named = (
         f' and name = "{next(iter(entries))}"'

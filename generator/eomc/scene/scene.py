@@ -1,4 +1,4 @@
-"""A checked scene: data, with the place of each entry in its file. No SymPy, no C."""
+"""A checked scene as data, with the place of each entry in its file. Independent of SymPy and C."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from eomc.scene.source_map import SourceMap
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A generalized coordinate; its velocity is `<name>_dot`. Start in `unit`, rate in unit/s.
+    """A generalized coordinate, with its initial value in `unit` and velocity in unit/s.
 
-    held, rate_fixed: whether constraints leave them as they are when a start is assembled.
-    friction: Coulomb's, N or N m; friction_width: the rate within which it is smoothed.
+    The velocity is named `<name>_dot`. start_fixed, rate_fixed: True if assembly keeps the initial
+    value or velocity. friction: Coulomb friction, N or N m. friction_width: rate over which it is
+    smoothed.
     """
 
     name: str
@@ -34,7 +35,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A parameter (changed at run time) or a constant (folded into the code)."""
+    """A parameter (variable at run time) or a constant (folded into the code)."""
 
     name: str
     unit: str
@@ -45,9 +46,9 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Input:
-    """A quantity given from outside at every step; `signal` is what it is by default.
+    """An input, given from outside at every step; `signal` is its default as a formula.
 
-    limits: the least and largest value that acts, None where there is none.
+    limits: smallest and largest value that acts, None if unbounded.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A quantity that is asked for: a formula over everything that a motion has."""
+    """An output: a formula of any quantities of the motion."""
 
     name: str
     unit: str
@@ -69,7 +70,10 @@ class Output:
 
 @dataclass(frozen=True)
 class Constraint:
-    """What is zero along every motion: a formula of coordinates and t, or linear in the rates."""
+    """A constraint: a formula that is zero along every motion.
+
+    It depends on coordinates and t, or is linear in the velocities.
+    """
 
     name: str
     unit: str
@@ -79,9 +83,10 @@ class Constraint:
 
 @dataclass(frozen=True)
 class Event:
-    """Where a formula crosses zero: up, down or both ways.
+    """An event, where a formula crosses zero.
 
-    action: "record", "stop" or "jump"; jump: what coordinates and velocities are after it.
+    direction: "rising", "falling" or "both". action: "record", "stop" or "jump". jump: formulas of
+    the coordinates and velocities after a jump.
     """
 
     name: str
@@ -94,15 +99,29 @@ class Event:
 
 @dataclass(frozen=True)
 class Run:
-    """How the scene is run unless the caller says otherwise: step size h and duration in s.
+    """Settings of a run; step size h and duration in s are defaults for callers.
 
-    methods: the steppers wanted, the one that runs use first. real: the C type that everything
-    is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
-    derivatives of the accelerations are, "parameters" for those by parameters too. discretize:
-    whether those of steps are. frames: of which bodies and points poses, velocities, accelerations
-    and Jacobians are, True for all. inverse_dynamics, momentum: whether these are.
-    tolerance: of adaptive steps, None where the scene asks for none. friction: "smooth", or "stick"
-    where that of joints and coordinates holds them exactly.
+    Attributes
+    ----------
+    methods : tuple of str
+        The steppers to generate; the first is the default.
+    real : str
+        C type of all computations.
+    batch : bool
+        Generate functions for many trajectories at once.
+    linearize : bool or "parameters"
+        Generate derivatives of the accelerations, "parameters" also those by the parameters.
+    discretize : bool
+        Generate derivatives of steps.
+    frames : bool or tuple of str
+        Bodies and points whose poses, velocities, accelerations and Jacobians are generated; True
+        for all.
+    inverse_dynamics, momentum : bool
+        Generate these functions.
+    tolerance : float or None
+        Tolerance of adaptive steps; None for fixed steps.
+    friction : str
+        "smooth", or "stick" if Coulomb friction of joints and coordinates holds them exactly.
     """
 
     h: float = 0.001
@@ -120,15 +139,15 @@ class Run:
 
     @property
     def needs_derivatives(self) -> bool:
-        """Whether derivatives of the accelerations are wanted; those of steps are made of them."""
+        """True if derivatives of the accelerations are needed, also for derivatives of steps."""
         return bool(self.linearize) or self.discretize
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A checked scene: nothing in it is undeclared, circular, misspelt or of the wrong kind.
+    """A checked scene: all names are declared, no definition is circular, all kinds are right.
 
-    used: where each name stands.
+    `used` maps each name to the places where it is used.
     """
 
     name: str
@@ -157,15 +176,15 @@ class Scene:
 
     @property
     def constrained(self) -> bool:
-        """Whether there are constraints or loops."""
+        """True if there are constraints or loops."""
         return bool(self.constraints or (self.assembly and self.assembly.loops))
 
     def start(
         self, parameters: Mapping[str, float] | None = None
     ) -> tuple[list[float], list[float]]:
-        """q and q_dot at the start, with the given values in place of the parameters' defaults.
+        """Return the initial q and q_dot, for the given values of parameters.
 
-        Raises EomcError where they have no value, such as 1/l with l = 0.
+        Raises EomcError if one has no value, such as 1/l with l = 0.
         """
         values = {p.name: p.value for p in (*self.parameters, *self.constants)}
         values.update(parameters or {})
@@ -188,6 +207,6 @@ class Scene:
         formula: Formula | None = None,
         severity: str = "error",
     ) -> Problem:
-        """A problem at a key such as `energy.kinetic`, with its line and its formula marked."""
+        """Return a problem at a key such as `energy.kinetic`, with its line and formula marked."""
         text = formula.text if formula else None
         return self.places.problem(tuple(key.split(".")), message, text=text, severity=severity)

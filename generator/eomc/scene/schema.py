@@ -1,4 +1,4 @@
-"""The layout of a scene file: its tables and keys as pydantic models, and their faults in words."""
+"""The layout of a scene file as pydantic models, with remedies for errors in it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from eomc.scene.formulas import nearest
 REALS, FRICTIONS = ("double", "float"), ("smooth", "stick")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 MIN_TOLERANCE, MAX_TOLERANCE = 1e-15, 1e-2
-MIN_FLOAT_TOLERANCE = 5e-7  # a tolerance, of single precision
-DEFAULT_TOLERANCE = {"double": 1e-9, "float": 1e-5}  # the tolerance of a scene that gives none
+MIN_FLOAT_TOLERANCE = 5e-7  # in single precision
+DEFAULT_TOLERANCE = {"double": 1e-9, "float": 1e-5}  # of a scene with events, by its real type
 _NAMES = (*METHODS, "auto")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -49,7 +49,7 @@ class _Coordinate(_Table):
 
 
 class QuantityTable(_Table):
-    """A parameter or constant as it is written."""
+    """A parameter or constant in the file."""
 
     value: _Value
     unit: _Line = ""
@@ -67,7 +67,7 @@ class _Input(_Table):
 
 
 class OutputTable(_Table):
-    """An output or a constraint as it is written."""
+    """An output or constraint in the file."""
 
     formula: _Value
     unit: _Line = ""
@@ -81,7 +81,7 @@ class _Energy(_Table):
 
 
 def _as_tuple(value: object) -> object:
-    """`method = "rk4"` says the same as `method = ["rk4"]`; the first is what runs use."""
+    """Return `method = "rk4"` as a list of one; the first method is the default of runs."""
     if isinstance(value, list) and value:
         return tuple(dict.fromkeys(map(str, value)))
     return (value,)
@@ -111,7 +111,7 @@ class _Run(_Table):
 
 
 def _as_table(key: str, value: object) -> object:
-    """`m = 2.0` says the same as `m = { value = 2.0 }`."""
+    """Return `m = 2.0` as `m = { value = 2.0 }`."""
     return value if isinstance(value, dict) else {key: value}
 
 
@@ -132,7 +132,7 @@ _Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator
 
 
 class BodyTable(_Table):
-    """A [[body]] as it is written; None where a key is not there."""
+    """A [[body]] in the file; missing keys are None."""
 
     name: pydantic.StrictStr
     note: _Note = ""
@@ -154,7 +154,7 @@ class BodyTable(_Table):
 
 
 class PointTable(_Table):
-    """A [[point]] as it is written."""
+    """A [[point]] in the file."""
 
     name: pydantic.StrictStr
     body: pydantic.StrictStr
@@ -164,7 +164,7 @@ class PointTable(_Table):
 
 
 class _Between(_Table):
-    """What a spring and a damper have in common."""
+    """Common keys of springs and dampers."""
 
     coordinate: pydantic.StrictStr | None = None
     bodies: _TwoNames | None = None
@@ -174,20 +174,20 @@ class _Between(_Table):
 
 
 class SpringTable(_Between):
-    """A [[spring]] as it is written."""
+    """A [[spring]] in the file."""
 
     stiffness: _Value
     length: _Value = 0.0
 
 
 class DamperTable(_Between):
-    """A [[damper]] as it is written."""
+    """A [[damper]] in the file."""
 
     damping: _Value
 
 
 class ForceTable(_Table):
-    """A [[force]] as it is written."""
+    """A [[force]] in the file."""
 
     body: pydantic.StrictStr
     point: _Vector | None = None
@@ -198,7 +198,7 @@ class ForceTable(_Table):
 
 
 class LoopTable(_Table):
-    """A [[loop]] as it is written; None where a key is not there."""
+    """A [[loop]] in the file; missing keys are None."""
 
     name: pydantic.StrictStr
     joint: pydantic.StrictStr
@@ -214,7 +214,7 @@ class LoopTable(_Table):
 
 
 class EventTable(_Table):
-    """An [[event]] as it is written; other keys are coordinates and velocities after a jump."""
+    """An [[event]] in the file; other keys are coordinates and velocities after a jump."""
 
     model_config = pydantic.ConfigDict(extra="allow", frozen=True)
 
@@ -233,7 +233,7 @@ _Circles = Annotated[tuple[Any, ...], pydantic.PlainValidator(spelling.circles)]
 
 
 class PictureTable(_Table):
-    """[picture] as it is written."""
+    """The table [picture] in the file."""
 
     points: Annotated[dict[str, Any], pydantic.PlainValidator(spelling.named_points)] = {}
     dots: _Places = ()
@@ -246,7 +246,7 @@ class PictureTable(_Table):
 
 
 class Document(_Table):
-    """A whole scene as it is written."""
+    """A whole scene file."""
 
     eomc: Literal[1]
     name: pydantic.StrictStr
@@ -274,7 +274,7 @@ class Document(_Table):
 
 
 def read(tree: Mapping[str, Any]) -> Document:
-    """The scene as it is written; pydantic.ValidationError says what is laid out otherwise."""
+    """Return the document of a tree. Raises pydantic.ValidationError if its layout is wrong."""
     energy = tree.get("energy", {})
     if tree.get("body") and isinstance(energy, dict):  # bodies have energies of their own
         tree = {**tree, "energy": {"kinetic": 0.0, **energy}}
@@ -307,19 +307,19 @@ _MODELS: Mapping[str, type[_Table]] = {
 
 
 def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
-    """The table at `path`; an empty one where there is none."""
+    """Return the table at `path`; an empty one if there is none."""
     for part in path:
         tree = tree.get(part) if isinstance(tree, dict) else None
     return tree if isinstance(tree, dict) else {}
 
 
 def has_entry(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
-    """Whether the entry at `path` is there."""
+    """True if there is an entry at `path`."""
     return path[-1] in table_at(tree, path[:-1])
 
 
 def error_path(error: Mapping[str, Any]) -> tuple[str, ...]:
-    """pydantic's place without the branch of a union."""
+    """Return the path of a pydantic error, without the branch of a union."""
     path = tuple(map(str, error["loc"]))
     if path[:2] == ("run", "method"):  # whichever of a list
         return path[:2]
@@ -331,13 +331,13 @@ _UNION_ERRORS = ("float_type", "string_type", "finite_number")
 
 
 def _keys(path: tuple[str, ...]) -> list[str]:
-    """The keys that may stand next to the last of `path`."""
+    """Return the keys that are allowed beside the last one of `path`."""
     model = _MODELS[path[0]] if len(path) > 1 else Document
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
 def intended_key(path: tuple[str, ...]) -> str:
-    """The key that the last of `path` may have been meant for, or the empty string."""
+    """Return the key that the last one of `path` may stand for, or ""."""
     known, last = _keys(path), path[-1]
     alias = ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
     alias = alias or ALIASES.get(last, "")
@@ -348,7 +348,7 @@ def intended_key(path: tuple[str, ...]) -> str:
 
 
 def explain(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    """One of pydantic's faults in our words, with the remedy."""
+    """Return the message for a pydantic error, with its remedy."""
     kind, received, last = str(error["type"]), error.get("input"), path[-1]
     here = spelling.short_toml(received)
     if kind == "missing":
@@ -424,11 +424,11 @@ _MISSING: Mapping[tuple[str, ...], str] = {
 }
 
 
-_REQUIRED = ("name", "stiffness", "damping", "when")  # of what stands in an array
+_REQUIRED = ("name", "stiffness", "damping", "when")  # keys of entries of arrays
 
 
 def repair(tree: dict[str, Any], path: tuple[str, ...]) -> None:
-    """Put something harmless in a faulty entry's place, so that the rest can be checked."""
+    """Replace a faulty entry by a harmless one, so that all others can be checked."""
     table, last = table_at(tree, path[:-1]), path[-1]
     value = table.get(last)
     if len(path) == 1 and isinstance(value, list) and all(isinstance(g, dict) for g in value):

@@ -1,4 +1,4 @@
-"""Formulas of a scene compared with the names declared: what each may use, and faults in words."""
+"""Check formulas of a scene against the declared names, and describe errors in words."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from eomc.scene import formulas, messages
 from eomc.scene.formulas import Formula, FormulaError, suggest
 from eomc.scene.source_map import SourceMap
 
-# the kinds of thing a formula can depend on; what depends on something faulty is in doubt
+# kinds of quantities that a formula can depend on; after an error the kind is unknown
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
 ACCELERATION, FORCE = "accelerations", "forces of constraints"
 UNKNOWN = "something faulty"
 
 NOTHING: frozenset[str] = frozenset()
 
-# what outputs can use besides all other names, unless the scene has these for something else
+# names that outputs can use besides all others, unless the scene declares them
 ENERGIES = ("kinetic_energy", "potential_energy", "energy")
 
-MAX_SUGGESTIONS = 20  # faults, the first, for which near names are looked for
+MAX_SUGGESTIONS = 20  # similar names are suggested for the first errors only
 
 Path = tuple[str, ...]
 
 
 def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
-    """The value of a formula and "", or nan and why it has none."""
+    """Return the value of a formula and "", or nan and why it has no value."""
     try:
         value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
         if isinstance(value, (int, float)) and math.isfinite(value):
@@ -48,9 +48,9 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
 
 
 def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
-    """Each ring of names that depend on one another, its first name again at its end.
+    """Yield each cycle of names that depend on one another, its first name repeated at the end.
 
-    graph: what each name depends on; rings are taken out of it.
+    `graph` maps each name to those it depends on; the cycles found are removed from it.
     """
     while True:
         try:
@@ -62,22 +62,22 @@ def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
 
 
 def cycle_text(cycle: list[str]) -> str:
-    """A ring in a line, of a long one its ends."""
+    """Return a cycle as text, shortened in the middle if it is long."""
     return " -> ".join(cycle if len(cycle) <= 20 else [*cycle[:10], "...", *cycle[-9:]])
 
 
 class Checker:
-    """The names of a scene, as they become known, and the faults found so far.
+    """The names of a scene known so far, and the problems found so far.
 
-    tables: every declared name and its table. kinds: what each name that may be used so far
-    depends on. used: where each name stands. centers: the names made by bodies, link_x. mended:
-    places that hold something harmless instead of what is written.
+    tables: table of every declared name. kinds: kinds of quantities that each usable name depends
+    on. used: places where each name is used. centers: names defined by bodies, such as link_x.
+    repaired: places whose faulty entry was replaced by a harmless one.
     """
 
     def __init__(self, places: SourceMap) -> None:
         self.places = places
         self.problems: list[Problem] = []
-        self.faults = 0  # reported, each repetition of one counted
+        self.faults = 0  # number of errors, each repetition counted
         self.reported: set[tuple[Path, str]] = set()
         self.used: dict[str, list[Path]] = defaultdict(list)
         self.repaired: set[Path] = set()
@@ -85,14 +85,14 @@ class Checker:
         self.kinds: dict[str, frozenset[str]] = {}
         self.centers: set[str] = set()
         self.definitions: dict[str, Formula] = {}
-        self.solved = False  # whether formulas may use accelerations
+        self.solved = False  # True if formulas may use accelerations
 
     def allow_solved_quantities(
         self, accelerations: Collection[str], forces: Collection[str]
     ) -> None:
-        """From here on formulas may use accelerations, energies and forces of constraints.
+        """Allow accelerations, energies and constraint forces in all formulas checked from now on.
 
-        They are computed last.
+        These are computed last, for outputs.
         """
         self.solved = True
         moving = frozenset({POSITION, VELOCITY})
@@ -111,7 +111,7 @@ class Checker:
         text: str | None = None,
         severity: str = "error",
     ) -> None:
-        """Note a problem, of repeated entries once; `at` is its place in the formula `text`."""
+        """Record a problem, once for a repeated entry; `at` is its place in the formula `text`."""
         self.faults += severity == "error"
         origin = self.places.origin(path)
         same = (origin, re.sub(r"\d+", "", message))
@@ -120,7 +120,7 @@ class Checker:
             self.problems.append(self.places.problem(path, message, at, text, severity))
 
     def parse(self, path: Path, value: float | str) -> Formula | None:
-        """A formula that has passed the whitelist; None where it has a fault, which is reported."""
+        """Return a formula that passes the whitelist; None after an error, which is reported."""
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
             # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
@@ -143,9 +143,9 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> Formula | None:
-        """Parse a formula and check its names; None where it has a fault, which is reported.
+        """Return a parsed formula with checked names; None after an error, which is reported.
 
-        `rule` says in words which names are `allowed`, where not all are.
+        `allowed` are the names that it may use, all by default, and `rule` describes them in words.
         """
         formula = self.parse(path, value)
         return formula if formula and self.check_names(path, formula, allowed, rule) else None
@@ -157,7 +157,7 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> bool:
-        """Whether the formula uses only names that it may; what it may not is reported."""
+        """Return True if the formula uses only names that it may; errors are reported."""
         before = self.faults
         for node in formula.names():
             self.used[node.id].append(path)
@@ -173,7 +173,7 @@ class Checker:
         return self.faults == before
 
     def _refusal(self, name: str, rule: str) -> str:
-        """Why `name` can't be used."""
+        """Return why `name` can't be used."""
         if rule and (name in self.tables or name in self.kinds):
             return f"'{name}' can't be used here: {rule}"
         if name in self.tables:
@@ -202,13 +202,13 @@ class Checker:
         return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
 
     def _similar_name(self, name: str) -> str:
-        """The known name that differs by underscores only, or the empty string."""
+        """Return a known name that differs from `name` by underscores only, or ""."""
         plain = name.replace("_", "")
         known = self.kinds if self.faults < MAX_SUGGESTIONS else ()
         return next((k for k in known if k.replace("_", "") == plain), "")
 
     def _rate_fault(self, inside: ast.expr) -> str:
-        """Why there is no dot(inside), or the empty string."""
+        """Return why dot(inside) does not exist; "" if it does."""
         kinds = self.kinds_of(inside)
         if INPUT in kinds:
             return "it holds inputs, whose rate nobody knows; add the rate as a further input"
@@ -221,7 +221,7 @@ class Checker:
         return ""
 
     def kinds_of(self, node: ast.AST) -> frozenset[str]:
-        """What the value depends on; dot(e) brings velocities where e moves."""
+        """Return the kinds of quantities in a subtree; dot(e) adds velocities if e moves."""
         if isinstance(node, ast.Name):
             return self.kinds.get(node.id, NOTHING)
         kinds = NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
@@ -233,13 +233,13 @@ class Checker:
         return kinds | {VELOCITY} if dot and POSITION in kinds else kinds
 
     def where(self, formula: Formula, kind: str) -> ast.expr:
-        """The first part of the formula that brings in `kind`."""
+        """Return the first part of the formula that depends on `kind`."""
         parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
         parts_of_kind = [part for part in parts if kind in self.kinds_of(part)]
         return min(parts_of_kind, key=lambda part: part.col_offset, default=formula.tree)
 
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
-        """The formula's value; nan where it has none, which is reported."""
+        """Return the formula's value; nan if it has none, which is reported."""
         if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
             return math.nan  # reported already
         value, fault = value_of(formula, known)
@@ -248,7 +248,7 @@ class Checker:
         return value
 
     def check_smooth(self, path: Path, formula: Formula) -> None:
-        """What is differentiated may not jump, nor anything that it is made of."""
+        """Report jumps in a formula that is differentiated, and in the definitions that it uses."""
         queue = [(path, formula)]
         visited: set[str] = set()
         while queue:

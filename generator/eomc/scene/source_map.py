@@ -1,4 +1,4 @@
-"""Where things stand in a TOML text: lines and columns for error messages."""
+"""Lines and columns of keys in a TOML text, for error messages."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from eomc.base.errors import Problem
 from eomc.scene.formulas import FormulaError
 
 MAX_STATEMENT = 500  # lines
-MAX_PARSED = 4_000_000  # characters given to tomllib, some seconds
-MAX_SEARCHED = 20_000_000  # characters searched for the columns of faults; then lines do
+MAX_PARSED = 4_000_000  # characters given to tomllib, which takes some seconds
+MAX_SEARCHED = (
+    20_000_000  # characters searched for columns of errors; beyond it only lines are given
+)
 
-# tables that may stand many times, in [[two brackets]]
+# arrays of tables, [[name]]
 ARRAYS = ("body", "point", "spring", "damper", "force", "loop", "event")
 
 Path = tuple[str, ...]
 
 
 class SourceMap:
-    """Line numbers of keys, found by giving tomllib one statement at a time."""
+    """Line numbers of keys, found by parsing one TOML statement at a time."""
 
     def __init__(self, text: str, file: str) -> None:
         self.lines = text.split("\n")
         self.file = file
         self._line: dict[Path, tuple[int, int]] = {}
-        self._under: dict[Path, list[Path]] = {}  # the paths that begin with one or two keys
-        self._key: dict[Path, str] = {}  # how the last key is written, where it is otherwise
-        self._text: dict[str, str] = {}  # how a text is written, where it is otherwise
-        self._from: dict[Path, Path] = {}  # what was repeated: the entry it came from
+        self._under: dict[Path, list[Path]] = {}  # paths by their first key and first two keys
+        self._key: dict[Path, str] = {}  # the last key as it is written, if it differs
+        self._text: dict[str, str] = {}  # a text as it is written, if it differs
+        self._from: dict[Path, Path] = {}  # original entry of each copy made by repetition
         self._tried = self._searched = 0
         prefix: Path = ()
         counts = dict.fromkeys(ARRAYS, 0)
@@ -64,9 +66,9 @@ class SourceMap:
                     self._under.setdefault(path[:length], []).append(path)
 
     def _statement_end(self, start: int) -> tuple[int, dict[str, Any]]:
-        """The line after the statement that begins at `start`, and its tree.
+        """Return the line after the statement that begins at `start`, and its tree.
 
-        `start` itself where none is found.
+        Returns `start` itself if no statement is found.
         """
         for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
             statement = "\n".join(self.lines[start:end])
@@ -80,13 +82,13 @@ class SourceMap:
         return start, {}
 
     def rename(self, written: Path, intended: Path) -> None:
-        """Let `intended` and what is under it stand where the misspelt `written` stands."""
+        """Assign the places of the misspelt key `written`, and of all below it, to `intended`."""
         for path in list(self._under.get(written[:2], ())):
             if path[: len(written)] == written:
                 self._place_like(intended + path[len(written) :], path)
 
     def repeat(self, entry: Path, copies: Sequence[Path]) -> None:
-        """Let each of `copies` and what is under it stand where the entry `entry` stands."""
+        """Assign the places of the repeated `entry`, and of all below it, to each of its copies."""
         under = list(self._under.get(entry, ()))
         name_path = (*entry, "name")
         for path in (path for path in copies if path != entry):
@@ -103,15 +105,15 @@ class SourceMap:
         self._key.setdefault(new, self._key.get(written, written[-1]))
 
     def rewrite(self, text: str, written: str) -> None:
-        """Let a text made by repetition be looked for as it is written."""
+        """Record how a text that repetition produced is written in the file."""
         self._text.setdefault(text, written)
 
     def origin(self, path: Path) -> Path:
-        """The entry as it is written that an entry comes from."""
+        """Return the path of an entry as written, before repetition."""
         return self._from.get(path[:2], path[:2]) + path[2:]
 
     def source(self, path: Path) -> str:
-        """The statement in which a key stands."""
+        """Return the statement that contains a key."""
         start, end = self._line.get(path, (0, 0))
         return "\n".join(self.lines[start:end])
 
@@ -123,7 +125,7 @@ class SourceMap:
         text: str | None = None,
         severity: str = "error",
     ) -> Problem:
-        """A problem at a key; the fault `at` of its text is marked where it can be found."""
+        """Return a problem at a key, with the part `at` of its text marked if it can be found."""
         if path[-1:] == ("value",) and path not in self._line:
             path = path[:-1]  # written short, m = 2.0
         key = ".".join(path)
@@ -152,9 +154,9 @@ def _find_fault(
     text: str | None,
     before: str | None = None,
 ) -> tuple[int, int]:
-    """Where in a statement the fault stands, and how wide it is; -1 where it can't be found.
+    """Return the offset of an error in a statement, -1 if it can't be found, and its width.
 
-    before: the text as it was before repetition.
+    `before` is the text as it was before repetition.
     """
     text = (text or "").strip()
     column, width = 0, len(text) or 1
@@ -172,7 +174,7 @@ def _find_fault(
 
 
 def _quoted(text: str, source: str) -> re.Match[str] | None:
-    """The text in quotes; blanks may be line breaks, one for one, so that columns stay."""
+    """Match the text in quotes; a blank may be a line break, so that columns stay the same."""
     body = re.sub(r"\\\s", r"\\s", re.escape(text))
     return re.search(rf"""(["'])\s*({body})\s*\1""", source)
 
@@ -182,7 +184,7 @@ def _escaped(text: str) -> str:
 
 
 def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[Path]:
-    """The keys of a tree as deep as a scene goes: table, name, key; (array, "#1", key)."""
+    """Yield the paths of all keys, three levels deep: (table, name, key) or (array, "#1", key)."""
     for key, value in tree.items():
         yield (key,)
         if isinstance(value, list):
@@ -197,7 +199,7 @@ def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[Path]:
 
 
 def _numbered(path: Path, counts: Mapping[str, int]) -> Path:
-    """A path of a header: [[body]] and [body.x] belong to the last body so far."""
+    """Return a header's path with its entry's number: [body.x] belongs to the last [[body]]."""
     if path[0] not in counts or len(path) < 2 or not counts[path[0]]:
         return path
     keys = path[2:] if path[1].startswith("#") else path[1:]

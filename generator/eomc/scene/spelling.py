@@ -1,4 +1,4 @@
-"""Values of a scene that may be written in several ways; ValueErrors say what is wrong."""
+"""Parsers of values that may be written in several ways; each raises ValueError with a remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def short_toml(value: object) -> str:
-    """A value as TOML writes it, shortened."""
+    """Return a value as TOML, shortened."""
     if isinstance(value, bool):
         text = str(value).lower()
     elif isinstance(value, dict):
@@ -18,7 +18,7 @@ def short_toml(value: object) -> str:
 
 
 def entry(value: object) -> float | str:
-    """A number or a formula."""
+    """Return a number or formula."""
     if isinstance(value, str):
         return value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -32,7 +32,7 @@ def entry(value: object) -> float | str:
 
 
 def vector(value: object) -> tuple[float | str, ...]:
-    """A list of numbers and formulas."""
+    """Return a list of numbers and formulas as a tuple."""
     if not isinstance(value, list) or not value:
         raise ValueError(
             f"must be a list of numbers and formulas, such as [0, 1.5], here {short_toml(value)}"
@@ -41,12 +41,12 @@ def vector(value: object) -> tuple[float | str, ...]:
 
 
 def each(value: object) -> float | str | tuple[float | str, ...]:
-    """One for all, or a list of one each."""
+    """Return one value for all, or a tuple with one value each."""
     return tuple(map(entry, value)) if isinstance(value, list) else entry(value)
 
 
 def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]:
-    """An angle, or a list of turns: an axis and an angle each."""
+    """Return an angle, or a list of turns, each with an axis and an angle."""
     if not isinstance(value, list):
         return entry(value)
     turns = []
@@ -61,7 +61,7 @@ def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]
 
 
 def axes(value: object) -> tuple[tuple[float, ...], ...]:
-    """Axes; one may be written without the outer brackets."""
+    """Return one or more axes; a single one may be written without outer brackets."""
     axes: list[Any] = [value]
     if isinstance(value, list) and value and isinstance(value[0], list):
         axes = value
@@ -80,7 +80,7 @@ def _is_number(value: object) -> bool:
 
 
 def limits(value: object) -> tuple[float | str | None, ...]:
-    """The least and the largest value; None for an infinite one."""
+    """Return the smallest and largest value, None if infinite."""
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(
             "must be the least and the largest value, such as [-1, 1] or [0, inf], "
@@ -91,7 +91,7 @@ def limits(value: object) -> tuple[float | str | None, ...]:
 
 
 def names(value: object) -> tuple[str, ...]:
-    """A name, or a list of names."""
+    """Return a name or a list of names as a tuple."""
     names_ = value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names_):
         raise ValueError(f"must be a name in quotes, or a list of names, here {short_toml(value)}")
@@ -99,7 +99,7 @@ def names(value: object) -> tuple[str, ...]:
 
 
 def two_names(value: object) -> tuple[str, ...]:
-    """Two bodies."""
+    """Return the names of two bodies."""
     names_ = names(value)
     if len(names_) != 2:
         raise ValueError(
@@ -109,7 +109,7 @@ def two_names(value: object) -> tuple[str, ...]:
 
 
 def two_coordinates(value: object) -> tuple[str, ...]:
-    """Two coordinates."""
+    """Return the names of two coordinates."""
     names_ = names(value)
     if len(names_) != 2:
         raise ValueError(
@@ -119,7 +119,7 @@ def two_coordinates(value: object) -> tuple[str, ...]:
 
 
 def points(value: object) -> tuple[tuple[float | str, ...], ...]:
-    """Two points."""
+    """Return two points."""
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(
             f'must be two points, such as [[0, 0], ["l", 0]], here {short_toml(value)}'
@@ -131,14 +131,14 @@ def points(value: object) -> tuple[tuple[float | str, ...], ...]:
 
 
 def linearized(value: object) -> bool | str:
-    """Whether derivatives are wanted, those along the parameters too."""
+    """Return whether derivatives are generated, "parameters" for those by parameters too."""
     if isinstance(value, bool) or value == "parameters":
         return value
     raise ValueError(f'must be true, false or "parameters", here {short_toml(value)}')
 
 
 def frame_selection(value: object) -> bool | tuple[str, ...]:
-    """Whether all frames are wanted, or which."""
+    """Return True for all frames, False for none, or a tuple of names."""
     if isinstance(value, bool):
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
@@ -153,7 +153,7 @@ Place = str | tuple[float | str, ...]  # a name, or a vector
 
 
 def named_points(value: object) -> dict[str, tuple[float | str, ...]]:
-    """A table of vectors."""
+    """Return a table of vectors."""
     if not isinstance(value, dict):
         raise ValueError(
             f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {short_toml(value)}'
@@ -166,14 +166,14 @@ def _place(value: object) -> Place:
 
 
 def places(value: object) -> tuple[Place, ...]:
-    """A list of points, each by its name or as a vector."""
+    """Return a list of points, each a name or a vector."""
     if not isinstance(value, list):
         raise ValueError(f'must be a list of points, such as ["tip"], here {short_toml(value)}')
     return tuple(map(_place, value))
 
 
 def lines(value: object) -> tuple[tuple[Place, ...], ...]:
-    """A list of lines, each through two points or more."""
+    """Return a list of lines, each through two points or more."""
     example = 'a list of lines, such as [["cart", "tip"]]'
     if not isinstance(value, list):
         raise ValueError(f"must be {example}, here {short_toml(value)}")
@@ -186,7 +186,7 @@ def lines(value: object) -> tuple[tuple[Place, ...], ...]:
 
 
 def ends(value: object) -> tuple[tuple[Place, ...], ...]:
-    """A list of pairs of points."""
+    """Return a list of pairs of points."""
     pairs = lines(value)
     for pair in pairs:
         if len(pair) != 2:
@@ -194,16 +194,16 @@ def ends(value: object) -> tuple[tuple[Place, ...], ...]:
     return pairs
 
 
-Solid = tuple[Place, tuple[float | str, ...], object]  # where, how large, how it is rotated
+Solid = tuple[Place, tuple[float | str, ...], object]  # place, size, rotation
 
 
 def boxes(value: object) -> tuple[Solid, ...]:
-    """A list of boxes."""
+    """Return a list of boxes."""
     return _solids(value, "size", '{ at = "cart", size = [0.4, 0.2] }')
 
 
 def circles(value: object) -> tuple[Solid, ...]:
-    """A list of circles."""
+    """Return a list of circles."""
     return _solids(value, "radius", '{ at = "wheel", radius = 0.1 }')
 
 
@@ -224,7 +224,7 @@ def _solids(value: object, size: str, example: str) -> tuple[Solid, ...]:
 
 
 def plane_axes(value: object) -> str:
-    """What a picture in the plane calls its axes."""
+    """Return the names of the axes of a plane picture."""
     if value in ("xy", "xz", "yz"):
         return str(value)
     raise ValueError(

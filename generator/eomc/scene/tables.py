@@ -1,4 +1,4 @@
-"""Tables that scenes do not have, told; what stands in them is put where it is meant."""
+"""Report tables that scenes do not have, and move their entries into the intended tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from eomc.scene.scope import Checker
 
 
 def repair(tree: dict[str, Any], check: Checker) -> None:
-    """Report tables that scenes do not have, once each; take them out, or put them in place."""
+    """Report each table that scenes do not have once, and remove it or move its entries."""
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
         if match := messages.merge_array(name, tree[name]):
             table, entries = match

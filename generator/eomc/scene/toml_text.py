@@ -1,4 +1,4 @@
-"""A scene file's TOML text to a plain tree, within bounds that tomllib lacks."""
+"""Read the TOML text of a scene into a tree, within limits that tomllib does not have."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.scene import messages
 
 MAX_BYTES = 1_000_000
-MAX_KEY_PARTS = 8  # of a key, a.b.c; tomllib takes memory by their square
-MAX_TABLES = 10_000  # headers, [table] or [[body]]: more take seconds to check
+MAX_KEY_PARTS = 8  # a.b.c has three; tomllib's memory grows with their square
+MAX_TABLES = 10_000  # headers such as [table] or [[body]]; more take seconds to check
 
 _HEADER = re.compile(r"^[ \t]*\[[^\],\n]*\]\]?[ \t]*(?:#.*)?$", re.MULTILINE)
 
@@ -24,7 +24,7 @@ _PARTS = re.compile(rf"\s*[\w-]+(?:\s*\.\s*[\w-]+){{{MAX_KEY_PARTS},}}\s*", re.A
 
 
 def loads(text: str) -> dict[str, Any]:
-    """The tree of a text. Raises ValueError where there is none, or it is nested beyond bounds."""
+    """Return the tree of a text. Raises ValueError if it is not TOML or exceeds the limits."""
     if long_key(text):
         raise ValueError("a key has too many parts")
     try:
@@ -34,7 +34,7 @@ def loads(text: str) -> dict[str, Any]:
 
 
 def long_key(text: str) -> int:
-    """The line, from 1, in which a key has more than MOST_PARTS parts; 0 where none has."""
+    """Return the line, from 1, of a key with more than MAX_KEY_PARTS parts; 0 if there is none."""
     for number, line in enumerate(text.split("\n"), start=1):
         if line.count(".") >= MAX_KEY_PARTS:
             pieces = re.split(r"[\[\]{},=#]", _TEXTS.sub("x", line))
@@ -44,7 +44,7 @@ def long_key(text: str) -> int:
 
 
 def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
-    """A scene file's tree and the digest of its bytes, unchecked. Raises OSError and ValueError."""
+    """Return the unchecked tree and digest of a scene file. Raises OSError and ValueError."""
     with path.open("rb") as stream:
         data = stream.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
@@ -53,7 +53,7 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def events_to_toml(definitions: Any, what: str) -> str:
-    """Tables of events, by name a formula or a dict of the keys of [[event]], as TOML."""
+    """Return events as TOML, given formulas or dicts of keys of [[event]] by name."""
     if not isinstance(definitions, Mapping):
         raise EomcError(
             f'{what}: give a dict, such as {{"section": "theta"}}, here {definitions!r}'
@@ -73,7 +73,7 @@ def events_to_toml(definitions: Any, what: str) -> str:
 
 
 def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
-    """A scene's text and its tree. Raises SceneError with the fault at its place."""
+    """Return a scene's text and tree. Raises SceneError with the place of the error."""
     if len(data) > MAX_BYTES:
         shown = texts.line(file)
         raise EomcError(f"{shown}: it has more than the {MAX_BYTES} bytes a scene may have")
@@ -127,7 +127,7 @@ def _encoding_problem(data: bytes, offset: int, file: str) -> Problem:
 
 
 def _has_huge(tree: dict[str, Any]) -> bool:
-    """Whether there is a whole number beyond all doubles; Python may not even print one."""
+    """True if the tree contains an integer too large for a double."""
     pending: list[Any] = [tree]
     while pending:
         value = pending.pop()
@@ -149,7 +149,7 @@ def _huge_problem(text: str, file: str) -> Problem:
 
 
 def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
-    """tomllib's message, its place, and what is mostly meant by it."""
+    """Return tomllib's message with its place and the likely remedy."""
     if not isinstance(fault, tomllib.TOMLDecodeError):  # an int beyond Python's 4,300 digits
         return _huge_problem(text, file)
     lines = text.split("\n")

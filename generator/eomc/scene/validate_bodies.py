@@ -1,4 +1,4 @@
-"""Bodies, joints, springs and dampers of a scene: layout tables to a checked Assembly. No SymPy."""
+"""Checks of bodies and what acts on them: from tables to an Assembly. Independent of SymPy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JOINT_KEYS = (
 
 
 def center_names(doc: Document) -> set[str]:
-    """The names that bodies on joints give to the position of their centres of mass, and points."""
+    """Return the names of the positions of points, and of centres of mass of jointed bodies."""
     letters = "xy" if doc.gravity and len(doc.gravity) == 2 else "xyz"
     named = [body.name for body in doc.body.values() if body.position is None]
     named += [point.name for point in doc.point.values()]
@@ -32,10 +32,10 @@ def center_names(doc: Document) -> set[str]:
 
 
 def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
-    """The bodies of a scene and what acts between them; None where there is nothing of it.
+    """Return the bodies of a scene and what acts on them; None if the scene has no such tables.
 
-    known: the values of constants and parameters. Faults are reported to `check`; with faults the
-    assembly is not to be used.
+    `known` maps constants and parameters to values. Errors are reported to `check`; after an error
+    the assembly must not be used.
     """
     if not (doc.body or doc.point or doc.spring or doc.damper or doc.force or doc.loop):
         if doc.gravity is not None:
@@ -132,7 +132,7 @@ class _Bodies(JointChecks):
     # --- bodies -----------------------------------------------------------------------------------
 
     def _check_placed_body(self, path: Path, entry: BodyTable) -> None:
-        """A body placed by formulas."""
+        """Check a body placed by formulas."""
         if entry.joint is not None:
             self.check.report(
                 (*path, "position"),
@@ -165,7 +165,7 @@ class _Bodies(JointChecks):
         return f"point '{name}'" if point else f"the centre of mass of body '{name}'"
 
     def _check_point(self, path: Path, entry: PointTable) -> None:
-        """A frame on a body, which is one without mass on a fixed joint."""
+        """Check a [[point]], which is a massless body on a fixed joint."""
         place = self._vector((*path, "place"), entry.place)
         rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
         parent = self._parent((*path, "body"), entry.name, entry.body)
@@ -185,7 +185,7 @@ class _Bodies(JointChecks):
             )
 
     def _check_jointed_body(self, path: Path, entry: BodyTable) -> None:
-        """A body held by a joint."""
+        """Check a body on a joint."""
         check = self.check
         joint = self._joint(path, entry)
         parent = self._parent((*path, "parent"), entry.name, entry.parent)
@@ -226,7 +226,7 @@ class _Bodies(JointChecks):
         )
 
     def _check_shared_coordinates(self) -> None:
-        """Joints that move by one coordinate while another moves none: a slip."""
+        """Report joints that share a coordinate while another one is unused: likely a slip."""
         taken = {*self.first_body, *self.check.used}
         idle = [c for c in self.doc.coordinates if not {c, f"{c}_dot"} & taken]
         for body in self.bodies.values() if idle else ():
@@ -243,7 +243,7 @@ class _Bodies(JointChecks):
     # --- the tree ---------------------------------------------------------------------------------
 
     def _sorted_bodies(self) -> list[Body]:
-        """Parents before children, else as written; rings of parents are reported."""
+        """Return the bodies, parents before children, else in their order; cycles are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
         for ring in islice(find_cycles(graph), MOST):
             place = self.names[ring[0]]
@@ -268,9 +268,10 @@ class _Bodies(JointChecks):
         return out
 
     def _check_inertia(self, ordered: Iterable[Body]) -> None:
-        """Every joint that moves needs something to move, unless energies are given besides.
+        """Report joints that move nothing with inertia.
 
-        What rows hold may have no inertia, such as a massless rod that closes a loop.
+        Nothing is reported if energies are given as well or if there are constraints, where bodies
+        such as a rod that closes a loop may be massless.
         """
         ordered = list(ordered)
         rows = self.doc.loop or self.doc.constraints

@@ -1,4 +1,4 @@
-"""Constraints as they are written: names, and formulas that are zero along every motion."""
+"""Checks of [constraints]: names, and formulas that are zero along every motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
 def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
-    """The rows of [constraints]; faults are reported."""
+    """Yield the checked constraints of a document; errors are reported to `check`."""
     for name, entry in doc.constraints.items():
         if why := row_name_fault(check, doc, name):
             end = "" if names.fault(name) else ": give the constraint a name of its own"
@@ -26,7 +26,7 @@ def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
             check.report(path, why, text=entry.formula)
             continue
         formula = check.formula(path, entry.formula)
-        if formula is None or path in check.repaired:  # which is reported
+        if formula is None or path in check.repaired:  # reported already
             continue
         if INPUT in check.kinds_of(formula.tree):
             check.report(
@@ -41,7 +41,7 @@ def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
 
 
 def _equation_remedy(text: str) -> str:
-    """What to write in place of an equation, or the empty string."""
+    """Return what to write in place of an equation; "" if the text is not an equation."""
     sides = [side.strip() for side in text.replace("==", "=").split("=")]
     if len(sides) != 2 or not all(sides):
         return ""
@@ -53,7 +53,7 @@ def _equation_remedy(text: str) -> str:
 
 
 def row_name_fault(check: Checker, doc: Document, name: str) -> str:
-    """Why a row can't have a name; the empty string where it can."""
+    """Return why a constraint equation can't have this name; "" if it can."""
     taken = {n: f"stands in [{table}]" for n, table in check.tables.items()}
     taken |= dict.fromkeys(doc.outputs, "stands in [outputs]")
     taken |= {f"{c}_dot": f"is the velocity of '{c}'" for c in doc.coordinates}
@@ -66,7 +66,7 @@ def row_name_fault(check: Checker, doc: Document, name: str) -> str:
 
 
 def force_names(doc: Document, assembly: Assembly | None) -> list[str]:
-    """What outputs call multipliers and the entries of reactions."""
+    """Return the names by which outputs refer to multipliers and reactions."""
     plane, loops = (assembly.plane, assembly.loops) if assembly else (True, ())
     rows = [*doc.constraints, *(row for loop in loops for row in loop.rows(plane).values())]
     if doc.run.friction == "stick":
@@ -86,9 +86,9 @@ def _coordinates_of(body: BodyTable) -> tuple[str, ...]:
 def reports_unknown_multiplier(
     check: Checker, doc: Document, path: Path, text: float | str, known: Sequence[str]
 ) -> bool:
-    """Whether an output names a multiplier or reaction by another name than those `known`.
+    """Report an output that names a multiplier or reaction by a name not in `known`.
 
-    That is reported.
+    Returns True if there was one.
     """
     rows = {name.removeprefix("lambda_") for name in known}
     rows |= {entry.name for entry in doc.loop.values()}
@@ -108,7 +108,7 @@ def reports_unknown_multiplier(
 
 
 def check_guesses(check: Checker, doc: Document) -> None:
-    """A warning of each `guess` where nothing is assembled."""
+    """Warn of each `guess` in a scene without constraints, where it has no effect."""
     if not (doc.constraints or doc.loop):
         for name, entry in doc.coordinates.items():
             if entry.guess:

@@ -1,4 +1,4 @@
-"""Coordinates as they are written: where they start, what rubs along them."""
+"""Checks of [coordinates]: initial values and friction."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from eomc.scene.scene import Coordinate
 from eomc.scene.schema import Document
 from eomc.scene.scope import Checker
 
-SUSPICIOUS_ANGLE = 7.0  # rad: more than one, as a bare number
+SUSPICIOUS_ANGLE = 7.0  # rad, more than one turn
 FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 
 def check_coordinates(
     check: Checker, doc: Document, known: Mapping[str, float]
 ) -> Iterator[Coordinate]:
-    """The coordinates of a document; faults are reported. known: values of parameters."""
+    """Yield the checked coordinates of a document; `known` maps parameters to values."""
 
     def formula(name: str, key: str, value: float | str) -> tuple[Formula | None, float]:
         path = ("coordinates", name, key)
@@ -50,7 +50,7 @@ def check_coordinates(
 
 
 def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
-    """Warn of an angle of a turn and more, written as a number: degrees may be meant."""
+    """Warn of an angle of more than a turn given as a number, since degrees may be meant."""
     if SUSPICIOUS_ANGLE <= abs(angle) < math.inf:
         message = (
             f"{angle:.6g} rad are {abs(angle) / math.tau:.3g} turns; for degrees write "
@@ -62,7 +62,7 @@ def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
 def check_width(
     check: Checker, path: tuple[str, ...], value: float, width: Formula | None, friction: object
 ) -> None:
-    """Report the width of a friction that is none, or has none."""
+    """Report a width of friction that is not positive, or that has no friction."""
     path = (*path, "friction_width")
     if value <= 0:
         check.report(

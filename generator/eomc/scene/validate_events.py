@@ -1,4 +1,4 @@
-"""Events as they are written: names, formulas, what a jump changes."""
+"""Checks of [[event]]: names, formulas and assignments of a jump."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONSTANT_REMEDY = ", and does not change in a run: make it a parameter"
 
 
 def check_events(check: Checker, doc: Document) -> Iterator[Event]:
-    """The events of a document; faults are reported."""
+    """Yield the checked events of a document; errors are reported to `check`."""
     names_so_far: set[str] = set()
     for k, entry in doc.event.items():
         if why := names.fault(entry.name):
@@ -27,7 +27,7 @@ def check_events(check: Checker, doc: Document) -> Iterator[Event]:
             check.report(("event", k, "name"), why, text=entry.name)
         names_so_far.add(entry.name)
         path = ("event", k, "when")
-        if path in check.repaired:  # which is reported
+        if path in check.repaired:  # reported already
             continue
         if isinstance(entry.when, str) and (match := COMPARISON.fullmatch(entry.when)):
             less = match[2] if re.fullmatch(r"[\w.]+", match[2]) else f"({match[2]})"
@@ -48,7 +48,7 @@ def check_events(check: Checker, doc: Document) -> Iterator[Event]:
 def _jump(
     check: Checker, doc: Document, k: str, entry: EventTable
 ) -> Iterator[tuple[str, Formula]]:
-    """What coordinates, velocities and parameters are after a jump."""
+    """Yield (name, formula) for each coordinate, velocity or parameter that a jump sets."""
     state = [name for c in doc.coordinates for name in (c, f"{c}_dot")]
     state += doc.parameters
     assignments = entry.model_extra or {}

@@ -1,4 +1,4 @@
-"""Joints of a scene's bodies: kind, parent, coordinates, axes and what there is one of for each."""
+"""Checks of the joints of bodies: kind, parent, coordinates, axes and values per coordinate."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from eomc.scene.validate_values import ZERO
 
 
 class JointChecks(LoopChecks):
-    """Checks what holds and moves bodies."""
+    """Checks how bodies are attached and moved."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         super().__init__(check, doc, known)
-        self.first_body: dict[str, str] = {}  # each coordinate: the first body that it moves
+        self.first_body: dict[str, str] = {}  # first body that each coordinate moves
 
     def _entry(self, name: str) -> BodyTable | PointTable:
         array, label = self.names[name]
@@ -27,7 +27,7 @@ class JointChecks(LoopChecks):
         return entries[label]
 
     def _joint(self, path: Path, entry: BodyTable) -> str:
-        """The kind of joint, or the empty string where it is not known."""
+        """Return the kind of joint; "" if it is unknown, which is reported."""
         check, joint = self.check, entry.joint
         known = [k for k, kind in JOINTS.items() if kind.plane or self.dimension != 2]
         if joint is None:
@@ -55,7 +55,7 @@ class JointChecks(LoopChecks):
         return joint
 
     def _parent(self, path: Path, name: str, parent: str | None) -> str | None:
-        """The body that carries `name`; None where it can't be one."""
+        """Return the parent of body `name`; None if it can't be a parent, which is reported."""
         if parent is None or parent == WORLD:
             return WORLD
         if parent not in self.names:
@@ -97,7 +97,7 @@ class JointChecks(LoopChecks):
         return sound if len(sound) == len(checked) else None
 
     def _coordinate(self, path: Path, text: str) -> Formula | None:
-        """A coordinate, or a formula of coordinates; None where it has a fault."""
+        """Return a checked coordinate or formula of coordinates; None after an error."""
         check, coordinates = self.check, self.doc.coordinates
         if text.isidentifier() and text not in coordinates:
             table = check.tables.get(text)
@@ -123,14 +123,14 @@ class JointChecks(LoopChecks):
         return formula
 
     def _coordinates_in(self, formulas_: Iterable[Formula]) -> dict[str, None]:
-        """The coordinates in formulas."""
+        """Return the coordinates that occur in formulas."""
         names_used = (node.id for formula in formulas_ for node in formula.names())
         return dict.fromkeys(name for name in names_used if name in self.doc.coordinates)
 
     def _axes(
         self, path: Path, joint: str, entry: BodyTable
     ) -> tuple[tuple[float, float, float], ...]:
-        """Unit axes; the joint's own where none are written."""
+        """Return the checked unit axes; the joint's defaults if none are given."""
         check, axis_count = self.check, JOINTS[joint].axis_count
         if path in check.repaired or self.dimension is None:
             return ()
@@ -161,7 +161,7 @@ class JointChecks(LoopChecks):
         return tuple(axes)
 
     def _per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
-        """One formula for each coordinate of the joint."""
+        """Return one checked formula for each coordinate of the joint."""
         count, key = len(JOINTS[joint].motions), path[-1]
         if written is None:
             return ()

@@ -1,4 +1,4 @@
-"""Joints that close loops, as they are written: bodies, points, axes, names of rows."""
+"""Checks of [[loop]]: bodies, points, axes and names of constraint equations."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class LoopChecks(SpringChecks):
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         super().__init__(check, doc, known)
-        self.rows = {*doc.constraints}  # of constraints so far
+        self.rows = {*doc.constraints}  # names of constraint equations so far
 
     def _loop(self, path: Path, entry: LoopTable) -> Loop | None:
-        """What closes a loop; None where its joint is not known, which is reported."""
+        """Return the checked loop; None if its joint is unknown, which is reported."""
         kind = self._closing(path, entry)
         if not kind or self.dimension is None:
             return None
@@ -50,7 +50,7 @@ class LoopChecks(SpringChecks):
         return loop
 
     def _closing(self, path: Path, entry: LoopTable) -> str:
-        """The kind of joint, or the empty string where there is none such."""
+        """Return the kind of joint; "" if there is no such kind, which is reported."""
         if (*path, "joint") in self.check.repaired:
             return ""
         known = [k for k, kind in CLOSINGS.items() if kind.plane or self.dimension != 2]
@@ -72,7 +72,7 @@ class LoopChecks(SpringChecks):
         return ""
 
     def _bodies_of_loop(self, path: Path, entry: LoopTable) -> tuple[str, ...]:
-        """The two bodies."""
+        """Return the two bodies."""
         check = self.check
         if entry.bodies is None:
             if (*path, "bodies") not in check.repaired:
@@ -82,7 +82,7 @@ class LoopChecks(SpringChecks):
         return self._two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
 
     def _ends(self, path: Path, entry: LoopTable) -> tuple[Vector, ...]:
-        """Where the joint is in the frame of each; of a [[point]] it is that point."""
+        """Return the position of the joint in the frame of each body; the origin of a [[point]]."""
         if entry.points is not None:
             one, other = (self._vector((*path, "points"), point) for point in entry.points)
             return one, other
@@ -102,7 +102,7 @@ class LoopChecks(SpringChecks):
     def _axes_of_loop(
         self, path: Path, kind: str, entry: LoopTable
     ) -> tuple[tuple[float, float, float], ...]:
-        """The axis in the frame of each body."""
+        """Return the axis in the frame of each body."""
         check, joint, written = self.check, CLOSINGS[kind], entry.axis
         across = "u" in joint.rows(self.dimension == 2)
         axis_count = joint.axes if self.dimension == 3 or across else 0
@@ -126,7 +126,7 @@ class LoopChecks(SpringChecks):
         axes = [unit for axis in written if (unit := self._unit(path, axis))]
         if len(axes) < len(written):
             return ()
-        single = not joint.defaults  # the first body's alone
+        single = not joint.defaults  # one axis, in the first body's frame
         if len(axes) > 2 or len(axes) < joint.axes or (single and len(axes) > 1):
             what = "one axis, of the first body" if single else _AXES_IN_WORDS[joint.axes]
             check.report(path, f"a {kind} joint has {what}, here {len(axes)}")
@@ -134,7 +134,7 @@ class LoopChecks(SpringChecks):
         return (axes[0], axes[-1])
 
     def _distance(self, path: Path, kind: str, entry: LoopTable) -> Any:
-        """The length of a distance, and of nothing else."""
+        """Return the length of a joint of kind "distance", else None."""
         if kind != "distance" or path in self.check.repaired:
             return None
         if entry.length is None:
@@ -148,7 +148,7 @@ class LoopChecks(SpringChecks):
         return length
 
     def _gear(self, path: Path, entry: LoopTable) -> dict[str, Any]:
-        """The coordinates of a gear, its ratio and offset."""
+        """Return the coordinates, ratio and offset of a gear."""
         check, coordinates = self.check, entry.coordinates or ()
         if not coordinates and (*path, "coordinates") not in check.repaired:
             what = 'missing: name the two that it couples, coordinates = ["phi", "psi"]'
@@ -176,7 +176,7 @@ class LoopChecks(SpringChecks):
         return {"coordinates": coordinates, "ratio": ratio, "offset": offset}
 
     def _report_foreign_keys(self, path: Path, kind: str, entry: LoopTable) -> None:
-        """Report keys of other kinds of joints."""
+        """Report keys that belong to other kinds of joints."""
         turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.dimension == 2))
         of_bodies = kind != "gear"
         belongs = {
@@ -192,7 +192,7 @@ class LoopChecks(SpringChecks):
                 self.check.report((*path, key), f"a {kind} joint has no '{key}': {remedy}")
 
     def _check_row_names(self, path: Path, loop: Loop) -> None:
-        """Each row has a name of its own, and so has the loop."""
+        """Report a name of the loop or of its constraint equations that is in use already."""
         check, path = self.check, (*path, "name")
         if path in check.repaired:
             return

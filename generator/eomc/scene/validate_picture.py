@@ -1,4 +1,4 @@
-"""The table [picture] of a scene: layout to a checked Picture. No SymPy."""
+"""Checks of [picture]. Independent of SymPy."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", 
 
 
 def check_picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
-    """What the scene wants drawn; None where it says nothing. Faults are reported to `check`.
+    """Return the checked picture; None if the scene has none. Errors are reported to `check`.
 
-    known: the values of constants and parameters.
+    `known` maps constants and parameters to values.
     """
     return _Picture(check, doc, known).checked() if doc.picture else None
 
@@ -31,7 +31,9 @@ class _Picture:
         self.check, self.known, self.table = check, known, doc.picture
         self.bodies = [e.name for table in (doc.body, doc.point) for e in table.values()]
         dimension = len(doc.gravity) if doc.body and doc.gravity else 0
-        self.dimension = dimension if dimension in (2, 3) else 0  # 0: the first vector says
+        self.dimension = (
+            dimension if dimension in (2, 3) else 0
+        )  # 0: not known before the first vector
         self.points: dict[str, Vector] = {}
 
     def checked(self) -> Picture:
@@ -102,7 +104,7 @@ class _Picture:
         return x, y, z
 
     def _formula(self, path: Path, value: float | str) -> Formula:
-        """A formula of everything but inputs and velocities."""
+        """Return a checked formula, which may use all names except inputs and velocities."""
         check = self.check
         formula = check.formula(path, value)
         if formula is None:
@@ -115,7 +117,7 @@ class _Picture:
         return formula
 
     def _size(self, path: Path, value: float | str) -> Formula:
-        """A length of parameters, which is not negative."""
+        """Return a checked length, a formula of parameters that is not negative."""
         rule = "a size is made of numbers, constants and parameters"
         formula = self.check.formula(path, value, self.known, rule)
         if self.check.number(path, formula, self.known) < 0:

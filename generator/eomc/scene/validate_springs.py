@@ -1,4 +1,4 @@
-"""Springs, dampers and forces of a scene: what each acts on, checked."""
+"""Checks of [[spring]], [[damper]] and [[force]]."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SpringChecks(ValueChecks):
         )
 
     def _force(self, path: Path, entry: ForceTable) -> Force:
-        """A force, a torque or both; formulas of all names."""
+        """Return the checked force, torque or both; their formulas may use all names."""
         check = self.check
         if entry.body not in self.names:
             remedy = suggest(entry.body, self.names) or ": declare it as a [[body]]"
@@ -60,14 +60,14 @@ class SpringChecks(ValueChecks):
     def _world_vector(
         self, path: Path, entries: tuple[float | str, ...] | None, wide: int | None = None
     ) -> Vector:
-        """Three formulas of all names."""
+        """Return three checked formulas, which may use all names."""
         if entries is None or not (wide == len(entries) or self._fits(path, len(entries))):
             return ORIGIN
         x, y, *third = (self.check.formula(path, entry) or ZERO for entry in entries)
         return x, y, third[0] if third else ZERO
 
     def _two_bodies(self, path: Path, bodies: tuple[str, ...], kind: str) -> tuple[str, str]:
-        """Two bodies, the world among them, that are not the same."""
+        """Check that two bodies, one of which may be the world, exist and differ."""
         for name in bodies:
             if name != WORLD and name not in self.names:
                 remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
@@ -78,7 +78,7 @@ class SpringChecks(ValueChecks):
         return first, second
 
     def _between(self, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
-        """What a spring or damper acts on."""
+        """Return where a spring or damper acts, as arguments of `assembly.Between`."""
         check, kind = self.check, path[0]
         if (entry.coordinate is None) == (entry.bodies is None):
             if not {(*path, "coordinate"), (*path, "bodies")} & check.repaired:

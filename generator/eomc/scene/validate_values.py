@@ -1,4 +1,4 @@
-"""Values in the tables of bodies, springs and dampers: formulas, vectors, turns and masses."""
+"""Checks of values in the tables of bodies: formulas, vectors, rotations and inertias."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from eomc.scene.formulas import Formula
 from eomc.scene.schema import BodyTable, Document
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
 
-MOMENT_TOLERANCE = 1e-6  # relative, of principal moments: files have them with six digits and more
+MOMENT_TOLERANCE = 1e-6  # relative: files give moments of inertia to six digits and more
 
 ZERO = formulas.parse("0")
 ORIGIN: Vector = (ZERO, ZERO, ZERO)
 
 
 class ValueChecks:
-    """Checks what is written for a vector, a rotation or a mass; faults go to `check`."""
+    """Checks vectors, rotations, masses and inertias; errors are reported to `check`."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         self.check = check
         self.doc = doc
         self.known = known
-        self.names: dict[str, Path] = {}  # of each body and point, and where it stands
-        # entries of a vector; None where gravity doesn't say whether the scene is plane
+        self.names: dict[str, Path] = {}  # place of each body and point
+        # 2 or 3 components of a vector; None if gravity is missing or faulty
         self.dimension: int | None = 2
-        self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text
+        self.values: dict[float | str, tuple[Formula, float]] = {}  # valid formulas by their text
         self.has_inertia: dict[str, bool] = {}
 
     def _value(self, path: Path, value: float | str) -> tuple[Formula, float]:
-        """A formula of parameters and its value at their defaults; 0 and nan where it is faulty."""
+        """Return a checked formula of parameters and its default value; (0, nan) after an error."""
         if value not in self.values:
             rule = f"'{path[-1]}' is made of numbers, constants and parameters"
             formula = self.check.formula(path, value, self.known, rule)
@@ -49,7 +49,7 @@ class ValueChecks:
         return self._value(path, value)[0]
 
     def _position_formula(self, path: Path, value: float | str) -> Formula:
-        """A formula of everything but inputs and velocities, without dot."""
+        """Return a checked formula of all names except inputs and velocities, without dot."""
         check = self.check
         formula = check.formula(path, value)
         if formula is None:
@@ -99,7 +99,7 @@ class ValueChecks:
         return False
 
     def _unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
-        """An axis of length one; None where it has a fault."""
+        """Return the axis normalised to length one; None after an error."""
         if not self._fits(path, len(axis)):
             return None
         size = math.hypot(*axis)
@@ -127,7 +127,7 @@ class ValueChecks:
         return tuple(Turn(axis, formula(path, angle)) for axis, angle in rotation)
 
     def _mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
-        """Mass and inertia."""
+        """Return the checked mass and inertia."""
         mass, value = self._value((*path, "mass"), entry.mass)
         if value < 0:
             self.check.report(
@@ -168,7 +168,10 @@ class ValueChecks:
         return (*moments, ZERO, ZERO, ZERO)[:6], numbers
 
     def _moments(self, path: Path, inertia: Sequence[float]) -> None:
-        """What no body can have: a negative principal moment, one above the sum of the others."""
+        """Report principal moments that no body can have.
+
+        They are impossible if one is negative, or larger than the sum of the two others.
+        """
         if not all(abs(x) < 1e150 for x in inertia):
             return
         tensor = mp.matrix(spatial.tensor(inertia))  # NumPy takes 0.1 s to load
