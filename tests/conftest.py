@@ -33,8 +33,8 @@ from eomc.verify.sampling import Sampler
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
     from eomc.toolchain.compiler import Compiler
-    from eomc.verify.oracle import Answer, Vector
-    from eomc.verify.sampling import Effort
+    from eomc.verify.reference import Reference, Vector
+    from eomc.verify.sampling import SampleBudget
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -76,7 +76,7 @@ def _binding_flags() -> tuple[str, ...]:
 
 
 extension.binding_flags = _binding_flags
-_run, _build, _try = extension.run, extension.build, extension.try_out
+_run, _build, _try = extension.run, extension.build, extension.try_load
 _libraries: dict[str, bytes] = {}
 
 
@@ -115,13 +115,13 @@ def _trial(*what: Any) -> None:
         _try(*what)
 
 
-extension.build, extension.run, extension.try_out = _build_once, _link, _trial
+extension.build, extension.run, extension.try_load = _build_once, _link, _trial
 
-_ahead = Sampler._ahead
-_seen: dict[tuple[int, Effort], tuple[Answer, Vector]] = {}
+_ahead = Sampler._predicted_ranges
+_seen: dict[tuple[int, SampleBudget], tuple[Reference, Vector]] = {}
 
 
-def _ahead_once(sampler: Sampler, effort: Effort) -> Vector:
+def _ahead_once(sampler: Sampler, effort: SampleBudget) -> Vector:
     """How far a reference gets by itself; it takes most of the time of drawing a few states."""
     key = (id(sampler.reference), effort)
     if key not in _seen:
@@ -129,7 +129,7 @@ def _ahead_once(sampler: Sampler, effort: Effort) -> Vector:
     return _seen[key][1]
 
 
-Sampler._ahead = _ahead_once  # type: ignore[method-assign]
+Sampler._predicted_ranges = _ahead_once  # type: ignore[method-assign]
 
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"

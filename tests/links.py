@@ -16,7 +16,7 @@ from eomc.program.ir import Function
 from eomc.program.lower import lower
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
-from eomc.verify.taylor import Jets
+from eomc.verify.taylor import TaylorReference
 
 sin, cos = sympy.sin, sympy.cos
 
@@ -56,7 +56,7 @@ def independent(made: System, state: Mapping[str, float]) -> tuple[np.ndarray, f
     """The acceleration from the energies' Taylor series, and the condition of D."""
     q, qd, u = ([state[x.name] for x in xs] for xs in (made.q, made.qd, made.u))
     params = {p.name: state[p.name] for p in made.parameters}
-    answer = Jets(made)
+    answer = TaylorReference(made)
     D = answer.evaluate("D", q, qd, state["t"], u, params)
     return answer.acceleration(q, qd, state["t"], u, params), float(np.linalg.cond(D))
 

@@ -34,8 +34,8 @@ from eomc.scene.read import parse
 from eomc.verify import check as checking
 from eomc.verify import comparison
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import Vector
-from eomc.verify.rows_runs import drive
+from eomc.verify.reference import Vector
+from eomc.verify.rows_runs import run_in_c
 from eomc.verify.sampling import State
 
 FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
@@ -84,8 +84,8 @@ def outcomes(module: Any, check: Any) -> Vector:
         for method in module.methods:
             h = check.system.run.h * float(np.exp(draw.uniform(-3, 2)))
             for cuts in ((3, 17), ()):
-                run = drive(model, method, at, h, 30, cuts=cuts, every=1 + n % 3)
-                found += [run.rows, np.array([run.status, run.done])]
+                run = run_in_c(model, method, at, h, 30, cuts=cuts, every=1 + n % 3)
+                found += [run.rows, np.array([run.status, run.steps])]
     if hasattr(module, "simulate_batch"):
         q, qd = (np.array([getattr(e.state, x) for e in states] * 9) for x in ("q", "qd"))
         qd = qd * np.exp(draw.uniform(-2, 6, (len(q), 1)))
@@ -101,8 +101,8 @@ class Bench:
     def __init__(self, name: str, folder: Path, made: System | None = None) -> None:
         self.system = variant(name) if made is None else made
         self.shipped = Shipped(self.system, folder / name)
-        self.reference = comparison.of(self.system)
-        comparison.of = lambda made: self.reference
+        self.reference = comparison.reference_for(self.system)
+        comparison.reference_for = lambda made: self.reference
         self.mutants = of_c(self.shipped.source)
         # What the reference compiles for itself is there in all forks then. A library that was
         # loaded once is not loaded again, so that the original has a place of its own.

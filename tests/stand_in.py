@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from sympy import Expr
 
-from eomc.verify.shorter import shorter
-from eomc.verify.symbolic import Reference
+from eomc.verify.symbolic import SymbolicReference
+from eomc.verify.trig_simplify import simplify_trig
 
 
-def simplified(reference: Reference) -> Reference:
+def simplified(reference: SymbolicReference) -> SymbolicReference:
     """The same in shorter forms, which round differently."""
 
     def short(e: Expr) -> Expr:
-        return shorter(e, reference.system.qd)
+        return simplify_trig(e, reference.system.qd)
 
     names = ("D", "C", "g", "bias", "tau", "friction")
     made = {name: getattr(reference, name).applyfunc(short) for name in names}
@@ -33,7 +33,7 @@ class StandIn:
 
     weights = np.array([1, 2, 2, 1]) / 6
 
-    def __init__(self, reference: Reference) -> None:
+    def __init__(self, reference: SymbolicReference) -> None:
         self.reference = reference
         system = reference.system
         self.coordinates = tuple(c.name for c in system.coordinates)

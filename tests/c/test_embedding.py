@@ -308,7 +308,7 @@ def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path
     (tmp_path / "told.c").write_text(program, encoding="utf-8")
     compiled("cc", "-std=gnu99", "told.c", "cartpole.c", "-lm", "-o", "told", cwd=tmp_path)
     told = subprocess.run([str(tmp_path / "told")], capture_output=True, text=True, check=True)
-    trusted = symbolic.of(scene_system("cartpole"))
+    trusted = symbolic.reference_for(scene_system("cartpole"))
     _, q, _ = trusted.simulate([0.0, 0.5], [0.25, 0.0], h=0.5, steps=1)
     assert float(told.stdout) == pytest.approx(q[-1][0], rel=1e-12)
 

@@ -32,7 +32,7 @@ from eomc.program.program import Program
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import check
-from eomc.verify.symbolic import Reference
+from eomc.verify.symbolic import SymbolicReference
 from eomc.verify.symbolic import derive as plainly
 
 FEW = settings(
@@ -127,7 +127,7 @@ def compiled(made: System) -> Program:
 states = partial(links.states, seed=5)
 
 
-def plain(reference: Reference, name: str, state: Mapping[str, float]) -> np.ndarray:
+def plain(reference: SymbolicReference, name: str, state: Mapping[str, float]) -> np.ndarray:
     """The reference's value of a field, or of the acceleration."""
     made = reference.system
     q, qd, u = ([state[x.name] for x in xs] for xs in (made.q, made.qd, made.u))

@@ -31,8 +31,8 @@ from eomc.program.program import Program
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import check, symbolic
-from eomc.verify.oracle import Answer
-from eomc.verify.taylor import Jets
+from eomc.verify.reference import Reference
+from eomc.verify.taylor import TaylorReference
 
 FEW = settings(
     derandomize=True, deadline=None, max_examples=1, database=None,
@@ -95,7 +95,7 @@ states = partial(links.states, count=2, seed=7, reach=1.2)
 class Asked:
     """An independent answer at a state."""
 
-    def __init__(self, answer: Answer, state: Mapping[str, float]) -> None:
+    def __init__(self, answer: Reference, state: Mapping[str, float]) -> None:
         made = self.made = answer.system
         self.answer = answer
         self.q, self.qd, self.u = (
@@ -126,7 +126,7 @@ def value(function: Function, state: Mapping[str, float], made: System) -> np.nd
     return np.array([column for column, _ in columns]).T.ravel()
 
 
-def assert_every_route_agrees(made: System, answer: Answer, some: bool = True) -> None:
+def assert_every_route_agrees(made: System, answer: Reference, some: bool = True) -> None:
     """All that the answer knows, by every route, within rounding; some: at one state at least.
 
     Energies and forces are sums of some hundred terms that may cancel: 1e-12 of the largest that
@@ -158,7 +158,7 @@ def assert_every_route_agrees(made: System, answer: Answer, some: bool = True) -
 def look_at(text: str) -> None:
     note(text)
     made = made_of(text)
-    answer = Jets(made)
+    answer = TaylorReference(made)
     try:
         assert_every_route_agrees(made, answer, some=False)
     except EomcError as fault:  # rightly so where D is singular everywhere
@@ -223,7 +223,7 @@ AXES = {"cylindrical": [2, -1, 2], "universal": [[1, 0, 0], [0.6, 0, 0.8]]}
 def test_joints_with_several_coordinates(joint: str, number: int) -> None:
     more = {"axis": AXES[joint]} if joint in AXES else {}
     made = made_of(held(joint, number, damping="c", armature=0.01, **more))
-    assert_every_route_agrees(made, Jets(made))
+    assert_every_route_agrees(made, TaylorReference(made))
 
 
 @pytest.mark.slow
@@ -233,7 +233,7 @@ def test_lagrange_over_world_coordinates_says_the_same(monkeypatch: pytest.Monke
     for joint in ("cylindrical", "universal"):
         made = made_of(held(joint, 2, axis=AXES[joint], damping="c"))
         assert lagrange.derive(made).lagrange
-        assert_every_route_agrees(made, Jets(made))
+        assert_every_route_agrees(made, TaylorReference(made))
 
 
 @pytest.mark.slow
@@ -244,7 +244,7 @@ def test_a_planar_joint_in_a_plane_scene() -> None:
     arm = {"name": "tail", "parent": "b", "joint": "revolute", "coordinates": "tail",
            "offset": [0.2, "l"], "mass": 0.5, "center": ["l", 0]}  # fmt: skip
     made = made_of(trees.text([body, arm], [0, "-g"], trees.PARAMETERS))
-    assert_every_route_agrees(made, Jets(made))
+    assert_every_route_agrees(made, TaylorReference(made))
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_a_planar_joint_in_a_plane_scene() -> None:
 def test_joints_that_move_together(wheel: str, slide: str) -> None:
     made = made_of(trees.geared(wheel, slide))
     assert [c.name for c in made.coordinates] == ["a", "b"]
-    assert_every_route_agrees(made, Jets(made))
+    assert_every_route_agrees(made, TaylorReference(made))
 
 
 @pytest.mark.slow
@@ -462,7 +462,7 @@ def test_grouping_inertias_saves_work_and_changes_no_motion(
 
 def test_a_wrong_recursion_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     made = made_of(trees.arm(2))
-    answer = Jets(made)
+    answer = TaylorReference(made)
     assert_every_route_agrees(made, answer)
     right = Recursion.cross
     monkeypatch.setattr(Recursion, "cross", lambda r, a, b: right(r, b, a))

@@ -126,7 +126,7 @@ def test_in_space_they_are_those_of_both_oracles() -> None:
     system = from_scene(parse(SPACE, "space.toml"))
     rng = np.random.default_rng(1)
     made = build(SPACE)
-    jets = symbolic.of(system)
+    jets = symbolic.reference_for(system)
     for _ in range(3):
         q, qd, u = rng.normal(size=4), rng.normal(size=4), rng.normal(size=1)
         names = [x.name for x in (*system.q, *system.qd, *system.u)]

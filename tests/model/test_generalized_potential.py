@@ -100,7 +100,7 @@ def test_both_references_and_the_derivation_agree_where_a_field_changes() -> Non
     text = CHARGE.replace("B*y/2", "B*y/2*(1 + sin(t))").replace('place = "x"', 'place = "x*t"')
     text = text.replace('_dot**2)/2"', '_dot**2)/2 + k*x_dot"')
     system = from_scene(parse(text))
-    plain, jets = symbolic.derive(system), taylor.Jets(system)
+    plain, jets = symbolic.derive(system), taylor.TaylorReference(system)
     state = {"q": [0.3, 0.4], "qd": [0.7, -0.2], "t": 0.3}
     for name in ("D", "C", "g", "bias", "kinetic", "potential", "energy", "jacobi", "power"):
         assert plain.evaluate(name, **state) == pytest.approx(jets.evaluate(name, **state)), name

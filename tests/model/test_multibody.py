@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
-from eomc.verify.taylor import Jets
+from eomc.verify.taylor import TaylorReference
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Rotation]  # of a frame in the world: place and turn
@@ -153,7 +153,9 @@ def gradient(of: Callable[[Array], float], q: Array) -> Array:
 
 def ask(made: System, name: str, q: Array, qd: Array, u: Any = ()) -> Array:
     params = {p.name: p.value for p in made.parameters}
-    return np.asarray(Jets(made).evaluate(name, q, qd, 0.0, np.array(u, dtype=float), params))
+    return np.asarray(
+        TaylorReference(made).evaluate(name, q, qd, 0.0, np.array(u, dtype=float), params)
+    )
 
 
 def states(number: int, seed: int = 3) -> list[tuple[Array, Array]]:

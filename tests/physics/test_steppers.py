@@ -132,7 +132,11 @@ def test_a_wrong_coefficient_is_found_by_check(
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     path = tmp_path / "cartpole.toml"
     path.write_text(text.replace("[run]", '[run]\nmethod = ["rk4", "dp8"]'), encoding="utf-8")
-    for of, row in ((Convergence, "closing"), (Advice, "advised"), (Convergence, "beside")):
+    for of, row in (
+        (Convergence, "closing"),
+        (Advice, "failing_fraction"),
+        (Convergence, "compare_methods"),
+    ):
         # which say nothing of it
         monkeypatch.setattr(of, row, lambda *_: Finding(math.nan, "not looked at"))
     made = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)

@@ -13,7 +13,7 @@ from eomc.model.system import System
 from eomc.program import program
 from eomc.program.assembly import assembled
 from eomc.program.interpret import evaluate
-from eomc.verify.taylor import Jets
+from eomc.verify.taylor import TaylorReference
 
 COUNT = 200
 GROUPS = range(0, COUNT, 10)
@@ -54,7 +54,7 @@ def test_accelerations_and_multipliers_are_the_reference_s(seed: int) -> None:
     system = closed(chain(seed))
     if system is None:
         pytest.skip("refused")
-    made, answer = program.build(lagrange.derive(system)), Jets(system)
+    made, answer = program.build(lagrange.derive(system)), TaylorReference(system)
     q, qd = np.array([(c.start, c.rate) for c in system.coordinates]).T
     values = dict(zip((x.name for x in (*system.q, *system.qd)), (*q, *qd), strict=True))
     a, _ = evaluate(made["acceleration"], values | {"t": 0.0})

@@ -212,7 +212,7 @@ h = 0.01
 def test_more_angles_than_coordinates(modules: Modules) -> None:
     """Every coordinate is an angle, and a sum of two is one more; other functions beside them."""
     module = modules.of_text(MORE)
-    trusted = symbolic.of(system.from_scene(scene.parse(MORE, "more.toml")))
+    trusted = symbolic.reference_for(system.from_scene(scene.parse(MORE, "more.toml")))
     _, q, qd = trusted.simulate(h=0.01, steps=50)
     run = module.simulate(h=0.01, steps=50)
     np.testing.assert_allclose(run.q, q, rtol=1e-11)
@@ -250,7 +250,7 @@ def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modu
 def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
     module = modules.of_text(chain(links))
     made = system.from_scene(scene.parse(chain(links), "links.toml"))
-    trusted = symbolic.of(made)
+    trusted = symbolic.reference_for(made)
     _, q, qd = trusted.simulate(h=0.002, steps=50)
     run = module.simulate(h=0.002, steps=50)
     np.testing.assert_allclose(run.q, q, rtol=1e-11)
@@ -261,7 +261,7 @@ def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
 def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     """Where reduction by pi/2 in parts has no digit left."""
     module = modules.unoptimised(chain(5))
-    trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
+    trusted = symbolic.reference_for(system.from_scene(scene.parse(chain(5), "links.toml")))
     q = np.array([3e15, -2e12, 1e9, 7e22, 0.5])
     qd = np.linspace(-1, 1, 5)
     expected = trusted.acceleration(q, qd)
@@ -283,7 +283,7 @@ def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) 
 def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
     """Of 7e22 rad, where numbers are 8e6 apart; the other links swing about it."""
     module = modules.unoptimised(chain(5))
-    trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
+    trusted = symbolic.reference_for(system.from_scene(scene.parse(chain(5), "links.toml")))
     start, rates = module.start
     start[at] = 7e22
     _, q, _ = trusted.simulate(start, rates, h=0.01, steps=20)

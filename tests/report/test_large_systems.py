@@ -252,7 +252,7 @@ def test_the_recursion_as_it_is_set_out_gives_the_equations(name: str) -> None:
     q, qd, qdd = rng.uniform(0.2, 1, (3, len(system.q)))
     at = {p.symbol: p.value for p in system.parameters}
     at |= dict(zip((*system.q, *system.qd), (*q, *qd), strict=True))
-    wanted = symbolic.of(system)
+    wanted = symbolic.reference_for(system)
     state = {"q": q, "qd": qd, "u": np.zeros(len(system.u))}
     expected = wanted.evaluate("D", **state) @ qdd + wanted.evaluate("bias", **state)
     found, K, P = as_set_out(system, system.tree, at, qdd)

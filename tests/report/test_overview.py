@@ -167,7 +167,7 @@ def test_a_motion_that_adaptive_steps_do_best_is_drawn_by_them(tmp_path: Path) -
     report = cost_of_digits.measure(system, tmp_path, methods=("rk4", "adaptive"), longest=0.01)
     best = report.best(6)
     assert best is not None and best.adaptive
-    assert overview.describe_scene(system, report, tmp_path).said.startswith(
+    assert overview.describe_scene(system, report, tmp_path).caption.startswith(
         f"By steps that fit a tolerance of {best.tol:.0e}, within "
     )
 

@@ -221,7 +221,7 @@ def test_accelerations_are_second_derivatives(modules: Modules) -> None:
     for _ in range(3):
         q, qd, qdd = random.uniform(-1, 1, (3, 3))
         for accelerations in (qdd, 0 * qdd):
-            exact = formulas.at(State(q, qd, 0.4), accelerations)
+            exact = formulas.evaluate(State(q, qd, 0.4), accelerations)
             found = [
                 module.frame_acceleration(q, qd, accelerations, name, t=0.4)[:3]
                 for name in ("tip", "middle")

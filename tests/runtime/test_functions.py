@@ -16,7 +16,7 @@ from eomc.emit.package import ASKED, FUNCTIONS
 from eomc.model.system import System
 from eomc.runtime.batch import BatchModel
 from eomc.runtime.package import CONSTRAINED
-from eomc.verify.taylor import Jets
+from eomc.verify.taylor import TaylorReference
 
 
 def test_values_are_those_of_the_textbook(cartpole: ModuleType) -> None:
@@ -61,7 +61,7 @@ def test_positional_arguments_are_those_by_name(everything: ModuleType) -> None:
 
 
 def test_every_value_agrees_with_the_reference(everything: ModuleType) -> None:
-    reference = Jets(scene_of_everything())
+    reference = TaylorReference(scene_of_everything())
     q, qd, at, u = [0.2, -0.5, 0.4], [0.3, 0.6, -0.2], 1.7, [0.5, -0.25]
     params = {"m": 2.5, "values": 0.9, "h": 0.1}
     names = {"kinetic_energy": "kinetic", "potential_energy": "potential"}

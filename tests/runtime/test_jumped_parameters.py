@@ -20,9 +20,9 @@ from eomc.program.assembly import assembled
 from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
-from eomc.verify.discrete import Discrete
-from eomc.verify.symbolic import of
-from eomc.verify.taylor import Jets
+from eomc.verify.discrete import DiscreteReference
+from eomc.verify.symbolic import reference_for
+from eomc.verify.taylor import TaylorReference
 
 GRIPPER = """eomc = 1
 name = "gripper"
@@ -276,7 +276,7 @@ def test_both_references_have_them_as_constants(text: str) -> None:
     system = assembled(from_scene(parse(text, "test.toml")))
     n = len(system.q)
     q, qd = np.random.default_rng(2).uniform(0.3, 0.9, (2, 5, n))
-    one, other = of(system), Discrete(system, Jets(constant(system)))
+    one, other = reference_for(system), DiscreteReference(system, TaylorReference(constant(system)))
     names = ["D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "power"]
     names += ["constraint_jacobian", "gamma"] if system.constraints else []
     for name in names:

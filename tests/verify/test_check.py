@@ -23,10 +23,10 @@ from eomc.verify import symbolic as references
 from eomc.verify.check import check, value_rows
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence
-from eomc.verify.finding import Finding
+from eomc.verify.measurement import Measurement
 from eomc.verify.report import Report
 from eomc.verify.sampling import LARGE
-from eomc.verify.symbolic import Reference, derive
+from eomc.verify.symbolic import SymbolicReference, derive
 
 # what is broken, how, and the rows that must say so
 BROKEN = {
@@ -93,7 +93,7 @@ BROKEN = {
 
 
 @cache
-def reference(name: str) -> Reference:
+def reference(name: str) -> SymbolicReference:
     return derive(scene_system(name))
 
 
@@ -162,7 +162,7 @@ def test_what_is_wrong_fails(what: str, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.fixture
 def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference is Taylor arithmetic, and sizes come from changing all inputs at once."""
-    monkeypatch.setattr(references, "WRITTEN_OUT", 0)
+    monkeypatch.setattr(references, "MAX_SIZE", 0)
     monkeypatch.setattr(sampling, "MOST_NUDGES", 0)
 
 
@@ -218,7 +218,7 @@ def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
 
 def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     """It says so, in the table and in JSON, and passes; without a jump it fails."""
-    x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Finding(1.0)
+    x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Measurement(1.0)
     monkeypatch.setattr(Convergence, "order", low)
     monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
     for force, passed in ((sympy.sign(v), True), (sympy.tanh(v), False)):
@@ -230,7 +230,7 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    unseen = Finding(math.nan, "too few halvings")
+    unseen = Measurement(math.nan, "too few halvings")
     monkeypatch.setattr(Convergence, "order", lambda *_: unseen)
     monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
     report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)

@@ -13,8 +13,8 @@ from conftest import tiers
 from eomc.base.errors import EomcError
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.verify import kkt, symbolic
-from eomc.verify.oracle import Answer
-from eomc.verify.taylor import Jets
+from eomc.verify.reference import Reference
+from eomc.verify.taylor import TaylorReference
 
 NAMES = list(constrained.cases())
 SMALL = [n for n in NAMES if n != "iftomm_A02_four_bar_N40"]
@@ -23,9 +23,9 @@ QUICK = ("pendulum_on_a_winch", "chaplygin_sleigh")
 RUNS = [n for n in SMALL if constrained.cases()[n]["rk4_measured"]]
 
 
-def answers(name: str) -> list[Answer]:
+def answers(name: str) -> list[Reference]:
     system = constrained.system(name)
-    return [Jets(system), *([symbolic.derive(system)] if name in SMALL else [])]
+    return [TaylorReference(system), *([symbolic.derive(system)] if name in SMALL else [])]
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, *PLANE))
@@ -62,7 +62,7 @@ def test_two_ways_to_the_rows_agree(name: str) -> None:
 @pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
 def test_rows_are_each_other_s_derivatives(name: str) -> None:
     """A, rates and gamma beside differences along a line in time."""
-    answer = Jets(constrained.system(name))
+    answer = TaylorReference(constrained.system(name))
     q, qd = constrained.ends(name, "q0", "qd0")
     q = q + 0.1 * np.cos(np.arange(len(q)))
     qd = qd + np.sin(np.arange(len(q)))
@@ -85,7 +85,7 @@ def test_rows_are_each_other_s_derivatives(name: str) -> None:
 @pytest.mark.parametrize("name", tiers(RUNS, "chaplygin_sleigh"))
 def test_projected_rk4_makes_the_errors_that_an_independent_one_made(name: str) -> None:
     measured = constrained.cases()[name]["rk4_measured"][0]
-    answer = symbolic.of(constrained.system(name))
+    answer = symbolic.reference_for(constrained.system(name))
     steps = measured["steps"]
     _, q, qd = answer.simulate(h=measured["h"], steps=steps, every=50)
     expected = measured["projected"]["err_q"]
@@ -144,7 +144,7 @@ def test_what_can_not_be_put_onto_its_rows_is_nan() -> None:
 def test_rows_of_rates_are_linear_in_them() -> None:
     made = double_pendulum()
     bad = (Constraint("speed", symbol("x_dot") ** 2 - 1, holonomic=False),)
-    for answer in (symbolic.derive, Jets):
+    for answer in (symbolic.derive, TaylorReference):
         with pytest.raises(EomcError, match="speed is not linear in the rates"):
             answer(replace(made, constraints=bad))
 
@@ -164,7 +164,7 @@ def test_a_row_of_rates_moves_no_position() -> None:
     xd, yd, zd = (symbol(f"{n}_dot") for n in "xyz")
     rows = {"line": symbol("y") - 2 * symbol("x"), "blade": zd - symbol("y") * xd}
     made = System.make("mixed", ["x", "y", "z"], (xd**2 + yd**2 + zd**2) / 2, constraints=rows)
-    for answer in (Jets(made), symbolic.derive(made)):
+    for answer in (TaylorReference(made), symbolic.derive(made)):
         q, qd = answer.project(np.array([1.0, 1.0, 5.0]), np.array([1.0, 1.0, 0.0]))
         np.testing.assert_allclose(q, [0.6, 1.2, 5.0], rtol=1e-15)
         np.testing.assert_allclose([qd[1] - 2 * qd[0], qd[2] - 1.2 * qd[0]], 0, atol=1e-15)
@@ -172,7 +172,7 @@ def test_a_row_of_rates_moves_no_position() -> None:
 
 def test_many_states_are_corrected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each as it is alone, also where others take longer or never get there."""
-    answer = Jets(double_pendulum())
+    answer = TaylorReference(double_pendulum())
     q = np.array([[1.001, 0.0], [0.7, -0.7], [np.nan, 0.0], [0.6, -0.8]])
     qd = np.array([[0.1, 2.0], [1.0, 1.0], [0.0, 1.0], [0.8, 0.6]])
     asked: list[object] = []

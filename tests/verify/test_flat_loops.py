@@ -16,7 +16,7 @@ from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_constraints import HELD, Rows
+from eomc.verify.rows_constraints import MAX_RESIDUAL, FormRows
 from eomc.verify.rows_runs import SHORT_LIMIT, Runs
 
 CRANK = """
@@ -85,7 +85,7 @@ def test_an_advised_step_is_tried_from_starts_on_the_rows(modules: Modules) -> N
     """Near the flat position: a start moved off the rows by 1e-6 has none on them near."""
     advice = comparison(modules, *TURNS).advice
     x, v = -5e-6, -3.6
-    advice.stiff = replace(advice.start, q=np.array([x, x, 0]), qd=np.array([v, v, 0]))
+    advice.stiffest_state = replace(advice.start, q=np.array([x, x, 0]), qd=np.array([v, v, 0]))
     _, grown = advice._ends("rk4", 0.001, 1)
     assert grown < 10
 
@@ -102,9 +102,10 @@ def test_roundings_that_grow_where_rows_fade_are_no_errors(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:
     made = comparison(modules, *of, seed=seed)
-    runs, rows = Runs(made), Rows(made, made.module)
+    runs, rows = Runs(made), FormRows(made, made.module)
     for found, limit in (
-        (runs.short(), SHORT_LIMIT), (runs.long(), runs.limit), (rows.kept("rk4"), HELD),
+        (runs.short(), SHORT_LIMIT), (runs.long(), runs.limit),
+        (rows.residual_along_run("rk4"), MAX_RESIDUAL),
     ):  # fmt: skip
         assert isinstance(found, float) and found <= limit
     runs.sines()  # which draws before it

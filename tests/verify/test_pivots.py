@@ -88,7 +88,7 @@ SOLVED = ["cartpole", "heavy_top", "tumbling_box", "rods3"]
 def test_pivots_are_schur_complements_of_D(name: str) -> None:
     """Beside the diagonal entries that they were; by the articulated route beside a trace."""
     made = chain(3) if name == "rods3" else variant(name)
-    reference, material = symbolic.of(made), RouteInputs(lagrange.derive(made))
+    reference, material = symbolic.reference_for(made), RouteInputs(lagrange.derive(made))
     ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
     solved = {r: way for r, way in ways.items() if isinstance(way, Solution) and way.matrix == "D"}
     assert solved

@@ -23,9 +23,9 @@ from eomc.scene.read import parse
 from eomc.verify import rows_derivatives
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding
+from eomc.verify.measurement import Measurement
 from eomc.verify.report import Report
-from eomc.verify.rows_derivatives import slopes, told
+from eomc.verify.rows_derivatives import module_derivatives, slopes
 from eomc.verify.rows_runs import FINE, Runs
 from eomc.verify.sampling import State
 
@@ -339,16 +339,16 @@ def test_derivatives_are_compared_where_small_terms_count(
     made = from_scene(parse(FAR, "test.toml"))
     comparison = Comparison(made, modules.unoptimised(FAR), np.random.default_rng(0), None)
     near = max(abs(float(e.state.q[0])) for e in comparison.expected)
-    (far,) = comparison.sampler.farther()
+    (far,) = comparison.sampler.far_states()
     assert abs(float(far.state.q[0])) > 2 * near
     assert slopes(comparison, "linearize") < 1e-8
 
     def wrong(check: Comparison, name: str, s: State) -> Any:
-        found = told(check, name, s)
+        found = module_derivatives(check, name, s)
         assert found is not None
         return found + 1e-3 * (s.q[0] / 0.3) ** 6
 
-    monkeypatch.setattr(rows_derivatives, "told", wrong)
+    monkeypatch.setattr(rows_derivatives, "module_derivatives", wrong)
     assert slopes(comparison, "linearize") > 1e-7
 
 
@@ -410,7 +410,7 @@ def test_what_shorter_steps_make_less_is_no_rounding(
     made = from_scene(parse(text, "test.toml"))
     module = modules.unoptimised(text)
     runs = Runs(Comparison(made, module, np.random.default_rng(0), 4))
-    steep = Finding(finer, "forces are so steep that shorter steps differ less")
+    steep = Measurement(finer, "forces are so steep that shorter steps differ less")
     assert runs.fine("rk4") == (finer if finer > 50 else steep)
 
 
@@ -446,7 +446,7 @@ def test_steps_too_long_for_the_motion_do_not_say_how_far_it_goes(modules: Modul
     assert comparison.simulate(comparison.sampler.start).status == "not finite"
     assert np.allclose(comparison.sampler.spread, [0.5, 0.3], rtol=0.1)
     assert np.allclose(comparison.sampler.speed, [84, 3], rtol=0.1)
-    stiff = comparison.advice.stiff
+    stiff = comparison.advice.stiffest_state
     assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * comparison.advice.scale)
     report = right(LEAVING, modules)
     (row,) = (r for r in report.rows if r.name == "h of gauss16")

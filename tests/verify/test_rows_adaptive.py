@@ -17,8 +17,8 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import rows_adaptive
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding
-from eomc.verify.rows_adaptive_batch import LIMIT, Many
+from eomc.verify.measurement import Measurement
+from eomc.verify.rows_adaptive_batch import LIMIT, BatchRows
 from eomc.verify.rows_adaptive_refusals import _Adaptive
 from eomc.verify.rows_refusals import Refusals
 
@@ -130,7 +130,7 @@ def test_steps_are_judged_where_time_tells_them(
     made, drive = _Adaptive(stiff, Refusals(stiff)), _Adaptive.drive
     assert made.longest() == 0
     start, late = (e.state for e in stiff.expected)
-    assert made.parted(start) == 0 and made.parted(late) is None
+    assert made.step_limit_errors(start) == 0 and made.step_limit_errors(late) is None
 
     def unheard(self: _Adaptive, *of: Any, h_most: float = 0.0, **how: Any) -> Any:
         return drive(self, *of, **how)
@@ -138,13 +138,13 @@ def test_steps_are_judged_where_time_tells_them(
     monkeypatch.setattr(_Adaptive, "drive", unheard)
     assert made.longest() == 1
     monkeypatch.setattr(stiff, "expected", stiff.expected[1:])
-    assert isinstance(made.longest(), Finding)  # nothing is judged, and it says so
+    assert isinstance(made.longest(), Measurement)  # nothing is judged, and it says so
 
 
 def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> None:
-    many = Many(stiff, [])
+    many = BatchRows(stiff, [])
     assert many.state is stiff.expected[0].state
-    right = many.beside()
+    right = many.compare_with_single_runs()
     assert isinstance(right, float) and right < LIMIT
 
     class Off:
@@ -155,5 +155,5 @@ def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> No
             return SimpleNamespace(q=run.q * 1.01, qd=run.qd)
 
     many.module = Off()
-    wrong = many.beside()
+    wrong = many.compare_with_single_runs()
     assert isinstance(wrong, float) and wrong > LIMIT

@@ -12,7 +12,7 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_batch import STEPS, Batches
-from eomc.verify.rows_runs import Runs, drive
+from eomc.verify.rows_runs import Runs, run_in_c
 
 # forces that answer where a slide is; with a cosine of it they have no digit at 1e304
 SLIDE = """eomc = 1
@@ -53,22 +53,22 @@ def test_rows_without_digits_are_compared_by_their_own_rounding(
     b = batches(modules, force)
     s = replace(b.instances[0], q=np.zeros(1), qd=np.array([ALL_BUT_LOST]))
     alone, beside = (
-        drive(b.model, "rk4", replace(s, qd=s.qd * by), b.h, STEPS) for by in (1, 1 + 1e-13)
+        run_in_c(b.model, "rk4", replace(s, qd=s.qd * by), b.h, STEPS) for by in (1, 1 + 1e-13)
     )
     kept = alone.rows[:, :6]
-    assert not b.parts("rk4", s, kept, alone)
-    assert not b.parts("rk4", s, beside.rows[:, :6], alone)
-    assert b.parts("rk4", s, kept * 1.01, alone) == digits
+    assert not b.differs_beyond_rounding("rk4", s, kept, alone)
+    assert not b.differs_beyond_rounding("rk4", s, beside.rows[:, :6], alone)
+    assert b.differs_beyond_rounding("rk4", s, kept * 1.01, alone) == digits
 
 
 def test_the_last_row_of_an_instance_that_stops_is_that_alone(modules: Modules) -> None:
     """Also where it stops after its first step; one that goes on has no digit left to compare."""
     b = batches(modules, "-x/7")
     s = replace(b.instances[0], q=np.zeros(1), qd=np.array([SOON_LOST]), params=None)
-    alone = drive(b.model, "rk4", s, b.h, STEPS)
-    assert 0 < alone.done < STEPS and alone.status
+    alone = run_in_c(b.model, "rk4", s, b.h, STEPS)
+    assert 0 < alone.steps < STEPS and alone.status
     whole = b.simulate("rk4", [s] * len(b.instances), None)
-    for steps in range(alone.done, 0, -1):  # rounding may decide a step that all but fails
+    for steps in range(alone.steps, 0, -1):  # rounding may decide a step that all but fails
         whole.steps[0] = steps
         whole.q[0, steps + 1 :] = whole.qd[0, steps + 1 :] = np.nan
         assert not b.ends_otherwise("rk4", whole, 0, s)
@@ -109,7 +109,7 @@ def test_what_one_coordinate_alone_would_throw_counts(modules: Modules) -> None:
     """Both moved by as much leave the spring between them as it is; roundings do not."""
     b = batches(modules, "", COUPLED)
     s = replace(b.instances[0], q=np.array([0.5, 0.5]), qd=np.array([0.1, 0.1]), params=None)
-    beside = drive(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
-    assert np.abs(beside.rows[:, 1] - drive(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
+    beside = run_in_c(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
+    assert np.abs(beside.rows[:, 1] - run_in_c(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
     off = b.step_off("rk4", s, beside.rows[:, 1])
     assert off is not None and off < 10

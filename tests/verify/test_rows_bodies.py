@@ -26,7 +26,7 @@ from eomc.verify import rows_bodies
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_bodies import Bodies
 from eomc.verify.sampling import State
-from eomc.verify.taylor import Jets
+from eomc.verify.taylor import TaylorReference
 
 NAMES = ("kinetic_energy", "potential_energy", "power")
 
@@ -35,7 +35,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
     """How far the reference's energies are off from those of point masses."""
     made = from_scene(parse(text, "test.toml"))
     assert made.scene is not None
-    module = StandIn(Jets(made))  # type: ignore[arg-type]  # which answers alike
+    module = StandIn(TaylorReference(made))  # type: ignore[arg-type]  # which answers alike
     check = Comparison(made, module, np.random.default_rng(0), states)
     assert check.expected
     return {name: Bodies(check, made.scene).compare(name) for name in NAMES}
@@ -243,9 +243,9 @@ def test_quaternions_are_scipys() -> None:
     a, b, x = random.normal(size=(5, 4)), random.normal(size=(5, 4)), random.normal(size=(5, 3))
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
     one, other = (Rotation.from_quat(np.roll(q, -1, axis=1)) for q in (a, b))
-    np.testing.assert_allclose(rows_bodies.rotated(a, x), one.apply(x), atol=1e-14)
-    product = rows_bodies.multiplied(a, b)
-    np.testing.assert_allclose(rows_bodies.rotated(product, x), (one * other).apply(x), atol=1e-14)
+    np.testing.assert_allclose(rows_bodies.rotate(a, x), one.apply(x), atol=1e-14)
+    product = rows_bodies.quaternion_product(a, b)
+    np.testing.assert_allclose(rows_bodies.rotate(product, x), (one * other).apply(x), atol=1e-14)
 
 
 def test_point_masses_have_the_inertia_of_the_body() -> None:
@@ -256,12 +256,12 @@ def test_point_masses_have_the_inertia_of_the_body() -> None:
     (body,) = [b for b in made.scene.assembly.bodies if b.joint]
     masses, points = zip(*line.points(body), strict=True)
     m, x = np.array(masses), np.array(points)
-    assert math.isclose(m.sum(), float(line.of(body.mass)))
+    assert math.isclose(m.sum(), float(line.evaluate(body.mass)))
     centre = m @ x / m.sum()
     np.testing.assert_allclose(centre, line.vector(body.center), atol=1e-12)
     r = x - centre
     tensor = sum(w * (y @ y * np.eye(3) - np.outer(y, y)) for w, y in zip(m, r, strict=True))
     np.testing.assert_allclose(
         tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
-        [float(line.of(entry)) for entry in body.inertia], atol=1e-12,
+        [float(line.evaluate(entry)) for entry in body.inertia], atol=1e-12,
     )  # fmt: skip

@@ -21,11 +21,11 @@ def test_what_accelerations_lose_is_allowed_to_derivatives(
 ) -> None:
     """In roundings of the acceleration; derivatives that no rounding moves add nothing."""
     system = scene_system("mass_spring")
-    module: Any = StandIn(symbolic.of(system))
+    module: Any = StandIn(symbolic.reference_for(system))
     module.dtype = "float32"
     made = Comparison(system, module, np.random.default_rng(0), 4)
     e = next(e for e in made.expected if np.all(e.value["acceleration"]))
-    monkeypatch.setattr(rows_derivatives, "told", lambda *_: np.ones((1, 2)))
+    monkeypatch.setattr(rows_derivatives, "module_derivatives", lambda *_: np.ones((1, 2)))
     monkeypatch.setattr(
         module, "acceleration", lambda *_, **__: e.value["acceleration"] * (1 + lost * made.eps)
     )
@@ -36,13 +36,13 @@ def test_what_accelerations_lose_is_allowed_to_derivatives(
 def test_what_a_rounding_of_the_state_moves_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Inputs are changed one after the other, and what each moves is added."""
     system = scene_system("mass_spring")
-    made = Comparison(system, StandIn(symbolic.of(system)), np.random.default_rng(0), 4)
+    made = Comparison(system, StandIn(symbolic.reference_for(system)), np.random.default_rng(0), 4)
     e = made.expected[-1]
     e = replace(e, value={**e.value, "acceleration": made.ask("acceleration", e.state)})
 
     def powers(_: Comparison, __: str, s: State) -> Any:
         return np.array([[s.q[0] ** 3 * s.qd[0] ** 2]])
 
-    monkeypatch.setattr(rows_derivatives, "told", powers)
+    monkeypatch.setattr(rows_derivatives, "module_derivatives", powers)
     found = rows_derivatives._growth(made, "linearize", e, powers(made, "", e.state))
     assert found == pytest.approx(5, rel=1e-3)

@@ -19,10 +19,10 @@ from eomc.verify import rows_constraints
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT
-from eomc.verify.rows_constraints import HELD, WORK, Rows
+from eomc.verify.rows_constraints import MAX_RESIDUAL, WORK, FormRows
 from eomc.verify.rows_refusals import OK, Refusals
 from eomc.verify.sampling import SMALL, Sampler
-from eomc.verify.symbolic import of
+from eomc.verify.symbolic import reference_for
 
 SCENE = """eomc = 1
 name = "held_bob"
@@ -116,7 +116,7 @@ def test_reactions_are_compared_where_a_coordinate_hardly_moves(
     hinged: Comparison, sign: float, least: float, most: float
 ) -> None:
     """What is no number passed."""
-    made = Rows(hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]}))
+    made = FormRows(hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]}))
     assert least <= made.reactions() <= most
 
 
@@ -143,7 +143,7 @@ def test_rows_do_the_work_of_their_parts_without_rates(bent: dict[str, Any]) -> 
     """A belt's with no t in it, of which it was expected that it does none."""
     system = assembled(from_scene(parse(BELT)))
     of = Comparison(system, None, np.random.default_rng(0), 4)
-    power = Rows(of, Answering(of, **bent)).power()
+    power = FormRows(of, Answering(of, **bent)).power()
     assert (power > LIMIT) == bool(bent)
 
 
@@ -173,7 +173,7 @@ def test_states_with_a_negative_d_are_left_out() -> None:
     kinetic = "(m - 2*x)*(x_dot**2 + y_dot**2)/2"
     text = SCENE.replace("m*(x_dot**2 + y_dot**2)/2", kinetic)
     system = assembled(from_scene(parse(text)))
-    sampler = Sampler(of(system), np.random.default_rng(0), SMALL)
+    sampler = Sampler(reference_for(system), np.random.default_rng(0), SMALL)
     heavy, light = (replace(sampler.start, q=np.array(q)) for q in ((0.0, -1.0), (1.0, 0.0)))
     assert sampler.regular(heavy) and not sampler.regular(light)
 
@@ -183,6 +183,6 @@ def test_runs_whose_step_is_too_long_are_no_fault_of_the_rows(modules: Modules) 
     """Angles of 1e37, whose sines are anything, were taken for rows that are not held."""
     system = assembled(from_scene(parse((SCENES / "four_bar.toml").read_text("utf-8") + STIFF)))
     module, random = modules.unoptimised(system), np.random.default_rng(0)
-    made = Rows(Comparison(system, module, random, 4), module)
-    found = made.kept("rk4")
-    assert isinstance(found, float) and 0 < found < HELD
+    made = FormRows(Comparison(system, module, random, 4), module)
+    found = made.residual_along_run("rk4")
+    assert isinstance(found, float) and 0 < found < MAX_RESIDUAL

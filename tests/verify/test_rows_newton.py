@@ -34,7 +34,9 @@ WRONG = {
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum."""
-    symbolic.of(MADE).acceleration(*np.zeros((2, len(MADE.q))))  # made once, for all forks
+    symbolic.reference_for(MADE).acceleration(
+        *np.zeros((2, len(MADE.q)))
+    )  # made once, for all forks
     return Shipped(MADE, tmp_path_factory.mktemp("newton"))
 
 
@@ -43,7 +45,7 @@ def sweeps(shipped: Shipped, source: str) -> float:
 
     def measure() -> float:
         made = Comparison(MADE, shipped.load(), np.random.default_rng(0), 4)
-        found = rows_newton.Newton(made).beyond("gauss8")
+        found = rows_newton.Newton(made).extra_sweeps("gauss8")
         assert isinstance(found, float)
         return found if math.isfinite(found) else 1e9
 
@@ -61,7 +63,7 @@ def test_right_ones_need_few_sweeps(shipped: Shipped) -> None:
 def test_wrong_ones_do_not(shipped: Shipped, what: str) -> None:
     right, wrong = WRONG[what]
     assert shipped.source.count(right) == 1
-    assert sweeps(shipped, shipped.source.replace(right, wrong)) > rows_newton.EXTRA
+    assert sweeps(shipped, shipped.source.replace(right, wrong)) > rows_newton.MAX_EXTRA_SWEEPS
 
 
 def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
@@ -70,7 +72,7 @@ def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
 
     q, qd, m = np.array([0.5, -0.3]), np.array([0.2, 0.7]), METHODS["gauss6"]
     sweeps = one_step.step(m, lambda q, qd, t: a(q, qd, np.asarray(t)), q, qd, 0.2, 0.3)
-    ends, count = one_step.by_newton(m, a, q, qd, 0.2, 0.3)
+    ends, count = one_step.step_by_newton(m, a, q, qd, 0.2, 0.3)
     assert np.allclose(ends, sweeps, rtol=0, atol=1e-14)
     assert 1 < count < 10
 
@@ -78,7 +80,7 @@ def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
 def test_plain_sweeps_contract_as_the_squares_of_their_weights_do() -> None:
     """Of an oscillator: h^2 w^2 times the largest eigenvalue of A A, which is 1/12 of gauss4."""
     slopes = np.array([[-9.0, 0.0]])
-    assert one_step.contraction(METHODS["gauss4"], slopes, 0.5) == pytest.approx(9 / 48)
+    assert one_step.contraction_factor(METHODS["gauss4"], slopes, 0.5) == pytest.approx(9 / 48)
 
 
 def test_states_of_which_one_overflows_have_no_step() -> None:
@@ -103,6 +105,6 @@ def test_the_stages_of_one_state_are_asked_for_together() -> None:
 
     q, qd, m = np.array([0.5, -0.3]), np.array([0.2, 0.7]), METHODS["gauss6"]
     one = one_step.step(m, a, q, qd, 0.2, 0.3)
-    assert calls <= 1 + one_step.SWEEPS
+    assert calls <= 1 + one_step.MAX_SWEEPS
     of_many = one_step.step(m, a, q[None], qd[None], np.array([0.2]), 0.3)
     assert np.allclose(one, of_many[:, 0], rtol=0, atol=1e-15)

@@ -96,7 +96,7 @@ def test_steps_under_inputs_can_go_on_too() -> None:
     of.accelerations = partial(Comparison.accelerations, of)
     x, s = np.array([[0.3, -0.2], [0.1, 0.4]]), State(*np.zeros((2, 2)), u=np.array([0.5]))
     for method in ("rk4", "gauss8", "gauss16"):
-        assert rows_plain._can_go_on(of, method, s, x, 0.01, 3)
+        assert rows_plain._next_step_converges(of, method, s, x, 0.01, 3)
 
 
 FRICTION = """eomc = 1

@@ -29,7 +29,7 @@ class Projecting:
     def project(self, q: Any, qd: Any, *, t: float, params: Any, held: Sequence[str]) -> Any:
         names = [c.name for c in SYSTEM.coordinates]
         of = tuple(k for k, name in enumerate(names) if name in held)
-        found = np.array(symbolic.of(SYSTEM).project(q, qd, t, params, of))
+        found = np.array(symbolic.reference_for(SYSTEM).project(q, qd, t, params, of))
         self.asked.append(held)
         free = [k for k in range(len(names)) if k not in of]
         found[:, free] *= 1 + 1e-9 * (len(held) in self.wrong)
@@ -39,7 +39,7 @@ class Projecting:
 def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, Row]:
     monkeypatch.setattr(Projection, "refusals", lambda _: 0.0)  # which ask a C function
     random = np.random.default_rng(0)
-    made = Comparison(SYSTEM, StandIn(symbolic.of(SYSTEM)), random, 4)
+    made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
     report(made, module, "")
     return {row.name: row for row in made.rows}
 

@@ -29,7 +29,9 @@ STAGE = "x[k] = at[k][j];"
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum with rk4 and gauss16."""
-    symbolic.of(MADE).acceleration(*np.zeros((2, len(MADE.q))))  # made once, for all forks
+    symbolic.reference_for(MADE).acceleration(
+        *np.zeros((2, len(MADE.q)))
+    )  # made once, for all forks
     return Shipped(MADE, tmp_path_factory.mktemp("runs"))
 
 

@@ -15,7 +15,7 @@ from conftest import Modules
 
 import eomc
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding
+from eomc.verify.measurement import Measurement
 from eomc.verify.rows_sines import LIMIT, vanishing
 
 
@@ -137,4 +137,4 @@ def test_differences_of_angles_are_no_sines(tmp_path: Path) -> None:
 def test_where_no_entry_is_a_sine_alone_nothing_is_judged(modules: Modules) -> None:
     made = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
     found = vanishing(made)
-    assert isinstance(found, Finding) and found.why
+    assert isinstance(found, Measurement) and found.why

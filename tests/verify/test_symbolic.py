@@ -16,7 +16,7 @@ from sympy import cos, sin
 
 from eomc.base.errors import EomcError
 from eomc.model.system import System, symbol, t
-from eomc.verify.symbolic import Reference, derive
+from eomc.verify.symbolic import SymbolicReference, derive
 
 MEASURED = [
     "cartpole_drop_tutorialP",
@@ -44,7 +44,9 @@ MEASURED = [
 x, v = symbol("x"), symbol("x_dot")
 
 
-def states(reference: Reference, count: int = 5) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def states(
+    reference: SymbolicReference, count: int = 5
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Random q, qd and t."""
     random = np.random.default_rng(1)
     n = len(reference.system.q)

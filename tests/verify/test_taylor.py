@@ -24,8 +24,8 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import Coordinate, Parameter, System, dot, symbol, t
 from eomc.scene.read import parse
 from eomc.verify import symbolic, taylor, taylor_rules
-from eomc.verify.symbolic import Reference, derive
-from eomc.verify.taylor import Jets
+from eomc.verify.symbolic import SymbolicReference, derive
+from eomc.verify.taylor import TaylorReference
 
 NAMES = (
     *("D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "jacobi", "power"),
@@ -51,7 +51,7 @@ def assert_alike(system: System, tolerance: float = 1e-12, rows: int = 4) -> Non
 
     Those of C and the forces are as large as D times rates, where they cancel to less.
     """
-    plain, quick = derive(system), Jets(system)
+    plain, quick = derive(system), TaylorReference(system)
     at = states(system, rows)
     sizes = {name: np.max(np.abs(plain.evaluate(name, **at)), initial=0) for name in NAMES}
     assert np.isfinite(list(sizes.values())).all()
@@ -203,7 +203,7 @@ def test_a_chain_of_20_masses_has_its_closed_form() -> None:
     mu_ij is the mass that hangs below both; bias = C qd + g.
     """
     n = 20
-    found, random = Jets(absolute_chain(n)), np.random.default_rng(3)
+    found, random = TaylorReference(absolute_chain(n)), np.random.default_rng(3)
     m, length = 1 + 0.1 * np.arange(n), 0.5 + 0.03 * np.arange(n)
     below = np.cumsum(m[::-1])[::-1]
     i = np.arange(n)
@@ -265,7 +265,9 @@ def test_first_and_second_derivatives(name: str) -> None:
     y, p = symbol("y"), symbol("p")
     made = System.make("free", [x], dot(y) ** 2 / 2, y, definitions={y: x}, parameters={p: 1.7})
     # as it stands: what jumps is refused in an energy, and its rules serve in forces
-    found = Jets(replace(made, definitions=tuple((name, formula) for name, _ in made.definitions)))
+    found = TaylorReference(
+        replace(made, definitions=tuple((name, formula) for name, _ in made.definitions))
+    )
     for at in (0.3, 0.9):
         with mpmath.workdps(40):
             value, slope, bend = (float(mpmath.diff(exact, mpmath.mpf(at), n)) for n in range(3))
@@ -341,7 +343,7 @@ def test_what_has_no_rate_is_refused() -> None:
         made = System.make("odd", [x], v**2, 0, definitions={a: inside}, inputs=[u])
         made = replace(made, potential=dot(a) * x)
         with pytest.raises(EomcError, match=f"hangs on {words}"):
-            Jets(made)
+            TaylorReference(made)
 
 
 @pytest.mark.parametrize(
@@ -349,30 +351,32 @@ def test_what_has_no_rate_is_refused() -> None:
 )
 def test_kinetic_energy_must_be_quadratic(kinetic: Any) -> None:
     with pytest.raises(EomcError, match="not quadratic in the velocities"):
-        Jets(System.make("strange", [x], kinetic))
+        TaylorReference(System.make("strange", [x], kinetic))
 
 
 def test_unknown_functions_are_refused() -> None:
     made = replace(System.make("odd", [x], v**2, 0), potential=sympy.gamma(x))
     with pytest.raises(EomcError, match=r"derivatives of gamma\(x\) are not known"):
-        Jets(made)
+        TaylorReference(made)
 
 
 def test_no_real_value_is_nan_in_its_row_alone() -> None:
-    made = Jets(System.make("fall", [x], v**2 / 2, 1 / x + sympy.log(x)))
+    made = TaylorReference(System.make("fall", [x], v**2 / 2, 1 / x + sympy.log(x)))
     found = made.evaluate("g", [[0.0], [-1.0], [2.0]])
     assert np.isnan(found[0]).all()
     assert found[2] == pytest.approx(-1 / 4 + 1 / 2)
     assert np.isnan(made.evaluate("potential", [-1.0]))
-    edge = Jets(System.make("edge", [x], dot(abs(x)) ** 2 + v**2, 0))
+    edge = TaylorReference(System.make("edge", [x], dot(abs(x)) ** 2 + v**2, 0))
     assert np.isnan(edge.evaluate("bias", [0.0], [1.0])).all()
-    edge = Jets(System.make("edge", [x], v**2, abs(x)))
+    edge = TaylorReference(System.make("edge", [x], v**2, abs(x)))
     assert edge.evaluate("g", [0.0]) == 0
 
 
 def test_parameters_that_are_zero_divide_quietly() -> None:
     k = symbol("k")
-    made = Jets(System.make("zero", [x], v**2, x / k + sympy.log(k) + x**k, parameters={k: 0}))
+    made = TaylorReference(
+        System.make("zero", [x], v**2, x / k + sympy.log(k) + x**k, parameters={k: 0})
+    )
     assert np.isnan(made.evaluate("g", [1.0])).all()
     assert made.evaluate("D", [1.0]) == 2
 
@@ -383,7 +387,7 @@ def test_parameters_that_are_zero_divide_quietly() -> None:
 def test_rows_are_states() -> None:
     """Many at once, in blocks, one alone, and the plain reference's rows."""
     system = scene_system("cartpole_driven")
-    plain, quick = derive(system), Jets(system)
+    plain, quick = derive(system), TaylorReference(system)
     at = states(system, 7)
     u = np.linspace(-1, 1, 7)[:, None]
     for given in (None, u):
@@ -412,7 +416,7 @@ def test_rows_are_states() -> None:
 
 def test_runs_are_those_of_the_plain_reference() -> None:
     system = scene_system("cartpole_driven")
-    plain, quick = derive(system), Jets(system)
+    plain, quick = derive(system), TaylorReference(system)
     for one, other in zip(plain.simulate(steps=20), quick.simulate(steps=20), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
     times, q, qd = quick.simulate([[0.1, 3], [0.2, 2]], [[0, 1], [1, 0]], steps=5, every=2)
@@ -423,17 +427,17 @@ def test_runs_are_those_of_the_plain_reference() -> None:
 
 
 def test_the_size_decides() -> None:
-    assert isinstance(symbolic.of(scene_system("heavy_top")), Reference)
-    assert isinstance(symbolic.of(chain(2)), Reference)
+    assert isinstance(symbolic.reference_for(scene_system("heavy_top")), SymbolicReference)
+    assert isinstance(symbolic.reference_for(chain(2)), SymbolicReference)
     assert symbolic.is_small(chain(3))
-    assert isinstance(symbolic.of(chain(8)), Jets)
+    assert isinstance(symbolic.reference_for(chain(8)), TaylorReference)
 
 
 @pytest.mark.slow
 def test_fifty_links_are_quick() -> None:
     system = chain(50)
     begun = time.perf_counter()
-    found = Jets(system)
+    found = TaylorReference(system)
     q = np.full(50, 0.1)
     found.acceleration(q, q)  # D, bias and tau: some 0.02 s
     assert time.perf_counter() - begun < 1

@@ -40,7 +40,7 @@ from eomc.report.linearised import (
     stable_step,
 )
 from eomc.report.reference_solution import Reference
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 
 ROW_COUNT = 256  # rows at which runs are compared with the reference
 DIGITS = range(3, 16)

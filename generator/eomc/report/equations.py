@@ -21,7 +21,7 @@ from eomc.report.derived import Derived, Terms
 from eomc.report.typeset import readable
 from eomc.scene.formulas import suggest
 from eomc.verify import symbolic
-from eomc.verify.shorter import coefficients, shorter
+from eomc.verify.trig_simplify import coefficients, simplify_trig
 
 MAX_EXPANDED_SIZE = 30_000  # size by symbolic.is_small; simplification then takes seconds
 MAX_DERIVED_OPERATIONS = 8_000  # in D, C and bias before simplification
@@ -169,7 +169,7 @@ def derive(system: System) -> Equations:
     system = constant(system)
     if not symbolic.is_small(system, MAX_EXPANDED_SIZE):
         raise too_long_error(system)
-    plain = symbolic.derive(symbolic.written_out(system))
+    plain = symbolic.derive(symbolic.without_definitions(system))
     if (
         sum(e.count_ops() for name in ("D", "C", "bias") for e in getattr(plain, name))
         > MAX_DERIVED_OPERATIONS
@@ -178,7 +178,7 @@ def derive(system: System) -> Equations:
 
     @cache
     def short(e: Expr) -> Expr:
-        return readable(shorter(e, system.qd))
+        return readable(simplify_trig(e, system.qd))
 
     D, C, g, tau, friction = (
         getattr(plain, name).applyfunc(short) for name in ("D", "C", "g", "tau", "friction")

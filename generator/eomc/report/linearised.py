@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from eomc.report.reference_solution import Reference
 from eomc.runtime.growth import growth as multiplied
 from eomc.runtime.growth import mean_mass_matrix, norm_root
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 
 Complex = NDArray[np.complex128]
 

@@ -46,7 +46,7 @@ from eomc.program import program
 from eomc.runtime.written import replacing
 from eomc.toolchain import cache as builds
 from eomc.verify import symbolic
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 
 Text = NDArray[Any]  # of str
 

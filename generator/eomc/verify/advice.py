@@ -15,22 +15,26 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.convergence import Convergence
-from eomc.verify.finding import Finding
-from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST, State, along, ask
+from eomc.verify.measurement import Measurement
+from eomc.verify.reference import Vector
+from eomc.verify.sampling import MAX_DISTANCE, State, evaluate_module, states_of_run
 
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
 # An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
 # limit is that of the motion as it is linear at one place, and the motion goes on from there.
 FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
-BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
-OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
-LINEAR = 1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
-APART = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
-SLIGHT = 1e-5  # of the motion: differences of rates of rows, which are smooth
-NONE = 1e-9  # of the largest singular value of a constraint's slopes: none
-PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
-AHEAD = 2000  # steps of the scene's h in which these lie
+UNSTABLE_GROWTH = 1e3  # times what a difference grows by in fine steps: unstable
+MAX_END_ERROR = (
+    0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
+)
+SMALL_PERTURBATION = (
+    1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
+)
+MAX_EIGENVALUE_RATIO = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
+DIFFERENCE_STEP = 1e-5  # of the motion: differences of rates of rows, which are smooth
+ZERO_TOLERANCE = 1e-9  # of the largest singular value of a constraint's slopes: none
+MAX_PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
+MAX_STEPS_AHEAD = 2000  # steps of the scene's h in which these lie
 
 
 class Advice:
@@ -44,7 +48,7 @@ class Advice:
         self.runs, self.start, self.scale, self.h = runs, runs.start, runs.scale, runs.h
         self.duration = runs.duration
 
-    def advised(self, method: str) -> Finding:
+    def failing_fraction(self, method: str) -> Measurement:
         """The least of PARTS of the advised h with which a run is lost.
 
         From where the start of the motion allows the shortest h. Lost: it stops, or a difference
@@ -54,30 +58,34 @@ class Advice:
         stay where it holds: how far it is from the eigenvalues' then, times.
         """
         if method == "euler" and self._velocities_matter():
-            return Finding(math.inf, "for forces of positions alone")
-        longest = self._longest(method, self.stiff, 1e3 * self.duration)
+            return Measurement(math.inf, "for forces of positions alone")
+        longest = self._longest_advised(method, self.stiffest_state, 1e3 * self.duration)
         if math.isinf(longest):
-            return Finding(math.inf, "no mode turns or decays")
-        eigen = self._by_eigenvalues(method)
-        apart = max(longest / eigen, eigen / longest)
+            return Measurement(math.inf, "no mode turns or decays")
+        eigen = self._step_by_eigenvalues(method)
+        ratio = max(longest / eigen, eigen / longest)
         unit = "times the eigenvalues' h; runs leave where it holds"
-        near = Finding(apart, unit=unit, limit=APART) if apart <= APART else None
+        near = (
+            Measurement(ratio, unit=unit, limit=MAX_EIGENVALUE_RATIO)
+            if ratio <= MAX_EIGENVALUE_RATIO
+            else None
+        )
         if near and longest > self.duration:
             return near
         fine, grown = self._ends(method, longest, FINE)
         if not math.isfinite(grown):
-            return Finding(math.inf, "the motion does not go on")
-        lost = math.nan
+            return Measurement(math.inf, "the motion does not go on")
+        failing = math.nan
         for part in PARTS:
             end, growth = self._ends(method, longest, part)
-            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= OFF
-            if wrong or not growth <= BLOWN * max(1.0, grown):
-                lost = part
+            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= MAX_END_ERROR
+            if wrong or not growth <= UNSTABLE_GROWTH * max(1.0, grown):
+                failing = part
                 break
-        return near if near and not lost > PARTS[0] else Finding(lost)
+        return near if near and not failing > PARTS[0] else Measurement(failing)
 
     @cached_property
-    def stiff(self) -> State:
+    def stiffest_state(self) -> State:
         """Where, along the start of the motion, the shortest h is advised.
 
         As far as that stays near: steps that are too long for it end at 1e40, where no difference
@@ -85,18 +93,18 @@ class Advice:
         """
         start = self.start
         method = next(m for m in self.runs.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(AHEAD, math.ceil(self.duration / self.h))
-        every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
-        found, longest = start, 1e3 * self.duration
+        steps = min(MAX_STEPS_AHEAD, math.ceil(self.duration / self.h))
+        every = max(1, steps * max(1, len(start.q) // 8) // MAX_PLACES)
+        stiffest, longest = start, 1e3 * self.duration
         run = self.runs.run(start, method, steps=steps, every=every)
-        for s in along(run, start):
-            if not np.all(np.abs([s.q - start.q, s.qd - start.qd]) < FARTHEST * self.scale):
+        for s in states_of_run(run, start):
+            if not np.all(np.abs([s.q - start.q, s.qd - start.qd]) < MAX_DISTANCE * self.scale):
                 break
-            if (here := self._longest(method, s, longest)) < longest:
-                found, longest = s, here
-        return found
+            if (here := self._longest_advised(method, s, longest)) < longest:
+                stiffest, longest = s, here
+        return stiffest
 
-    def _longest(self, method: str, s: State, most: float) -> float:
+    def _longest_advised(self, method: str, s: State, most: float) -> float:
         """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
         low = most
         while self._warns(method, s, low):
@@ -112,14 +120,14 @@ class Advice:
     def _velocities_matter(self) -> bool:
         """Whether accelerations hang on velocities."""
         s = self.runs.places[-1].state
-        still = replace(s, qd=0 * s.qd)
-        one, other = (self.runs.ask("acceleration", x) for x in (s, still))
+        at_rest = replace(s, qd=0 * s.qd)
+        one, other = (self.runs.ask("acceleration", x) for x in (s, at_rest))
         return not np.array_equal(one, other)
 
     def _warns(self, method: str, s: State, h: float) -> bool:
         """Whether the module advises against h at a state."""
-        told = self.runs.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
-        return told is not None
+        message = self.runs.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
+        return message is not None
 
     def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
         """The end of a run over SPAN times `longest`, scaled, and the growth of a difference.
@@ -127,39 +135,44 @@ class Advice:
         The larger of that of a small difference and of one so small that stiff forces, which are
         soon at their bounds, are linear in it.
         """
-        s = self.stiff
+        s = self.stiffest_state
         signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
-        along = self._along(s)  # off the constraints there may be no start near singular positions
-        signs = (along @ (along.T @ signs.ravel())).reshape(signs.shape)
+        directions = self._constrained_directions(
+            s
+        )  # off the constraints there may be no start near singular positions
+        signs = (directions @ (directions.T @ signs.ravel())).reshape(signs.shape)
         steps, ends = round(SPAN / part), []
-        for by in (0.0, NUDGE, LINEAR):
+        for by in (0.0, NUDGE, SMALL_PERTURBATION):
             q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
             how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
             run = self.runs.run(replace(s, q=q, qd=qd), method, **how)
             if str(run.status) != "ok":
                 return np.full(self.scale.shape, math.inf), math.inf
             ends.append(np.array([run.q[-1], run.qd[-1]]) / self.scale)
-        grown = (np.max(np.abs(ends[k] - ends[0])) / by for k, by in ((1, NUDGE), (2, LINEAR)))
-        return ends[0], float(max(grown))
+        growths = (
+            np.max(np.abs(ends[k] - ends[0])) / by
+            for k, by in ((1, NUDGE), (2, SMALL_PERTURBATION))
+        )
+        return ends[0], float(max(growths))
 
-    def _by_eigenvalues(self, method: str) -> float:
+    def _step_by_eigenvalues(self, method: str) -> float:
         """The longest stable h of the motion linearised at `stiff`, by differences; s.
 
         Under constraints the longer of two: along them, as what leaves them is put back after each
         step, though they turn with the motion; and of all changes.
         """
-        ways = [self._along(self.stiff)]
+        candidates = [self._constrained_directions(self.stiffest_state)]
         if self.holonomic.size:
-            ways.append(np.eye(2 * len(self.stiff.q)))
-        return max(self._limit(method, along) for along in ways)
+            candidates.append(np.eye(2 * len(self.stiffest_state.q)))
+        return max(self._eigenvalue_limit(method, directions) for directions in candidates)
 
-    def _limit(self, method: str, along: Vector) -> float:
-        """The same, for changes of [q; qd] in units of the scale, the columns of `along`."""
-        s = self.stiff
+    def _eigenvalue_limit(self, method: str, directions: Vector) -> float:
+        """The same, for changes of [q; qd] in units of the scale, the columns of `directions`."""
+        s = self.stiffest_state
         n, x = len(s.q), np.array([s.q, s.qd])
-        rates = np.zeros_like(along)
-        for k, way in enumerate(along.T):
-            by = LINEAR**0.5 * 1e-2 * way.reshape(2, n) * self.scale
+        rates = np.zeros_like(directions)
+        for k, direction in enumerate(directions.T):
+            by = SMALL_PERTURBATION**0.5 * 1e-2 * direction.reshape(2, n) * self.scale
             try:
                 ends = [
                     self.runs.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
@@ -168,14 +181,14 @@ class Advice:
             except ArithmeticError:  # off the constraints there may be none
                 return 0.0
             change = np.array([2 * by[1], ends[0] - ends[1]])
-            rates[:, k] = (change / (2 * LINEAR**0.5 * 1e-2 * self.scale)).ravel()
-        values = np.linalg.eigvals(along.T @ rates)
+            rates[:, k] = (change / (2 * SMALL_PERTURBATION**0.5 * 1e-2 * self.scale)).ravel()
+        values = np.linalg.eigvals(directions.T @ rates)
         turning, decay = METHODS[method].limits
         rate = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
         fastest = float(max(rate))
         return 1 / fastest if fastest > 0 else math.inf
 
-    def _along(self, s: State) -> Vector:
+    def _constrained_directions(self, s: State) -> Vector:
         """Changes of [q; qd], in units of the scale, along the constraints: (2 nq, k), orthonormal.
 
         All without constraints. Velocities follow positions so that rates of rows stay zero.
@@ -183,21 +196,23 @@ class Advice:
         n, (far, fast) = len(s.q), self.scale
         if not self.holonomic.size:
             return np.eye(2 * n)
-        A = ask(self.runs.module, "constraint_jacobian", s)
-        of_q, of_qd = _kernel(A[self.holonomic] * far), _kernel(A * fast)
+        A = evaluate_module(self.runs.module, "constraint_jacobian", s)
+        of_q, of_qd = _null_space(A[self.holonomic] * far), _null_space(A * fast)
         rates = np.zeros((len(A), of_q.shape[1]))
-        for k, way in enumerate(of_q.T):
+        for k, direction in enumerate(of_q.T):
             ends = (
-                ask(self.runs.module, "constraint_rates", replace(s, q=s.q + by * far * way))
-                for by in (SLIGHT, -SLIGHT)
+                evaluate_module(
+                    self.runs.module, "constraint_rates", replace(s, q=s.q + by * far * direction)
+                )
+                for by in (DIFFERENCE_STEP, -DIFFERENCE_STEP)
             )
-            rates[:, k] = (next(ends) - next(ends)) / (2 * SLIGHT)
-        follow = -np.linalg.pinv(A * fast, rcond=NONE) @ rates
+            rates[:, k] = (next(ends) - next(ends)) / (2 * DIFFERENCE_STEP)
+        follow = -np.linalg.pinv(A * fast, rcond=ZERO_TOLERANCE) @ rates
         whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
         return np.asarray(np.linalg.qr(whole)[0])
 
 
-def _kernel(A: Vector) -> Vector:
+def _null_space(A: Vector) -> Vector:
     """What A makes zero, (n, k), orthonormal."""
     _, sizes, rows = np.linalg.svd(A)
-    return np.asarray(rows[np.sum(sizes > NONE * np.max(sizes, initial=0)) :].T)
+    return np.asarray(rows[np.sum(sizes > ZERO_TOLERANCE * np.max(sizes, initial=0)) :].T)

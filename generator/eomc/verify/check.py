@@ -52,92 +52,92 @@ def check(
     seed. A module that raises fails the row, which shows its words. Raises EomcError where
     `symbolic.of` does.
     """
-    made = Comparison(system, module, np.random.default_rng(seed), states, plain)
-    models = [form._model for form, _ in made.forms if hasattr(form, "_model")]
+    comparison = Comparison(system, module, np.random.default_rng(seed), states, plain)
+    models = [form._model for form, _ in comparison.forms if hasattr(form, "_model")]
     for model in models:
         model._passes_over = True  # as the reference does
     try:
-        return _report(made, module)
+        return _report(comparison, module)
     finally:
         for model in models:
             model._passes_over = False
 
 
-def _report(made: Comparison, module: Any) -> Report:
+def _report(comparison: Comparison, module: Any) -> Report:
     """All rows."""
-    system = made.system
-    made.row("names, defaults, start", 0, "that differ", made.faces)
+    system = comparison.system
+    comparison.row("names, defaults, start", 0, "that differ", comparison.metadata_differences)
     compiled = hasattr(module, "_model")
-    if made.expected:
-        value_rows(made)
-        property_rows(made)
+    if comparison.expected:
+        value_rows(comparison)
+        property_rows(comparison)
         if system.constraints:
-            rows_constraints.report(made)
+            rows_constraints.report(comparison)
         if compiled:  # what is compiled has several ways to one answer
-            compiled_rows(made)
+            compiled_rows(comparison)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
-            Bodies(made, scene).report()
+            Bodies(comparison, scene).report()
             if compiled:
-                rows_frames.report(made, scene)
+                rows_frames.report(comparison, scene)
         if compiled and system.run.inverse_dynamics:
-            rows_frames.inverse_dynamics(made)
+            rows_frames.inverse_dynamics(comparison)
         if system.outputs and hasattr(module, "output"):
-            rows_outputs.report(made)
+            rows_outputs.report(comparison)
         if compiled and system.events:
-            rows_events.report(made)
-            rows_stepped.report(made)
+            rows_events.report(comparison)
+            rows_stepped.report(comparison)
         if hasattr(module, "applied"):
-            rows_limits.report(made)
-            rows_signals.report(made)
-            rows_discretize.report(made)
-            rows_adaptive.report(made)
-        rows_plain.rows(made)
+            rows_limits.report(comparison)
+            rows_signals.report(comparison)
+            rows_discretize.report(comparison)
+            rows_adaptive.report(comparison)
+        rows_plain.rows(comparison)
     else:
-        made.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
-    kind = "Taylor arithmetic" if made.large else "equations written out"
-    counts = len(made.expected), made.sampler.rejected
-    return Report(system.name, tuple(made.rows), *counts, kind)
+        comparison.row("states", 1, "states with a regular D", lambda: 0.0, minimum=True)
+    kind = "Taylor arithmetic" if comparison.large else "equations written out"
+    counts = len(comparison.expected), comparison.sampler.rejected
+    return Report(system.name, tuple(comparison.rows), *counts, kind)
 
 
-def value_rows(made: Comparison) -> None:
+def value_rows(comparison: Comparison) -> None:
     """Add the rows against the reference: values, one step, runs."""
-    row, rounding = made.row, "units of rounding"
+    row, rounding = comparison.row, "units of rounding"
     for name in (*VALUES, "acceleration"):
-        row(name, LIMIT, rounding, partial(made.value, name))
-    if made.methods[0] == "rk4":  # which is what the reference steps by
-        row("one step", LIMIT, rounding, made.steps)
-        row("run", LIMIT, rounding + ", times steps and growth", made.runs)
-    for method in made.methods[made.methods[0] == "rk4" :]:
-        row(f"one step of {method}", LIMIT, rounding, partial(made.step_by, method))
-    row("run: its energy", LIMIT, rounding, made.run_energy)
+        row(name, LIMIT, rounding, partial(comparison.value, name))
+    if comparison.methods[0] == "rk4":  # which is what the reference steps by
+        row("one step", LIMIT, rounding, comparison.steps)
+        row("run", LIMIT, rounding + ", times steps and growth", comparison.runs)
+    for method in comparison.methods[comparison.methods[0] == "rk4" :]:
+        row(f"one step of {method}", LIMIT, rounding, partial(comparison.step_by, method))
+    row("run: its energy", LIMIT, rounding, comparison.run_energy)
 
 
-def property_rows(made: Comparison) -> None:
+def property_rows(comparison: Comparison) -> None:
     """Add the rows about the module alone, and those by differences."""
-    row, rounding = made.row, "units of rounding"
-    row("D = D^T", LIMIT, rounding, made.symmetry)
-    if not made.system.constraints:  # the KKT matrix has to be regular, D need not
-        row("D > 0", 0, "least eigenvalue of D, scaled", made.definiteness, least=True)
-    row("bias = C qd + g", LIMIT, rounding, made.bias)
-    force = "tau + A^T lambda" if made.system.constraints else "tau"
-    row(f"D qdd + bias = {force}", LIMIT, rounding, made.motion)
-    rows_derivatives.report(made)
-    if made.dtype == np.float64:  # single precision leaves its differences too few digits
-        row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", made.skewness)
-        made.convergence_rows()
+    row, rounding = comparison.row, "units of rounding"
+    row("D = D^T", LIMIT, rounding, comparison.symmetry)
+    if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
+        row("D > 0", 0, "least eigenvalue of D, scaled", comparison.definiteness, minimum=True)
+    row("bias = C qd + g", LIMIT, rounding, comparison.bias)
+    force = "tau + A^T lambda" if comparison.system.constraints else "tau"
+    row(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion)
+    rows_derivatives.report(comparison)
+    if comparison.dtype == np.float64:  # single precision leaves its differences too few digits
+        row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", comparison.skewness)
+        comparison.convergence_rows()
 
 
-def compiled_rows(made: Comparison) -> None:
+def compiled_rows(comparison: Comparison) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
-    runs, refusals = Runs(made), Refusals(made)
+    runs, refusals = Runs(comparison), Refusals(comparison)
     runs.report()
-    rows_sines.report(made)
-    rows_newton.report(made)
+    rows_sines.report(comparison)
+    rows_newton.report(comparison)
     refusals.report()
-    rows_adaptive_refusals.report(made, refusals)
-    if made.system.constraints:
-        rows_projection.of_inertia(made, refusals)
-    if hasattr(made.module, "simulate_batch"):
+    rows_adaptive_refusals.report(comparison, refusals)
+    if comparison.system.constraints:
+        rows_projection.of_inertia(comparison, refusals)
+    if hasattr(comparison.module, "simulate_batch"):
         Batches(runs, refusals.singular).report()
-        rows_adaptive_batch.report(made, refusals.singular)
+        rows_adaptive_batch.report(comparison, refusals.singular)

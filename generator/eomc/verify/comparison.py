@@ -15,30 +15,30 @@ from eomc.model.corners import corners
 from eomc.model.system import System
 from eomc.verify import one_step
 from eomc.verify.advice import PARTS, Advice
-from eomc.verify.convergence import ORDER_MARGIN, SEEN, Convergence, Place
-from eomc.verify.finding import Finding, largest, units
-from eomc.verify.oracle import Vector
+from eomc.verify.convergence import MAX_OBSERVABLE_ORDER, ORDER_MARGIN, Convergence, Place
+from eomc.verify.measurement import Measurement, largest, units
+from eomc.verify.reference import Vector
 from eomc.verify.report import Row
 from eomc.verify.sampling import (
     EPS,
-    FARTHEST,
     LARGE,
+    MAX_DISTANCE,
     NUDGE,
     SMALL,
     Expected,
     Sampler,
     State,
-    along,
-    ask,
+    evaluate_module,
+    projected_start,
     simulate,
-    started,
+    states_of_run,
 )
-from eomc.verify.symbolic import of
-from eomc.verify.taylor import Jets
+from eomc.verify.symbolic import reference_for
+from eomc.verify.taylor import TaylorReference
 
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-LONGER = 16.0  # times the scene's h: a long step
-SHORTER = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
+LONG_STEP = 16.0  # times the scene's h: a long step
+STEP_FRACTIONS = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
 
 
 def _corrected(e: Expected) -> Vector | float:
@@ -57,8 +57,8 @@ class Comparison:
         self.dtype = np.dtype(getattr(module, "dtype", "float64"))
         self.eps = float(np.finfo(self.dtype).eps)
         self.methods: tuple[str, ...] = getattr(module, "methods", ("rk4",))
-        self.reference = of(system)
-        self.large = isinstance(self.reference, Jets)
+        self.reference = reference_for(system)
+        self.large = isinstance(self.reference, TaylorReference)
         self.effort = LARGE if self.large else SMALL
         self.sampler = Sampler(self.reference, random, self.effort)
         self.expected = self.sampler.states(self.effort.states if states is None else states)
@@ -69,12 +69,14 @@ class Comparison:
         """Orders, advised steps, the balance of power: see `convergence`."""
         runs, methods = self.convergence, self.methods
         for method in methods:
-            least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
+            least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
             find = partial(runs.order, method)
             self.smooth_row(f"order of {method}", least, "order observed", find)
         for method in methods[1:]:
             unit = "of the two methods' own errors"
-            self.row(f"{method} beside {methods[0]}", 2, unit, partial(runs.beside, method))
+            self.row(
+                f"{method} beside {methods[0]}", 2, unit, partial(runs.compare_methods, method)
+            )
         unit = "order at which it closes"
         self.smooth_row("power balance", runs.closing_limit, unit, runs.closing)
         for method in methods:
@@ -82,32 +84,34 @@ class Comparison:
                 self.advice_row(method)
 
     def row(
-        self, name: str, limit: float, unit: str, measure: Callable[[], float | Finding],
-        least: bool = False,
+        self, name: str, limit: float, unit: str, measure: Callable[[], float | Measurement],
+        minimum: bool = False,
     ) -> None:  # fmt: skip
         """Add what `measure` finds: at most the limit, or more than it where it is the least."""
         try:
-            found = measure()
+            result = measure()
         except Exception as fault:  # whatever the module raises is an outcome of the check
             self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
             return
-        error, why = (found.value, found.why) if isinstance(found, Finding) else (found, "")
-        if isinstance(found, Finding) and found.unit:
-            passed = error <= found.limit
-            self.rows.append(Row(name, error, found.limit, passed, found.unit))
+        error, why = (result.value, result.why) if isinstance(result, Measurement) else (result, "")
+        if isinstance(result, Measurement) and result.unit:
+            passed = error <= result.limit
+            self.rows.append(Row(name, error, result.limit, passed, result.unit))
             return
         if why:
             idle = math.isinf(error)
             unit = ("no limit to test: " if idle else "not judged: ") + why
             self.rows.append(Row(name, error, limit, True, unit, judged=idle))
             return
-        self.rows.append(Row(name, error, limit, error > limit if least else error <= limit, unit))
+        self.rows.append(
+            Row(name, error, limit, error > limit if minimum else error <= limit, unit)
+        )
 
     def smooth_row(
-        self, name: str, limit: float, unit: str, measure: Callable[[], Finding]
+        self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
         """A row about orders, which is not judged where the scene's functions have corners."""
-        self.row(name, limit, unit, measure, least=True)
+        self.row(name, limit, unit, measure, minimum=True)
         row = self.rows[-1]
         if math.isinf(row.error):
             self.rows[-1] = replace(row, unit=unit + ": exact, no error to measure")
@@ -118,8 +122,8 @@ class Comparison:
     def advice_row(self, method: str) -> None:
         """At which part of the advised h a run is lost: not at an eighth of it, but at twice it."""
         unit = "of the advised h, where runs are lost"
-        find = partial(self.advice.advised, method)
-        self.row(f"h of {method}", PARTS[0], unit, find, least=True)
+        find = partial(self.advice.failing_fraction, method)
+        self.row(f"h of {method}", PARTS[0], unit, find, minimum=True)
         row = self.rows[-1]
         if not row.passed and self.corners:
             note = f"not judged: no matter with {self.corners}"
@@ -134,13 +138,13 @@ class Comparison:
     def convergence(self) -> Convergence:
         """The rows that come from runs of several step sizes."""
         own = [e for e in self.expected if e.state.params is None]
-        usual = own[1:4] or self.expected[:3]  # the scene's own parameters, away from its start
+        typical = own[1:4] or self.expected[:3]  # the scene's own parameters, away from its start
         return Convergence(
             self.module,
             self.methods,
             [
-                Place(replace(e.state, t=self.begin(e.state)), float(e.size["jacobi"]))
-                for e in usual
+                Place(replace(e.state, t=self.start_time(e.state)), float(e.size["jacobi"]))
+                for e in typical
             ],
             self.expected[0].state,
             self.sampler.scale,
@@ -149,9 +153,9 @@ class Comparison:
         )
 
     @cached_property
-    def elsewhere(self) -> list[Expected]:
+    def unusual_states(self) -> list[Expected]:
         """States that a run hardly comes to, where values have to be right too."""
-        return self.sampler.elsewhere(1 if self.large else 2)
+        return self.sampler.unusual_states(1 if self.large else 2)
 
     @cached_property
     def corners(self) -> str:
@@ -164,13 +168,13 @@ class Comparison:
         plain = [] if self.plain is None else [(self.plain, "plain C: ")]
         return [(self.module, ""), *plain]
 
-    def largest(self, of: Callable[[Expected], float], few: int | None = None) -> float:
+    def largest(self, error: Callable[[Expected], float], few: int | None = None) -> float:
         """The largest error over all states, or a few; nan wins."""
-        return float(np.max([of(e) for e in (self.few(few) if few else self.expected)]))
+        return float(np.max([error(e) for e in (self.few(few) if few else self.expected)]))
 
     # against the reference
 
-    def faces(self) -> float:
+    def metadata_differences(self) -> float:
         """How many of the module's names, defaults and start values are not the system's."""
         s, m, start = self.system, self.module, self.sampler.start
         pairs = [
@@ -188,17 +192,17 @@ class Comparison:
     def value(self, name: str) -> float:
         """One of VALUES or the acceleration."""
         # energies in units of what they usually are: k - k cos(q) may be 0 at a state
-        usual = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
+        typical = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
 
         def error(e: Expected) -> float:
-            size = np.maximum(e.size[name], usual)
-            return self.units(ask(self.module, name, e.state), e.value[name], size)
+            size = np.maximum(e.size[name], typical)
+            return self.units(evaluate_module(self.module, name, e.state), e.value[name], size)
 
-        return float(np.max([error(e) for e in (*self.expected, *self.elsewhere)]))
+        return float(np.max([error(e) for e in (*self.expected, *self.unusual_states)]))
 
-    def steps(self) -> float | Finding:
+    def steps(self) -> float | Measurement:
         """One step of the scene's h from a few states."""
-        h, far = self.system.run.h, FARTHEST * self.sampler.scale
+        h, far = self.system.run.h, MAX_DISTANCE * self.sampler.scale
 
         def reference(**rows: Any) -> Vector:
             return np.stack(self.reference.step(h=h, **rows), axis=1)
@@ -206,61 +210,63 @@ class Comparison:
         def error(e: Expected) -> float | None:
             s = e.state
             with np.errstate(all="ignore"):
-                expected, size = self.sampler.reach(reference, s)
+                expected, size = self.sampler.value_and_size(reference, s)
             if not np.all(np.abs(expected - [s.q, s.qd]) < far):
                 return None
-            found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
+            step = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
             gain = h * e.size["acceleration"]
             size = size + np.array([h * (np.abs(s.qd) + gain), gain]) + _corrected(e)
-            return self.units(found, expected, size)
+            return self.units(step, expected, size)
 
         return largest(map(error, self.few(self.effort.few)), "all steps are thrown far")
 
-    def step_by(self, method: str) -> float | Finding:
+    def step_by(self, method: str) -> float | Measurement:
         """One step of a method from a few states, by its tableau on the reference's accelerations.
 
         Of the scene's h, and of LONGER, where what is of high order in h is more than rounding.
         Shorter where the stages of an implicit one are else not found.
         """
         errors = (
-            self.one_step_of(method, e, h)
+            self.one_step_error(method, e, h)
             for e in self.few(self.effort.few)
-            for h in (self.system.run.h, LONGER * self.system.run.h)
+            for h in (self.system.run.h, LONG_STEP * self.system.run.h)
         )
         return largest(errors, "no step from any state is finite")
 
     def accelerations(self, s: State) -> one_step.Acceleration:
         """The reference's, of one state or many, with the inputs and parameters of one."""
 
-        def found(q: Vector, qd: Vector, t: Vector) -> Vector:
-            held = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
-            return self.reference.acceleration(q, qd, t, held, s.params)
+        def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
+            inputs = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
+            return self.reference.acceleration(q, qd, t, inputs, s.params)
 
-        return found
+        return acceleration
 
-    def one_step_of(self, method: str, e: Expected, longest: float) -> float | None:
+    def one_step_error(self, method: str, e: Expected, longest: float) -> float | None:
         """None where the reference has no such step; inf where the module refuses what it has.
 
         That is, its shortest; or two in a row whose stages the module does not find.
         """
-        s, gain, lost, refused = e.state, e.size["acceleration"], 0, False
-        for h in (part * longest for part in SHORTER):
+        s, gain, failures, refused = e.state, e.size["acceleration"], 0, False
+        for h in (part * longest for part in STEP_FRACTIONS):
             refused = False
 
-            def reference(q: Vector, qd: Vector, t: Vector, h: float = h, **given: Any) -> Vector:
+            def reference(
+                q: Vector, qd: Vector, t: Vector, h: float = h, **arguments: Any
+            ) -> Vector:
                 def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
-                    return self.reference.acceleration(q, qd, t, **given)
+                    return self.reference.acceleration(q, qd, t, **arguments)
 
                 ends = one_step.step(METHODS[method], acceleration, q, qd, t, h)
                 if self.system.constraints:
-                    params = given.get("params")
+                    params = arguments.get("params")
                     q, qd = ends
                     ends = np.array(self.reference.corrected(q, qd, t + h, params))
                 return np.moveaxis(ends, 0, 1)
 
             with np.errstate(all="ignore"):
-                expected, size = self.sampler.reach(reference, s)
-            most = self.sampler.scale * (1 if h > self.system.run.h else FARTHEST)
+                expected, size = self.sampler.value_and_size(reference, s)
+            most = self.sampler.scale * (1 if h > self.system.run.h else MAX_DISTANCE)
             if not np.all(np.abs(expected - [s.q, s.qd]) < most):
                 continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
@@ -269,12 +275,12 @@ class Comparison:
                 if METHODS[method].newton:  # stages end at what a rounding of q makes of rates
                     size[1] += np.abs(s.q) / h
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
-            refused, lost = True, lost + (run.status == "no convergence")
-            if lost == 2:
+            refused, failures = True, failures + (run.status == "no convergence")
+            if failures == 2:
                 break
-        return math.inf if lost == 2 or refused else None
+        return math.inf if failures == 2 or refused else None
 
-    def runs(self) -> float | Finding:
+    def runs(self) -> float | Measurement:
         """A short run from the start, and one from a random state with random parameters."""
         errors = map(self.run, self.few(2))
         return largest(errors, "a difference grows too much in one step")
@@ -312,45 +318,47 @@ class Comparison:
         q, qd = self.sampler.rounded(s, np.add(by, [s.q, s.qd]))
         u = None if s.u is None else np.array([s.u] * len(q))
         with np.errstate(all="ignore"):
-            begin = self.begin(s)
-            t, *found = self.reference.simulate(q, qd, h, steps, u=u, params=s.params, t0=begin)
-            x, y, *near = np.moveaxis(np.stack(found, axis=1), 2, 0)
+            begin = self.start_time(s)
+            t, *trajectories = self.reference.simulate(
+                q, qd, h, steps, u=u, params=s.params, t0=begin
+            )
+            x, y, *near = np.moveaxis(np.stack(trajectories, axis=1), 2, 0)
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
             far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
             off = np.max([0 * x, *(np.abs(z - x) / EPS for z in near)], axis=0)
-        growth = np.where(far < FARTHEST, growth, math.inf)  # what blows up says nothing
+        growth = np.where(far < MAX_DISTANCE, growth, math.inf)  # what blows up says nothing
         growth, off = (np.maximum.accumulate(each) for each in (growth, off))
         known = np.isfinite(off).all(axis=(1, 2))
         sure = int(np.sum(known & (growth < GROWTH_LIMIT)))  # nan is not
         return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
-    def begin(self, s: State) -> float:
+    def start_time(self, s: State) -> float:
         """When runs from a state begin: where rows may stand in time, when it is on them."""
         return s.t if self.system.constraints else 0.0
 
     def simulate(self, s: State, **how: Any) -> Any:
         """The module's run from a state."""
-        if begin := self.begin(s):
+        if begin := self.start_time(s):
             how.setdefault("t0", begin)
-        return simulate(self.module, started(self.module, s), **how)
+        return simulate(self.module, projected_start(self.module, s), **how)
 
     def run_energy(self) -> float:
         """The energy that a run reports, at the states that it reports."""
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
-        far = FARTHEST * self.sampler.scale
+        far = MAX_DISTANCE * self.sampler.scale
         errors = []
-        for row, found in zip(along(run, s), run.energy, strict=True):
+        for row, energy_of_run in zip(states_of_run(run, s), run.energy, strict=True):
             if np.all(np.abs(np.subtract([row.q, row.qd], [s.q, s.qd])) < far):
                 energy, size = self.sampler.energy(row)
-                errors += [self.units(found, energy, size)] if np.isfinite(energy) else []
+                errors += [self.units(energy_of_run, energy, size)] if np.isfinite(energy) else []
         return float(np.max(errors, initial=0))
 
     def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""
-        return ask(self.module, name, s)
+        return evaluate_module(self.module, name, s)
 
-    def moves(self, s: State) -> bool:
+    def has_finite_accelerations(self, s: State) -> bool:
         """Whether the module's accelerations are finite: single precision overflows sooner."""
         if self.dtype == np.float64:
             return True
@@ -375,7 +383,7 @@ class Comparison:
         """D = D^T."""
 
         def error(e: Expected) -> float:
-            D = ask(self.module, "D", e.state)
+            D = evaluate_module(self.module, "D", e.state)
             return self.units(D, D.T, e.size["D"])
 
         return self.largest(error)
@@ -383,14 +391,14 @@ class Comparison:
     def definiteness(self) -> float:
         """The least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
 
-        def least(e: Expected) -> float:
-            D = ask(self.module, "D", e.state)
+        def least_eigenvalue(e: Expected) -> float:
+            D = evaluate_module(self.module, "D", e.state)
             diagonal = np.diag(D)
             if np.any(diagonal <= 0):
                 return float(np.min(diagonal))
             return float(np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))[0])
 
-        return -self.largest(lambda e: -least(e))
+        return -self.largest(lambda e: -least_eigenvalue(e))
 
     def skewness(self) -> float:
         """(Ddot - 2C + dD/dt) + its transpose, Ddot and dD/dt by differences of order 8.
@@ -403,15 +411,18 @@ class Comparison:
         def error(e: Expected) -> float:
             s = e.state
             rate = np.max(np.abs(s.qd) / self.sampler.spread) or 1.0
-            C = ask(self.module, "C", s)
+            C = evaluate_module(self.module, "C", s)
 
-            def along(qd: Vector, width: float) -> Vector:
-                at = (ask(self.module, "D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
-                      for n, _ in stencil for k in (n, -n))  # fmt: skip
+            def rate_of_D(qd: Vector, width: float) -> Vector:
+                at = (
+                    self.ask("D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
+                    for n, _ in stencil
+                    for k in (n, -n)
+                )
                 return sum((w * (next(at) - next(at)) for _, w in stencil), 0 * C) / width
 
             def residual(width: float) -> float:
-                A = along(s.qd, width) + along(0 * s.qd, width) - 2 * C
+                A = rate_of_D(s.qd, width) + rate_of_D(0 * s.qd, width) - 2 * C
                 return float(np.max(np.abs(A + A.T) / (rate * e.size["D"] + np.abs(C))))
 
             residuals = (residual(part / rate) for part in (0.03, 0.003, 3e-4, 3e-5))
@@ -423,7 +434,9 @@ class Comparison:
         """bias = C qd + g."""
 
         def error(e: Expected) -> float:
-            bias, C, g = (ask(self.module, name, e.state) for name in ("bias", "C", "g"))
+            bias, C, g = (
+                evaluate_module(self.module, name, e.state) for name in ("bias", "C", "g")
+            )
             return self.units(C @ e.state.qd + g, bias, e.size["bias"])
 
         return self.largest(error)
@@ -433,10 +446,10 @@ class Comparison:
 
         def error(e: Expected) -> float:
             names = ("D", "acceleration", "bias", "tau")
-            D, qdd, bias, tau = (ask(self.module, name, e.state) for name in names)
+            D, qdd, bias, tau = (evaluate_module(self.module, name, e.state) for name in names)
             if self.system.constraints:
                 rows = ("multipliers", "constraint_jacobian")
-                multipliers, A = (ask(self.module, name, e.state) for name in rows)
+                multipliers, A = (evaluate_module(self.module, name, e.state) for name in rows)
                 tau = tau + multipliers @ A
             return self.units(D @ qdd + bias, tau, e.size["motion"])
 

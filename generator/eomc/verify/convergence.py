@@ -24,23 +24,28 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS, RK4
 from eomc.verify import one_step
-from eomc.verify.finding import Finding
-from eomc.verify.oracle import Vector
-from eomc.verify.sampling import State, along, ask, simulate, started
+from eomc.verify.measurement import Measurement
+from eomc.verify.reference import Vector
+from eomc.verify.sampling import State, evaluate_module, projected_start, simulate, states_of_run
 
 EPS = 2.0**-52
-SEEN = 8  # higher orders go from errors of a hundredth to rounding in two halvings of h
+MAX_OBSERVABLE_ORDER = (
+    8  # higher orders go from errors of a hundredth to rounding in two halvings of h
+)
 ORDER_MARGIN = 0.5  # below the order of a method: half way to the next lower one
-SMALL = 1e-2  # of the motion: differences below are in proportion to a power of h
-CLEAR = 30.0  # times what rounding does to a run: differences above are the method's own
-ALIKE = 0.3  # orders that differ by less are the same
+MAX_DIFFERENCE = 1e-2  # of the motion: differences below are in proportion to a power of h
+NOISE_FACTOR = 30.0  # times what rounding does to a run: differences above are the method's own
+ORDER_TOLERANCE = 0.3  # orders that differ by less are the same
 COUNTS = (6, 12, 24, 48, 96)  # steps of a span
-FIRST = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
+FIRST_SPANS = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
 LOWER, MOST = (-2, -4, -7, -10, -14, -20), 8  # then down to where all is rounding, and up
 BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
-BESIDE = (1 - 1e-3, 1 + 1e-3)  # times a state: hardly changes what is smooth, but its roundings
-CLOSED = 1e3  # roundings of the energy: a balance is closed
-RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
+NEARBY_FACTORS = (
+    1 - 1e-3,
+    1 + 1e-3,
+)  # times a state: hardly changes what is smooth, but its roundings
+CLOSED_TOLERANCE = 1e3  # roundings of the energy: a balance is closed
+CONVERGED_CHANGE = 1e-3  # of the motion: two methods are compared where halving h changes no more
 DRAWS = 2  # of starts moved by a rounding
 
 
@@ -73,29 +78,29 @@ class _Ladder:
         Where it is not, that is the least that the order may be.
         """
         for a, b in pairwise(self.differences):
-            if CLEAR * self.noise < a < SMALL:
-                yield math.log2(a / max(b, self.noise)), b > CLEAR * self.noise
+            if NOISE_FACTOR * self.noise < a < MAX_DIFFERENCE:
+                yield math.log2(a / max(b, self.noise)), b > NOISE_FACTOR * self.noise
 
     @property
     def exact(self) -> bool:
         """Whether all differences are rounding."""
-        return max(self.differences) <= CLEAR * self.noise
+        return max(self.differences) <= NOISE_FACTOR * self.noise
 
     def best(self, least: float) -> float:
         """The largest order, where it is at least so much and no finer halving tells otherwise."""
-        found = list(self.orders)
-        for k, (order, _) in enumerate(found):
-            if order >= least and all(p >= least / 2 for p, clear in found[k + 1 :] if clear):
-                return max(p for p, _ in found[k:])
+        observed = list(self.orders)
+        for k, (order, _) in enumerate(observed):
+            if order >= least and all(p >= least / 2 for p, clear in observed[k + 1 :] if clear):
+                return max(p for p, _ in observed[k:])
         return math.nan
 
     @property
-    def settled(self) -> float:
+    def agreed_order(self) -> float:
         """The order on which the last two halvings clear of rounding agree, or nan."""
-        found = [p for p, clear in self.orders if clear]
-        if len(found) < 2 or abs(found[-1] - found[-2]) > ALIKE:
+        observed = [p for p, clear in self.orders if clear]
+        if len(observed) < 2 or abs(observed[-1] - observed[-2]) > ORDER_TOLERANCE:
             return math.nan
-        return found[-1]
+        return observed[-1]
 
 
 class Convergence:
@@ -118,7 +123,7 @@ class Convergence:
             how["method"] = method
         if getattr(self.module, "constraint_names", ()):  # rows may stand in time
             how.setdefault("t0", s.t)
-            s = started(self.module, s)
+            s = projected_start(self.module, s)
         return simulate(self.module, s, **how)
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
@@ -143,18 +148,18 @@ class Convergence:
 
     # --- orders -----------------------------------------------------------------------------------
 
-    def order(self, method: str) -> Finding:
+    def order(self, method: str) -> Measurement:
         """Of convergence of the state: the best found from any place; inf where runs are exact.
 
         Raises RuntimeError where no run from any place gets to its end.
         """
-        least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
-        found = []
+        least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
+        orders = []
         for at in self.places:
-            found.append(self._order(at, method, least))
-            if math.isfinite(found[-1]) and found[-1] >= least:
+            orders.append(self._order(at, method, least))
+            if math.isfinite(orders[-1]) and orders[-1] >= least:
                 break  # a wrong stepper is nowhere right
-        return _judged(found, max, "too few halvings between rounding and a hundredth")
+        return _pick_order(orders, max, "too few halvings between rounding and a hundredth")
 
     def _order(self, at: Place, method: str, least: float) -> float:
         """The best of a few spans; else of all from the shortest that shows a difference upwards.
@@ -170,26 +175,26 @@ class Convergence:
                 ladders[power] = self._ladder(at, end, 48 * self.h * 2.0**power)
             return ladders[power]
 
-        for power in FIRST:
+        for power in FIRST_SPANS:
             if (one := ladder(power)) and not math.isnan(best := one.best(least)):
                 return best
         low = next((k for k in LOWER if (one := ladder(k)) and one.exact), LOWER[-1])
-        before, moved, bent = math.nan, False, False
+        before, moved, nonsmooth = math.nan, False, False
         for power in range(low, MOST + 1):
             if not (one := ladder(power)):
                 continue
             if not math.isnan(best := one.best(least)):
                 return best
-            if abs(one.settled - before) <= ALIKE:  # and nan is not
-                bent = bent or self._bends(at, method, one.span)
-                if not bent:  # which longer spans are too
-                    return one.settled
-            before, moved = one.settled, moved or not one.exact
+            if abs(one.agreed_order - before) <= ORDER_TOLERANCE:  # and nan is not
+                nonsmooth = nonsmooth or self._has_kink(at, method, one.span)
+                if not nonsmooth:  # which longer spans are too
+                    return one.agreed_order
+            before, moved = one.agreed_order, moved or not one.exact
         if not any(ladders.values()):
             raise RuntimeError(f"no run by {method} gets to its end")
         return math.nan if moved else math.inf
 
-    def _bends(self, at: Place, method: str, span: float) -> bool:
+    def _has_kink(self, at: Place, method: str, span: float) -> bool:
         """Whether another method is of low orders over a span too: steps leap over a bend.
 
         RK4 on the module's accelerations is one, beside those that the module has.
@@ -200,7 +205,7 @@ class Convergence:
         if not getattr(self.module, "constraint_names", ()):
             others.append((RK4.name, self._end_by_hand))
         for name, end in others:
-            least = min(METHODS[name].order, SEEN) - ORDER_MARGIN
+            least = min(METHODS[name].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
             one = self._ladder(at, end, span)
             if one and math.isnan(one.best(least)) and sum(clear for _, clear in one.orders) > 1:
                 return True
@@ -228,19 +233,19 @@ class Convergence:
 
     # --- two methods ------------------------------------------------------------------------------
 
-    def beside(self, method: str) -> Finding:
+    def compare_methods(self, method: str) -> Measurement:
         """How far another method ends from the first, over what halving h changes in the two.
 
         From each place the lesser of two spans: errors may meet by chance at one. The median of
         the places.
         """
-        found = [self._beside(at, method) for at in self.places]
-        known = [x for x in found if not math.isnan(x)]
+        ratios = [self._method_difference(at, method) for at in self.places]
+        known = [x for x in ratios if not math.isnan(x)]
         if known:
-            return Finding(float(np.median(known)))
-        return Finding(math.nan, "no span is short enough for the two methods' steps")
+            return Measurement(float(np.median(known)))
+        return Measurement(math.nan, "no span is short enough for the two methods' steps")
 
-    def _beside(self, at: Place, method: str) -> float:
+    def _method_difference(self, at: Place, method: str) -> float:
         ratios: list[float] = []
         for power in range(0, -20, -2):
             span = 24 * self.h * 2.0**power
@@ -253,10 +258,12 @@ class Convergence:
                 continue
             one, two, far, other = (np.asarray(end) for end in ends)
             change = np.abs(two - one) + np.abs(other - far)
-            if float(np.max(change)) > RESOLVED:
+            if float(np.max(change)) > CONVERGED_CHANGE:
                 continue
             noise = self.noise(at, partial(self.end, method=method), span, 48, other)
-            ratios.append(float(np.max(np.abs(two - other)) / (np.max(change) + 2 * CLEAR * noise)))
+            ratios.append(
+                float(np.max(np.abs(two - other)) / (np.max(change) + 2 * NOISE_FACTOR * noise))
+            )
             if len(ratios) == 2 or ratios[-1] <= 1:
                 break
         return min(ratios, default=math.nan)
@@ -274,10 +281,10 @@ class Convergence:
         """Half of the order of the method and Simpson's rule; a wrong power does not close: 0."""
         return min(METHODS[self._best_method].order, 4) / 2
 
-    def closing(self) -> Finding:
+    def closing(self) -> Measurement:
         """The order at which jacobi(T) - jacobi(0) - integral of power vanishes; inf: it is 0."""
-        found = [self._closing(at) for at in self.places]
-        return _judged(found, min, "the balance is neither closed nor left open")
+        orders = [self._closing(at) for at in self.places]
+        return _pick_order(orders, min, "the balance is neither closed nor left open")
 
     def _closing(self, at: Place) -> float:
         """From spans that are short enough upwards, until a rest of the balance shows.
@@ -295,7 +302,7 @@ class Convergence:
             a, b, c = gaps
             if abs(c - b) <= 0.1 * abs(c) and abs(b - a) <= 0.3 * abs(b):
                 grows = rest and 1.2 < c / rest < 20  # with the span, or with its square
-                if grows and self._is_left(at, self.h * 2.0**power, c):
+                if grows and self._gap_persists(at, self.h * 2.0**power, c):
                     return math.log2(abs(a / c)) / 2
                 rest = c
                 continue
@@ -305,12 +312,12 @@ class Convergence:
                 return order
         return math.inf if closed else math.nan
 
-    def _is_left(self, at: Place, span: float, rest: float) -> bool:
+    def _gap_persists(self, at: Place, span: float, rest: float) -> bool:
         """Whether as much is left of the balance beside that state."""
         s = at.state
-        near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in BESIDE)
-        found = [self._gaps(x, span)[0][-1:] for x in near]
-        return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in found)
+        near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in NEARBY_FACTORS)
+        gaps = [self._gaps(x, span)[0][-1:] for x in near]
+        return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in gaps)
 
     def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
         """What is left of the balance with 16, 32 and 64 steps; whether one of them closes it."""
@@ -319,7 +326,7 @@ class Convergence:
             run = self.run(s, self._best_method, h=span / n, steps=n)
             if str(run.status) != "ok":
                 return [], False
-            states = along(run, s)
+            states = states_of_run(run, s)
             power = np.array([self.ask("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
             after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
@@ -327,19 +334,21 @@ class Convergence:
             names = ("kinetic_energy", "potential_energy")
             sizes = [np.abs(self.ask(name, states[i])) for name in names for i in (0, -1)]
             energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
-            if abs(gaps[-1]) <= CLOSED * EPS * energy:
+            if abs(gaps[-1]) <= CLOSED_TOLERANCE * EPS * energy:
                 return gaps, True
         return (gaps if np.all(np.isfinite(gaps)) else []), False
 
     def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""
-        return ask(self.module, name, s)
+        return evaluate_module(self.module, name, s)
 
 
-def _judged(found: Iterable[float], pick: Callable[[Iterable[float]], float], why: str) -> Finding:
+def _pick_order(
+    values: Iterable[float], pick: Callable[[Iterable[float]], float], why: str
+) -> Measurement:
     """The one that `pick` takes of several places; inf where all that are known are exact."""
-    known = [x for x in found if not math.isnan(x)]
+    known = [x for x in values if not math.isnan(x)]
     orders = [x for x in known if math.isfinite(x)]
     if orders:
-        return Finding(pick(orders))
-    return Finding(math.inf) if known else Finding(math.nan, why)
+        return Measurement(pick(orders))
+    return Measurement(math.inf) if known else Measurement(math.nan, why)

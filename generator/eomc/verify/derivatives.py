@@ -10,20 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from eomc.verify.oracle import STENCIL, Answer, Vector
+from eomc.verify.reference import STENCIL, Reference, Vector
 from eomc.verify.sampling import State
 
 WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
 
 
-def by_differences(
-    reference: Answer, s: State, scale: Vector, defaults: Mapping[str, float],
-    of: str = "acceleration",
+def differentiate(
+    reference: Reference, s: State, scale: Vector, defaults: Mapping[str, float],
+    name: str = "acceleration",
 ) -> Iterator[tuple[Vector, Vector]]:  # fmt: skip
-    """dqdd/d[q, qd, u, p] (nq, 2 nq + nu + np) and the scales of these, for each of WIDTHS.
+    """Yield the derivatives of the reference's accelerations, for each of WIDTHS.
 
-    scale: (2, nq), of q and qd. u: held, at the signals where the state has none. of: what else the
-    reference has of a state, (m,), in place of qdd.
+    Yields dqdd/d[q, qd, u, p] (nq, 2 nq + nu + np) and the scales of these variables. `scale` (2,
+    nq) is the scale of q and qd. Inputs are held constant, at the signals if the state has none.
+    `name` selects another function of the reference, with values (m,), in place of `acceleration`.
     """
     n, params = len(s.q), dict(s.params or defaults)
     u = np.zeros(0)
@@ -38,27 +39,27 @@ def by_differences(
     for width in WIDTHS:
         steps = np.concatenate([k * np.diag(width * scales) for m, _ in STENCIL for k in (m, -m)])
         rows = x + steps
-        given: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "u": rows[:, 2 * n : 2 * n + len(u)] if len(u) else None,
             "params": dict(zip(params, rows[:, 2 * n + len(u) :].T, strict=True)),
         }
         t = np.full(len(rows), s.t)
-        a = getattr(reference, of)(rows[:, :n], rows[:, n : 2 * n], t, **given)
+        a = getattr(reference, name)(rows[:, :n], rows[:, n : 2 * n], t, **arguments)
         forward, back = np.moveaxis(a.reshape(len(STENCIL), 2, len(x), -1), 1, 0)
         weights = np.array([w for _, w in STENCIL])
         yield np.tensordot(weights, forward - back, 1).T / (width * scales), scales
 
 
-def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
+def relative_differences(values: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
     """The differences of two (nq, k), relative to each row's largest in those scales.
 
     size: (nq,), of the sums that the accelerations are: differences lose 1e-10 of it.
-    nan where `exact` is not finite, inf where `found` alone is not.
+    nan where `exact` is not finite, inf where `values` alone is not.
     """
     largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
     with np.errstate(all="ignore"):
-        off = np.abs(found - exact) * scales / largest[:, None]
-    off = np.where(found == exact, 0, off)
+        difference = np.abs(values - exact) * scales / largest[:, None]
+    difference = np.where(values == exact, 0, difference)
     return np.asarray(
-        np.where(np.isfinite(exact), np.where(np.isfinite(found), off, np.inf), np.nan)
+        np.where(np.isfinite(exact), np.where(np.isfinite(values), difference, np.inf), np.nan)
     )

@@ -12,63 +12,80 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from eomc.model.system import System
-from eomc.verify.oracle import Answer, Values, Vector
+from eomc.verify.reference import Reference, Values, Vector
 
 ROWS = ("g", "bias", "tau", "friction")
 KINETIC = ("kinetic", "energy", "jacobi")
 
 
-class Discrete(Answer):
+class DiscreteReference(Reference):
     """The equations of `system`, from an answer for `discrete.constant` of it."""
 
-    def __init__(self, system: System, core: Answer) -> None:
+    def __init__(self, system: System, core: Reference) -> None:
         self.system, self.core = system, core
         names = [c.name for c in system.coordinates]
-        self.own = [k for k, name in enumerate(names) if name not in system.discrete]
-        self.more = [k for k, name in enumerate(names) if name in system.discrete]
+        self.continuous_indices = [k for k, name in enumerate(names) if name not in system.discrete]
+        self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
         """As `Answer.terms`."""
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
-        values = {self.system.coordinates[k].name: float(q[k]) for k in self.more}
+        values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
         params = {**(s.get("params") or {}), **values}
-        own = {**s, "q": q[self.own], "qd": qd[self.own], "params": params}
-        more = float(np.sum(qd[self.more] ** 2)) / 2 if name == "energy" else 0.0
-        return self.core.terms(name, own) + more
+        own = {
+            **s,
+            "q": q[self.continuous_indices],
+            "qd": qd[self.continuous_indices],
+            "params": params,
+        }
+        added = float(np.sum(qd[self.discrete_indices] ** 2)) / 2 if name == "energy" else 0.0
+        return self.core.terms(name, own) + added
 
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        found = np.asarray(self.core._value(name, *self._of_core(q, qd, t, u, values)))
+        value = np.asarray(self.core._value(name, *self._core_arguments(q, qd, t, u, values)))
         if name in KINETIC:
-            found = found + np.sum(qd[..., self.more] ** 2, axis=-1) / 2
+            value = value + np.sum(qd[..., self.discrete_indices] ** 2, axis=-1) / 2
         elif name in ROWS or name == "constraint_jacobian":
-            found = self._columns(found)
+            value = self._with_discrete_columns(value)
         elif name in ("D", "C"):
-            found = self._square(found, float(name == "D"))
-        return found[()]
+            value = self._with_discrete_block(value, float(name == "D"))
+        return value[()]
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        D, force = self.core._motion(*self._of_core(q, qd, t, u, values))
-        return self._square(D, 1.0), self._columns(force)
+        D, force = self.core._motion(*self._core_arguments(q, qd, t, u, values))
+        return self._with_discrete_block(D, 1.0), self._with_discrete_columns(force)
 
-    def _of_core(
+    def _core_arguments(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector, Any, ArrayLike | None, Values]:
         """The same arguments, discrete variables among the parameters."""
-        more = (q[..., k] for k in self.more)
-        return q[..., self.own], qd[..., self.own], t, u, (*values, *more)
+        discrete = (q[..., k] for k in self.discrete_indices)
+        return (
+            q[..., self.continuous_indices],
+            qd[..., self.continuous_indices],
+            t,
+            u,
+            (*values, *discrete),
+        )
 
-    def _columns(self, found: Vector) -> Vector:
+    def _with_discrete_columns(self, columns: Vector) -> Vector:
         """(..., nq) with zeros for the discrete variables."""
-        whole = np.zeros((*found.shape[:-1], len(self.own) + len(self.more)))
-        whole[..., self.own] = found
-        return whole
+        result = np.zeros(
+            (*columns.shape[:-1], len(self.continuous_indices) + len(self.discrete_indices))
+        )
+        result[..., self.continuous_indices] = columns
+        return result
 
-    def _square(self, found: Vector, diagonal: float) -> Vector:
+    def _with_discrete_block(self, matrix: Vector, diagonal: float) -> Vector:
         """(..., nq, nq), likewise, with these numbers on their diagonal."""
-        whole = np.swapaxes(self._columns(np.swapaxes(self._columns(found), -1, -2)), -1, -2)
-        whole[..., self.more, self.more] = diagonal
-        return whole
+        result = np.swapaxes(
+            self._with_discrete_columns(np.swapaxes(self._with_discrete_columns(matrix), -1, -2)),
+            -1,
+            -2,
+        )
+        result[..., self.discrete_indices, self.discrete_indices] = diagonal
+        return result

@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
+EIGENVALUE_TOLERANCE = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 RANK_TOLERANCE = 1e-9  # of the largest singular value: a row that is none here
-MOST = 60  # sweeps of Newton's method
+MAX_ITERATIONS = 60  # sweeps of Newton's method
 NEARER = 200  # sweeps towards the nearest place
-HELD = 1e-10  # of the terms of a row: what it may still be
-SETTLED = 16 * 2.0**-52  # of the state: what a correction may still be when it is rounding
+RESIDUAL_TOLERANCE = 1e-10  # of the terms of a row: what it may still be
+CONVERGENCE_TOLERANCE = (
+    16 * 2.0**-52
+)  # of the state: what a correction may still be when it is rounding
 
 
 def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
@@ -48,33 +50,33 @@ def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, V
 
 def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
     """At one state; rows of zeros say nothing, and have the multiplier 0."""
-    multipliers, on = np.zeros(len(A)), A.any(axis=1)
-    A, level = A[on], level[on]
+    multipliers, nonzero = np.zeros(len(A)), A.any(axis=1)
+    A, level = A[nonzero], level[nonzero]
     n, m = len(D), len(A)
     scale = scales(D, A)
     matrix = _scaled(D, A, np.zeros((m, m)), scale)
     right = scale * np.concatenate([force, level])
     sizes = np.linalg.svd(matrix, compute_uv=False)
     if sizes[-1] > RANK_TOLERANCE * sizes[0]:
-        found = np.linalg.solve(matrix, right)
-        found += np.linalg.solve(matrix, right - matrix @ found)
+        solution = np.linalg.solve(matrix, right)
+        solution += np.linalg.solve(matrix, right - matrix @ solution)
     else:
-        found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
-    found *= scale
-    multipliers[on] = found[n:]
-    return found[:n], multipliers
+        solution = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
+    solution *= scale
+    multipliers[nonzero] = solution[n:]
+    return solution[:n], multipliers
 
 
-def kept(D: Vector, A: Vector, held: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """D and A with which the coordinates `held` do not change."""
+def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tuple[Vector, Vector]:
+    """D and A with which the coordinates `fixed` do not change."""
     D, A = D.copy(), A.copy()
-    for i in held:
+    for i in fixed:
         D[i] = D[:, i] = A[:, i] = 0
         D[i, i] = 1
     return D, A
 
 
-def inverse(D: Vector, A: Vector) -> Vector:
+def absolute_inverse(D: Vector, A: Vector) -> Vector:
     """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded.
 
     A row of zeros has the multiplier 0.
@@ -84,7 +86,7 @@ def inverse(D: Vector, A: Vector) -> Vector:
     return np.asarray(np.abs(scale[:, None] * np.linalg.inv(matrix) * scale))
 
 
-def regular(D: Vector, A: Vector, least: float) -> bool:
+def is_regular(D: Vector, A: Vector, least: float) -> bool:
     """Whether the scaled matrix is far from singular: its singular values above `least`.
 
     Those of rows are squares of A's.
@@ -116,7 +118,7 @@ def scales(D: Vector, A: Vector) -> Vector:
     return np.concatenate([coordinates, 1 / np.where(rows > 0, rows, 1)])
 
 
-def least_along(D: Vector, A: Vector) -> float:
+def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
     """The least eigenvalue of D, (n, n), along what rows A, (m, n), make zero, scaled to 1.
 
     nan: not to be judged, as where rows depend on one another.
@@ -127,18 +129,18 @@ def least_along(D: Vector, A: Vector) -> float:
     if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A)) and np.all(rows > 0)):
         return np.nan
     _, s, V = np.linalg.svd(A / size / rows[:, None])
-    if len(s) and s[-1] < CLEAR:
+    if len(s) and s[-1] < EIGENVALUE_TOLERANCE:
         return np.nan
     N = V[len(s) :].T
     return float(np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)[0]) if N.size else 0.0
 
 
-def inert(D: Vector, A: Vector) -> bool:
+def is_nonnegative(D: Vector, A: Vector) -> bool:
     """Whether D is negative along nothing that rows A leave; True where that can't be judged."""
-    return not least_along(D, A) < -CLEAR
+    return not least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE
 
 
-def onto(
+def project(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
     """The x nearest to q on the rows, in the metric of D, and its last correction, in its sizes.
@@ -153,14 +155,14 @@ def onto(
     if not last < 1e-10:
         return x, last
     for _ in range(NEARER):
-        D, A, off = rows(x)
-        by, _ = solve(D, A, np.zeros(len(q)), -(off + A @ (q - x)))
-        by += q - x
-        size = float(np.max(np.abs(by) / (np.abs(x) + np.max(np.abs(x)) + 1), initial=0))
+        D, A, residual = rows(x)
+        correction, _ = solve(D, A, np.zeros(len(q)), -(residual + A @ (q - x)))
+        correction += q - x
+        size = float(np.max(np.abs(correction) / (np.abs(x) + np.max(np.abs(x)) + 1), initial=0))
         if not np.isfinite(size) or part < 1e-2:
             return x, np.inf
-        x = x + part * by
-        if size <= SETTLED or (size < 1e-12 and size > before / 2):
+        x = x + part * correction
+        if size <= CONVERGENCE_TOLERANCE or (size < 1e-12 and size > before / 2):
             return x, size
         part /= 1 + (size > before / 2)
         before = size
@@ -175,24 +177,26 @@ def _onto(
     Long corrections are halved until what is to be zero gets less. The last correction is inf where
     the last q is not on the rows.
     """
-    D, A, off = rows(q)
+    D, A, residual = rows(q)
     last = np.inf
-    for _ in range(MOST):
-        by, _ = solve(D, A, np.zeros(len(q)), -off)
-        size = float(np.max(np.abs(by) / (np.abs(q) + np.max(np.abs(q)) + 1), initial=0))
+    for _ in range(MAX_ITERATIONS):
+        correction, _ = solve(D, A, np.zeros(len(q)), -residual)
+        size = float(np.max(np.abs(correction) / (np.abs(q) + np.max(np.abs(q)) + 1), initial=0))
         if not np.isfinite(size):
             return q, np.inf
-        if size <= SETTLED or (size < 1e-12 and size > last / 2):
+        if size <= CONVERGENCE_TOLERANCE or (size < 1e-12 and size > last / 2):
             level = np.abs(A) @ (np.abs(q) + np.max(np.abs(q)) + 1)
-            return q + by, size if np.all(np.abs(off) <= HELD * level) else np.inf
+            return q + correction, size if np.all(
+                np.abs(residual) <= RESIDUAL_TOLERANCE * level
+            ) else np.inf
         last, part = size, 1.0
         weight = scales(D, A)[len(q) :]
-        before = np.linalg.norm(weight * off)
+        before = np.linalg.norm(weight * residual)
         while part > 1e-3 and size >= 1e-6:
-            after = np.linalg.norm(weight * rows(q + part * by)[2])
+            after = np.linalg.norm(weight * rows(q + part * correction)[2])
             if after <= (1 - part / 4) * before:
                 break
             part /= 2
-        q = q + part * by
-        D, A, off = rows(q)
+        q = q + part * correction
+        D, A, residual = rows(q)
     return q, last

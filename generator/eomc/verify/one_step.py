@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import Method
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 
-SWEEPS = 20  # over the stages of an implicit method: they are to contract to a seventh
-SETTLED = 4 * 2.0**-52  # of a velocity: the stages are found
-ALL_BUT = 1e-10  # the same, where corrections are rounding and get no smaller
+MAX_SWEEPS = 20  # over the stages of an implicit method: they are to contract to a seventh
+CONVERGENCE_TOLERANCE = 4 * 2.0**-52  # of a velocity: the stages are found
+STAGNATION_TOLERANCE = 1e-10  # the same, where corrections are rounding and get no smaller
 WIDTH = 1e-5  # of differences
 
 Acceleration = Callable[[Vector, Vector, Any], Vector]
@@ -47,14 +47,14 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
             a[i] = at_stage(i, a)
     else:
         a[:] = acceleration(q, qd, t)
-        for _ in range(SWEEPS):
+        for _ in range(MAX_SWEEPS):
             new = at_stages(a)
             change = float(np.max(np.abs(new - a)))
             size = np.abs(qd) / h + np.max(np.abs(new), axis=0)
             a = new
             if not np.isfinite(change):  # a row has overflowed: others may be on their way
                 a[:] = np.nan
-            if not change > SETTLED * float(np.max(size)):
+            if not change > CONVERGENCE_TOLERANCE * float(np.max(size)):
                 break
         else:
             a[:] = np.nan
@@ -70,7 +70,7 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
     return np.asarray(((f[: 2 * n] - f[2 * n :]) / (2 * np.diag(by)[:, None])).T)
 
 
-def contraction(m: Method, slopes: Vector, h: float) -> float:
+def contraction_factor(m: Method, slopes: Vector, h: float) -> float:
     """By how much a plain sweep makes errors of an implicit method's stages less, at the end.
 
     slopes: (nq, 2 nq), da/dq and da/dqd.
@@ -85,7 +85,7 @@ def _sweep(m: Method, slopes: Vector, h: float) -> Vector:
     return np.asarray(h * np.kron(A, slopes[:, n:]) + h**2 * np.kron(AA, slopes[:, :n]))
 
 
-def by_newton(
+def step_by_newton(
     m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: float, h: float
 ) -> tuple[Vector, int]:
     """(2, nq): q and qd (nq,) at t + h by an implicit method, and how many sweeps it took.
@@ -101,7 +101,7 @@ def by_newton(
     J = slopes(acceleration, q, qd, t, scale)
     M = np.eye(S * n) - _sweep(m, J, h)
     a, count, last = np.tile(first, (S, 1)), 0, np.inf
-    while count < SWEEPS:
+    while count < MAX_SWEEPS:
         places = q + h * np.outer(c, qd) + h**2 * AA @ a
         f = acceleration(places, qd + h * A @ a, t + c * h)
         if not np.all(np.isfinite(f)):
@@ -110,13 +110,13 @@ def by_newton(
         a, count = a + d, count + 1
         change = float(np.max(np.abs(d)))
         size = np.max(np.abs(qd)) / h + np.max(np.abs(q)) / h**2 + np.max(np.abs(a))
-        if change <= SETTLED * float(size) or (
-            change <= ALL_BUT * float(size) and change > last / 2
+        if change <= CONVERGENCE_TOLERANCE * float(size) or (
+            change <= STAGNATION_TOLERANCE * float(size) and change > last / 2
         ):
             ends = [q + h * qd + h**2 * b_a @ a, qd + h * b @ a]
             return np.array(ends), count
         last = change
-    return np.full((2, n), np.nan), SWEEPS
+    return np.full((2, n), np.nan), MAX_SWEEPS
 
 
 def _square(rows: tuple[tuple[Any, ...], ...], n: int) -> Vector:

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
-from eomc.verify.rows_adaptive import resolved
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
+from eomc.verify.rows_adaptive import resolves_steps
 from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State, simulate
@@ -25,14 +25,14 @@ from eomc.verify.sampling import State, simulate
 COUNT = 19  # instances: more than twice what any register holds
 FEW = 4  # singular states
 STEPS = 4  # of a run that is compared with that of one alone
-TOLERANCE, LONGEST = {8: 1e-12, 4: 1e-6}, 0.3  # by bytes of a number; h_most, of a run
+TOLERANCE, MAX_STEP_FRACTION = {8: 1e-12, 4: 1e-6}, 0.3  # by bytes of a number; h_most, of a run
 LIMIT, UNIT = 1.0, "tolerances a step"
 EVENTS = 64  # of a call of each, beside those of a step
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
 @dataclass
-class Left:
+class BatchResult:
     """What calls of C left in place: states (n, 2 nq), times, rows, counts, statuses."""
 
     x: Vector
@@ -45,23 +45,23 @@ class Left:
         return [x[which] for x in (self.x, self.t, self.rows, self.counts, self.status)]
 
 
-def report(of: Comparison, singular: list[State]) -> None:
+def report(check: Comparison, singular: list[State]) -> None:
     """Add the rows of a scene that asks for both."""
-    if of.system.run.tolerance is None or not of.system.run.batch:
+    if check.system.run.tolerance is None or not check.system.run.batch:
         return
-    made = Many(of, singular)
-    of.row("adaptive steps of many", LIMIT, UNIT, made.beside)
-    for module, form in of.forms:
-        many = Many(of, singular, module)
-        of.row(f"{form}adaptive steps of many: bits", 0, "instances", many.alike)
-        of.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.refused)
+    rows = BatchRows(check, singular)
+    check.row("adaptive steps of many", LIMIT, UNIT, rows.compare_with_single_runs)
+    for module, form in check.forms:
+        many = BatchRows(check, singular, module)
+        check.row(f"{form}adaptive steps of many: bits", 0, "instances", many.differing_instances)
+        check.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.wrong_refusals)
 
 
-class Found:
+class EventRecorder:
     """Room for the events of each in a call of C, and the number and digest of all of each."""
 
     def __init__(self, model: Any, count: int) -> None:
-        self.said: list[list[int]] = [[0, 0] for _ in range(count)]
+        self.digests: list[list[int]] = [[0, 0] for _ in range(count)]
         self.room: tuple[Any, ...] = ()
         if not model.events:
             return
@@ -72,51 +72,51 @@ class Found:
         places = address(long, self.counts), address(integer, self.which)
         self.room = (each, *places, model._pointer(self.rows))
 
-    def keep(self) -> None:
+    def record(self) -> None:
         """Those of the last call."""
         for k, n in enumerate(self.counts if self.room else ()):
-            number, digest = self.said[k]
+            number, digest = self.digests[k]
             for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
                 number, digest = number + 1, zlib.crc32(which.tobytes() + row.tobytes(), digest)
-            self.said[k] = [number, digest]
+            self.digests[k] = [number, digest]
 
 
-class Many:
+class BatchRows:
     """Instances beside a sampled state whose time tells steps, under its inputs, at its time."""
 
-    def __init__(self, of: Comparison, singular: list[State], module: Any = None) -> None:
-        self.of, self.module, self.singular = of, module or of.module, singular
+    def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
+        self.check, self.module, self.singular = check, module or check.module, singular
         self.model = self.module._model
         self.tol = TOLERANCE[self.model.dtype.itemsize]
-        states = [e.state for e in reversed(of.few(2))]
-        self.state = s = next(filter(self.told, states), states[0])
-        random, sampler = np.random.default_rng(3), of.sampler
+        states = [e.state for e in reversed(check.few(2))]
+        self.state = s = next(filter(self.resolves_steps, states), states[0])
+        random, sampler = np.random.default_rng(3), check.sampler
         self.starts = [
-            sampler.onto(replace(s, q=s.q + dq, qd=s.qd + dv))
+            sampler.project(replace(s, q=s.q + dq, qd=s.qd + dv))
             for dq, dv in zip(
                 1e-2 * sampler.spread * random.standard_normal((COUNT, len(s.q))),
                 1e-2 * sampler.speed * random.standard_normal((COUNT, len(s.q))), strict=True,
             )
         ]  # fmt: skip
 
-    def alone(self, s: State, **span: Any) -> Any:
+    def single_run(self, s: State, **span: Any) -> Any:
         """A run of one from there."""
         return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
     def span(self, s: State) -> float:
         """How long some steps take; 0 where there is none."""
-        run = self.alone(s, duration=self.of.system.run.duration)
+        run = self.single_run(s, duration=self.check.system.run.duration)
         return float(run.t[min(STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
 
-    def told(self, s: State) -> bool:
+    def resolves_steps(self, s: State) -> bool:
         """Whether times there tell steps."""
-        return resolved(self.of, s, self.span(s) / STEPS)
+        return resolves_steps(self.check, s, self.span(s) / STEPS)
 
-    def beside(self) -> float | Finding:
+    def compare_with_single_runs(self) -> float | Measurement:
         """The ends and rows of some steps of each, beside those of its run alone."""
         s, T = self.state, self.span(self.state)
-        if not self.told(s):
-            return Finding(math.nan, "times tell no steps")
+        if not self.resolves_steps(s):
+            return Measurement(math.nan, "times tell no steps")
         times = s.t + T * np.array([0.4, 1.0])
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
             q, qd = (np.array([getattr(x, name) for x in self.starts]) for name in ("q", "qd"))
@@ -124,22 +124,24 @@ class Many:
                 q, qd, times=times, tol=self.tol, t0=s.t, params=s.params,
                 u=None if s.u is None else np.tile(s.u, (COUNT, 1)), threads=1,
             )  # fmt: skip
-        return largest((self.off(many, k, times) for k in range(COUNT)), "no instance has a step")
+        return largest(
+            (self.end_error(many, k, times) for k in range(COUNT)), "no instance has a step"
+        )
 
-    def off(self, many: Any, k: int, times: Vector) -> float | None:
+    def end_error(self, many: Any, k: int, times: Vector) -> float | None:
         """How far an instance is from its run alone; None where that stops."""
-        one = self.alone(self.starts[k], times=times)
+        one = self.single_run(self.starts[k], times=times)
         if one.status != "ok" or len(one) < len(times):
             return None
         x = np.hstack([many.q[k], many.qd[k]]).astype(float)
-        scale = np.abs(one.x).max(axis=0) + self.of.sampler.scale.ravel()
-        allowed = (self.tol + ROUNDING * self.of.eps) * (one.steps + 1)
+        scale = np.abs(one.x).max(axis=0) + self.check.sampler.scale.ravel()
+        allowed = (self.tol + ROUNDING * self.check.eps) * (one.steps + 1)
         return float(np.nan_to_num(np.max(np.abs(x - one.x) / scale) / allowed, nan=math.inf))
 
     def drive(
         self, starts: list[State], span: float, steps: int, *, stiff: bool = False,
         longest: float = 0.0,
-    ) -> Left:  # fmt: skip
+    ) -> BatchResult:  # fmt: skip
         """The C function called until none is left, `steps` of each at once."""
         model, n, s = self.model, len(starts), starts[0]
         new = model._ffi.new
@@ -148,52 +150,54 @@ class Many:
         end = self.state.t + span
         times = np.array([self.state.t + 0.6 * span, end], model.dtype)
         rows = np.full((2, n, 2, model.nq), np.nan, model.dtype)
-        kept, status, memory = np.zeros(n, "l"), np.zeros(n, "i"), new("adaptive_memory[]", n)
+        row_counts, status, memory = np.zeros(n, "l"), np.zeros(n, "i"), new("adaptive_memory[]", n)
         for one in memory if stiff else ():
             one.stiff = 1
         u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
         p = np.array([parameters(model, x) for x in starts], model.dtype)
         address, (long, integer) = model._c[0], model._whole
-        found = Found(model, n)
+        events_found = EventRecorder(model, n)
         for _ in range(100_000):
-            left = model._lib.adaptive_batch(
+            remaining = model._lib.adaptive_batch(
                 n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
                 model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
-                model._pointer(rows[1]), *found.room, model._pointer(p), 1, memory,
-                address(long, kept), address(integer, status),
+                model._pointer(rows[1]), *events_found.room, model._pointer(p), 1, memory,
+                address(long, row_counts), address(integer, status),
             )  # fmt: skip
-            found.keep()
-            if not left:
+            events_found.record()
+            if not remaining:
                 break
         counts = [
-            [m.steps, m.rejected, m.evaluations, m.stiff_steps, *said]
-            for m, said in zip(memory, found.said, strict=True)
+            [m.steps, m.rejected, m.evaluations, m.stiff_steps, *digest_entry]
+            for m, digest_entry in zip(memory, events_found.digests, strict=True)
         ]
-        return Left(np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status)
+        return BatchResult(
+            np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status
+        )
 
-    def alike(self) -> float:
+    def differing_instances(self) -> float:
         """How many differ in other places, in calls of one step each, or where some begin stiff."""
         wrong, T = 0, self.span(self.state)
-        for stiff, longest in ((False, LONGEST * T), (False, 0.0), (True, 0.0)):
+        for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
             how: Any = {"stiff": stiff, "longest": longest}
             whole, few = (self.drive(self.starts, T, n, **how) for n in (1000, 1))
             back = self.drive(self.starts[::-1], T, 3, **how)
-            alone = [self.drive([x], T, 1000, **how) for x in self.starts[:3]]
+            single = [self.drive([x], T, 1000, **how) for x in self.starts[:3]]
             for k in range(COUNT):
-                others = [few[k], back[COUNT - 1 - k], *([alone[k][0]] if k < len(alone) else [])]
+                others = [few[k], back[COUNT - 1 - k], *([single[k][0]] if k < len(single) else [])]
                 wrong += any(_differ(whole[k], other) for other in others)
         return float(wrong)
 
-    def refused(self) -> float:
+    def wrong_refusals(self) -> float:
         """How many do not say that they can't begin, or disturb those who can."""
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
         known = self.singular[:: max(1, len(self.singular) // FEW)]
         odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]
-        found, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
-        wrong = sum(_differ(found[k + len(odd)], expected[k]) for k in range(len(rest)))
-        wrong += int(found.status[0] != NOT_FINITE) + int(found.status[1] == 0)
-        wrong += sum(code not in (SINGULAR, NOT_FINITE) for code in found.status[2 : len(odd)])
+        result, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
+        wrong = sum(_differ(result[k + len(odd)], expected[k]) for k in range(len(rest)))
+        wrong += int(result.status[0] != NOT_FINITE) + int(result.status[1] == 0)
+        wrong += sum(code not in (SINGULAR, NOT_FINITE) for code in result.status[2 : len(odd)])
         return float(wrong)
 
 

@@ -10,21 +10,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
-from eomc.verify.rows_adaptive import TICKS, resolved
-from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals, unfinite
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
+from eomc.verify.rows_adaptive import TIME_ROUNDINGS, resolves_steps
+from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals, with_nonfinite_entries
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State
 
-FEW, ROOM = 8, 40  # states; steps of a run
+FEW, MAX_STEPS = 8, 40  # states; steps of a run
 PARTS = 7  # steps of a span in which one would do
-LOOSE = 1e-3  # tolerance
+LOOSE_TOLERANCE = 1e-3  # tolerance
 TURNS = 1e7  # rad: sines of several angles at once come to their limit before
 
 
 @dataclass(frozen=True)
-class _Driven:
+class _RunResult:
     """What a run of the C function left: rows (n, 2 nq), their times (n,), its place (2 nq,)."""
 
     status: int
@@ -33,18 +33,18 @@ class _Driven:
     x: Vector
 
     @property
-    def stays(self) -> bool:
+    def refuses_cleanly(self) -> bool:
         """Whether it refuses, and leaves only finite states."""
         return self.status != OK and not len(self.rows)
 
 
-def report(of: Comparison, refusals: Refusals) -> None:
+def report(check: Comparison, refusals: Refusals) -> None:
     """Add the rows of a scene that asks for a tolerance."""
-    if of.system.run.tolerance is None:
+    if check.system.run.tolerance is None:
         return
-    made = _Adaptive(of, refusals)
-    of.row("adaptive steps: refusals", 0, "runs that end otherwise", made.refused)
-    of.row("adaptive steps: longest", 0, "runs that end otherwise", made.longest)
+    rows = _Adaptive(check, refusals)
+    check.row("adaptive steps: refusals", 0, "runs that end otherwise", rows.wrong_refusals)
+    check.row("adaptive steps: longest", 0, "runs that end otherwise", rows.longest)
 
 
 class _Adaptive:
@@ -54,10 +54,10 @@ class _Adaptive:
 
     def drive(
         self, s: State, span: float, tol: float, h_most: float = 0.0, stiff: bool = False,
-        each: int = ROOM,
-    ) -> _Driven:  # fmt: skip
+        each: int = MAX_STEPS,
+    ) -> _RunResult:  # fmt: skip
         """A run of at most ROOM steps, `each` of them in a call."""
-        model, many = self.model, 2 * ROOM
+        model, many = self.model, 2 * MAX_STEPS
         x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)
         rows, times = np.full((2, many, model.nq), np.nan, model.dtype), np.zeros(many, model.dtype)
         u = None if s.u is None else np.array(s.u, model.dtype)
@@ -65,7 +65,7 @@ class _Adaptive:
         work.stiff = stiff
         events = (0, model._ffi.NULL, null) if model.events else ()
         n, status, end = 0, OK, s.t + span
-        for _ in range(0, ROOM, each):
+        for _ in range(0, MAX_STEPS, each):
             if status != OK or t[0] >= end or (model.events and work.stopped):
                 break
             status = model._lib.adaptive(
@@ -74,48 +74,51 @@ class _Adaptive:
                 model._pointer(rows[1, n:]), *events, model._pointer(p), work,
             )  # fmt: skip
             n += work.rows
-        return _Driven(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
+        return _RunResult(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
 
-    def refused(self) -> float:
+    def wrong_refusals(self) -> float:
         """From where D is singular, or numbers are none, or too large for a step."""
-        h, tol = self.check.system.run.h, LOOSE
+        h, tol = self.check.system.run.h, LOOSE_TOLERANCE
         wrong = 0
         for s in self.refusals.singular[:: max(1, len(self.refusals.singular) // FEW)]:
             for stiff in (False, True):
                 run = self.drive(s, 10 * h, tol, stiff=stiff)
-                wrong += not (run.stays and run.status == SINGULAR)
+                wrong += not (run.refuses_cleanly and run.status == SINGULAR)
                 wrong += not np.array_equal(run.x, np.asarray([s.q, s.qd], run.x.dtype).ravel())
-        for *_, odd in unfinite(self.state):
+        for *_, odd in with_nonfinite_entries(self.state):
             run = self.drive(odd, 10 * h, tol)
-            wrong += not run.stays or run.status not in REFUSED
-        return float(wrong + self.overflown())
+            wrong += not run.refuses_cleanly or run.status not in REFUSED
+        return float(wrong + self.overflow_errors())
 
-    def overflown(self) -> int:
+    def overflow_errors(self) -> int:
         """How many runs keep states that are not finite, of those that start almost there."""
         wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
         for unit in np.eye(len(self.state.q)):
             for size in (TURNS, huge):
                 for stiff in (False, True):
                     far = replace(self.state, q=size * unit, qd=1.01 * size * unit)
-                    run = self.drive(far, 1.0, LOOSE, stiff=stiff)
+                    run = self.drive(far, 1.0, LOOSE_TOLERANCE, stiff=stiff)
                     wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
         return wrong
 
-    def longest(self) -> float | Finding:
+    def longest(self) -> float | Measurement:
         """No step is longer than asked for, the last ends at the end, and calls leave no trace."""
-        errors = (self.parted(e.state) for e in self.check.few(2))
+        errors = (self.step_limit_errors(e.state) for e in self.check.few(2))
         return largest(errors, "time tells no parts of a first step")
 
-    def parted(self, s: State) -> float | None:
+    def step_limit_errors(self, s: State) -> float | None:
         """What is wrong with the first step in PARTS; None where there are none."""
-        first = self.drive(s, self.check.system.run.duration, LOOSE)
+        first = self.drive(s, self.check.system.run.duration, LOOSE_TOLERANCE)
         later = first.times[first.times > s.t]  # the state may jump at once
         span = float(later[0]) - s.t if len(later) else 0.0
-        if not resolved(self.check, s, span / PARTS):
+        if not resolves_steps(self.check, s, span / PARTS):
             return None
-        run, cut = (self.drive(s, span, LOOSE, h_most=span / PARTS, each=n) for n in (ROOM, 1))
+        run, cut = (
+            self.drive(s, span, LOOSE_TOLERANCE, h_most=span / PARTS, each=n)
+            for n in (MAX_STEPS, 1)
+        )
         sizes = np.diff(np.concatenate([[s.t], run.times]))
-        rounding = TICKS * self.check.eps * (abs(s.t) + span)
+        rounding = TIME_ROUNDINGS * self.check.eps * (abs(s.t) + span)
         late = bool(np.any(sizes > span / PARTS + rounding)) or len(run.times) < PARTS
         end = np.asarray(s.t + span, run.times.dtype)
         there = run.status == OK and run.times[-1] == end

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
 from eomc.verify.rows_refusals import SINGULAR
-from eomc.verify.rows_runs import EVERY, LONG, TURNS, Driven, Runs, drive
+from eomc.verify.rows_runs import EVERY, LONG, TURNS, RunResult, Runs, run_in_c
 from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
@@ -37,7 +37,7 @@ class Batches:
         self.module, self.runs = self.check.module, runs
         self.random = np.random.default_rng(9)
         self.singular = singular
-        self.instances = self.made()
+        self.instances = self.sample_instances()
         # along which neighbours differ: each coordinate by a part of its own, so that none cancel
         shape, random = (2, self.model.nq), np.random.default_rng(10)
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
@@ -47,16 +47,16 @@ class Batches:
         row = self.check.row
         for method in self.check.methods:
             row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
-                partial(self.beside, method))  # fmt: skip
+                partial(self.compare_with_single_steps, method))  # fmt: skip
             row(f"batch of {method}: places", 0, "batches with other bits",
                 partial(self.places, method))  # fmt: skip
             if not self.check.system.constraints:  # which move the starts that fail
                 row(f"batch of {method}: failures", 0, "instances that end otherwise",
                     partial(self.failures, method))  # fmt: skip
 
-    def made(self) -> list[State]:
+    def sample_instances(self) -> list[State]:
         """Random starts and parameters, some of them far out, some in haste, all regular."""
-        sampler, found = self.check.sampler, []
+        sampler, instances = self.check.sampler, []
         t = self.runs.states[-1].t
         own = [e.state for e in self.check.expected]
         for k in range(COUNT):
@@ -68,17 +68,17 @@ class Batches:
             if k % 7 == 3:  # steps in which angles move too far to be rotated
                 x[1] = x[1] + self.random.choice(LONG) * sampler.spread / self.h
             params = s.params or sampler.defaults
-            made = replace(s, q=x[0], qd=x[1], t=t, u=None, params=params)
-            found.append(self.on_rows(made, replace(s, t=t, u=None, params=params)))
-        return found
+            instance = replace(s, q=x[0], qd=x[1], t=t, u=None, params=params)
+            instances.append(self.projected(instance, replace(s, t=t, u=None, params=params)))
+        return instances
 
-    def on_rows(self, s: State, near: State) -> State:
+    def projected(self, s: State, near: State) -> State:
         """The state put onto constraints, or else one near it, or the start."""
         if not self.check.system.constraints:
             return s
         sampler = self.check.sampler
         start = replace(sampler.start, t=0.0, params=sampler.defaults)
-        onto = (sampler.onto(x) for x in (s, near))
+        onto = (sampler.project(x) for x in (s, near))
         return next((x for x in onto if np.all(np.isfinite(x.q))), replace(start, t=near.t))
 
     def simulate(
@@ -106,7 +106,7 @@ class Batches:
         rows = self.random.normal(size=shape).astype(self.model.dtype)
         return [None, rows[:, 0], rows]
 
-    def beside(self, method: str) -> float | Finding:
+    def compare_with_single_steps(self, method: str) -> float | Measurement:
         """Each step of each instance beside a single step from where the batch had it.
 
         Runs of seven steps may part as far as they go, where steps are too long for the motion.
@@ -123,22 +123,22 @@ class Batches:
                     errors.append(self.step_off(method, at, rows[:, n + 1]))
         return largest(errors, "no step of an instance has digits to compare")
 
-    def step_off(self, method: str, s: State, found: Vector) -> float | None:
+    def step_off(self, method: str, s: State, end: Vector) -> float | None:
         """The end of a step beside that of a single one, in units; None where it has no digits."""
         x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
         spread = self.runs.sampler.scale
         wide = float(np.max(1 + np.abs(x) / spread))  # the last digit, of what would be 1 elsewhere
         if wide * self.check.eps > nudge:
             return None
-        alone = drive(self.model, method, s, self.h, 1)
+        alone = run_in_c(self.model, method, s, self.h, 1)
         q, qd = x + nudge * spread * self.direction
-        moved = drive(self.model, method, replace(s, q=q, qd=qd), self.h, 1)
+        moved = run_in_c(self.model, method, replace(s, q=q, qd=qd), self.h, 1)
         if alone.status or moved.status:
             return None
         # what a change by all of the spread would make of each number
         grown = np.max(np.abs(moved.rows - alone.rows), axis=1) / nudge
         size = wide * (grown + np.abs(alone.rows[:, 1]))
-        return self.check.units(found, alone.rows[:, 1], size)
+        return self.check.units(end, alone.rows[:, 1], size)
 
     def places(self, method: str) -> float:
         """How many batches are not to the bit what their instances are elsewhere."""
@@ -151,21 +151,27 @@ class Batches:
                 other = self.simulate(
                     method, [self.instances[k] for k in part], None if u is None else u[part]
                 )
-                wrong += not _same(other, whole, part)
+                wrong += not _are_permuted(other, whole, part)
             sparse = self.simulate(method, self.instances, u, every=EVERY)
-            kept = np.minimum(EVERY * np.arange(sparse.q.shape[1]), STEPS)
+            stored = np.minimum(EVERY * np.arange(sparse.q.shape[1]), STEPS)
             good = whole._codes == 0
-            wrong += not np.array_equal(sparse.q[good], whole.q[good][:, kept])
-            wrong += not np.array_equal(sparse.qd[good], whole.qd[good][:, kept])
+            wrong += not np.array_equal(sparse.q[good], whole.q[good][:, stored])
+            wrong += not np.array_equal(sparse.qd[good], whole.qd[good][:, stored])
             alike = [replace(s, params=self.instances[0].params) for s in self.instances]
-            alike = [self.on_rows(s, self.instances[0]) for s in alike]
+            alike = [self.projected(s, self.instances[0]) for s in alike]
             one, other = (self.simulate(method, alike, u, own=own) for own in (False, True))
             by = [self.simulate(method, self.rounded(alike), u) for _ in range(DRAWS)]
             wrong += not self.near(one, other, by)
-            wrong += not self.single(method, whole, u)
+            wrong += not self.first_step_agrees(method, whole, u)
         if self.check.system.constraints:
             return float(wrong)
-        return float(wrong + sum(self.hasty(method, states, h) for states, h in self.in_haste()))
+        return float(
+            wrong
+            + sum(
+                self.differs_with_neighbours(method, states, h)
+                for states, h in self.long_step_cases()
+            )
+        )
 
     def rounded(self, states: list[State]) -> list[State]:
         """The states with each number a rounding off."""
@@ -194,7 +200,7 @@ class Batches:
         codes |= np.any([x._codes != other._codes for x in rounded], axis=0)
         return bool(np.all(alike) and np.all(codes))
 
-    def in_haste(self) -> Iterator[tuple[list[State], float]]:
+    def long_step_cases(self) -> Iterator[tuple[list[State], float]]:
         """Instances that all go too far in a step for sines to be rotated, by speed or by force."""
         sampler, first = self.check.sampler, self.instances[0]
         fast = [replace(s, qd=s.qd + 0.7 * sampler.spread / self.h) for s in self.instances]
@@ -203,20 +209,20 @@ class Batches:
             rest = [replace(s, qd=0 * s.qd) for s in self.instances]
             yield rest, self.runs.large_step(replace(first, qd=0 * first.qd), part)
 
-    def hasty(self, method: str, states: list[State], h: float) -> int:
+    def differs_with_neighbours(self, method: str, states: list[State], h: float) -> int:
         """Whether they go otherwise where they have others beside them."""
         mixed = [s for pair in zip(states, self.instances, strict=True) for s in pair]
         alone, other = (self.simulate(method, x, None, h=h) for x in (states, mixed))
-        return not _same(alone, other, 2 * np.arange(COUNT))
+        return not _are_permuted(alone, other, 2 * np.arange(COUNT))
 
-    def single(self, method: str, whole: Any, u: Vector | None) -> bool:
+    def first_step_agrees(self, method: str, whole: Any, u: Vector | None) -> bool:
         """Whether one step of each in place is the first of the batch."""
         q, qd = (np.array(x[:, 0]) for x in (whole.q, whole.qd))
         names = self.check.sampler.defaults
         params = {x: np.array([(s.params or names)[x] for s in self.instances]) for x in names}
-        given = None if u is None else np.ascontiguousarray(u[:, 0] if u.ndim == 3 else u)
+        inputs = None if u is None else np.ascontiguousarray(u[:, 0] if u.ndim == 3 else u)
         failed = self.module.step_batch(
-            q, qd, self.h, t=self.instances[0].t, u=given, params=params, method=method
+            q, qd, self.h, t=self.instances[0].t, u=inputs, params=params, method=method
         )
         good = failed == 0
         return bool(
@@ -247,54 +253,62 @@ class Batches:
                 at = replace(states[k], u=None if u is None else u[k])
                 wrong += self.ends_otherwise(method, whole, k, at)
             none = self.simulate(method, [states[k] for k in bad], None if u is None else u[bad])
-            wrong += not _same(none, whole, np.array(bad))
-        return float(wrong + self.moving(method))
+            wrong += not _are_permuted(none, whole, np.array(bad))
+        return float(wrong + self.singular_starts_that_move(method))
 
-    def moving(self, method: str) -> int:
+    def singular_starts_that_move(self, method: str) -> int:
         """How many instances go on that start where D is singular."""
         starts = self.singular[:: 1 + len(self.singular) // COUNT]
         states = [replace(self.instances[0], q=s.q, qd=s.qd, params=s.params) for s in starts]
         if not states:
             return 0
-        found = self.simulate(method, states, None)
-        return int(np.sum((found._codes != SINGULAR) | (found.steps != 0)))
+        batch = self.simulate(method, states, None)
+        return int(np.sum((batch._codes != SINGULAR) | (batch.steps != 0)))
 
     def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
         """Whether a failing instance ends otherwise than a single run does."""
-        alone = drive(self.model, method, s, self.h, STEPS)
-        done, status = int(whole.steps[k]), int(whole._codes[k])
+        alone = run_in_c(self.model, method, s, self.h, STEPS)
+        steps, status = int(whole.steps[k]), int(whole._codes[k])
         rows = np.stack([whole.q[k], whole.qd[k]])
-        kept = rows[:, : done + 1]
-        if not np.all(np.isfinite(kept)) or not np.all(np.isnan(rows[:, done + 1 :])):
+        stored = rows[:, : steps + 1]
+        if not np.all(np.isfinite(stored)) or not np.all(np.isnan(rows[:, steps + 1 :])):
             return True
         start = np.array([s.q, s.qd], rows.dtype)
-        if (status == 0) != (done == STEPS) or not np.array_equal(rows[:, 0], start):
+        if (status == 0) != (steps == STEPS) or not np.array_equal(rows[:, 0], start):
             return True
         # one that goes on at such a speed has no digit left
-        if alone.status != 0 and 0 < done <= alone.done and self.parts(method, s, kept, alone):
+        if (
+            alone.status != 0
+            and 0 < steps <= alone.steps
+            and self.differs_beyond_rounding(method, s, stored, alone)
+        ):
             return True
         # rounding may decide a step that all but fails; a first step is clear
-        return alone.done == 0 and not METHODS[method].implicit and (
-            done != 0 or status != alone.status
+        return alone.steps == 0 and not METHODS[method].implicit and (
+            steps != 0 or status != alone.status
         )  # fmt: skip
 
-    def parts(self, method: str, s: State, kept: Vector, alone: Driven) -> bool:
+    def differs_beyond_rounding(
+        self, method: str, s: State, stored: Vector, alone: RunResult
+    ) -> bool:
         """Whether the last row of an instance is another than alone, by more than rounding does.
 
         That is seen beside the start: the cosine of 1e304 is another at the next double.
         """
-        known, far = alone.rows[:, kept.shape[1] - 1], 1e-3
+        known, far = alone.rows[:, stored.shape[1] - 1], 1e-3
         near = [
-            drive(self.model, method, replace(s, qd=s.qd * (1 + k * self.check.eps)), self.h, STEPS)
+            run_in_c(
+                self.model, method, replace(s, qd=s.qd * (1 + k * self.check.eps)), self.h, STEPS
+            )
             for k in (-3, -2, -1, 1, 2, 3)
         ]
         with np.errstate(all="ignore"):  # of runs that end before
-            rounded = np.max([np.abs(x.rows[:, kept.shape[1] - 1] - known) for x in near], axis=0)
-            off = np.abs(kept[:, -1] - known)
+            rounded = np.max([np.abs(x.rows[:, stored.shape[1] - 1] - known) for x in near], axis=0)
+            off = np.abs(stored[:, -1] - known)
             return bool(np.any(off > far * np.abs(known) + ROUNDED * rounded))
 
 
-def _same(one: Any, other: Any, order: Any) -> bool:
+def _are_permuted(one: Any, other: Any, order: Any) -> bool:
     """Whether instance k of one is instance order[k] of the other."""
     return all(
         np.array_equal(getattr(one, name), getattr(other, name)[order], equal_nan=True)

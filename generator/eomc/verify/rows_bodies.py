@@ -23,7 +23,7 @@ from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.scene import Scene
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import STENCIL, Vector
+from eomc.verify.reference import STENCIL, Vector
 from eomc.verify.sampling import Expected, State
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
@@ -58,9 +58,9 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
     def rate(far: Vector) -> float:
         return float(np.max([np.abs(qd) / far, np.sqrt(np.abs(qdd) / far)])) or 1.0
 
-    usual, least = rate(spread), rate(np.maximum(spread, 1))
-    yield from (width / usual for width in WIDTHS)
-    width = WIDTHS[0] / usual
+    typical, least = rate(spread), rate(np.maximum(spread, 1))
+    yield from (width / typical for width in WIDTHS)
+    width = WIDTHS[0] / typical
     while 0 < WIDER * width < 1 / least:
         width *= WIDER
         yield width
@@ -87,7 +87,7 @@ class Bodies:
 
     def off(self, name: str, e: Expected) -> float:
         """The difference at one state, in parts of its size; nan where nothing can be compared."""
-        s, found, system = e.state, [], self.check.system
+        s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
         if name == "power":  # that of forces alone
             value = float(self.check.ask("tau", s) @ s.qd)
@@ -97,14 +97,16 @@ class Bodies:
         for width in widths(self.check.sampler.spread, s.qd):
             with np.errstate(all="ignore"):
                 key = id(e), width
-                told = self.check.sampler.told(s)
-                line = self.lines.get(key) or Line(self.scene, told, width, slides=slides)
+                state_with_parameters = self.check.sampler.with_discrete_parameters(s)
+                line = self.lines.get(key) or Line(
+                    self.scene, state_with_parameters, width, slides=slides
+                )
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
-                found.append(abs(value - ours) / (size or 1.0))
-            if found and found[-1] < LIMIT / 10:
+                differences.append(abs(value - ours) / (size or 1.0))
+            if differences and differences[-1] < LIMIT / 10:
                 break
-        return min(found, default=math.nan)
+        return min(differences, default=math.nan)
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class Frame:
 
     def point(self, x: Vector) -> Vector:
         """A point of the frame, (3,) or (n, 3), in the world."""
-        return self.at + rotated(self.turn, x)
+        return self.at + rotate(self.turn, x)
 
     def slid(self, by: Vector, axis: Vector) -> Frame:
         """The frame moved along its own axis."""
@@ -127,7 +129,7 @@ class Frame:
         """The frame turned about its own axis."""
         half = by[:, None] / 2
         turn = np.hstack([np.cos(half), np.sin(half) * axis])
-        return Frame(self.at, multiplied(self.turn, turn), self.angle + by * axis[2])
+        return Frame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
 
 
 @dataclass
@@ -156,21 +158,21 @@ class Line:
             rate = qd + qdd * self.nodes
             known |= {c.name: q + (qd + rate) / 2 * self.nodes, f"{c.name}_dot": rate + zero}
         for constant in self.scene.constants:
-            known[constant.name] = self.of(constant.formula)
+            known[constant.name] = self.evaluate(constant.formula)
         known |= {p.name: (s.params or {}).get(p.name, p.value) for p in self.scene.parameters}
         self.frames[WORLD] = Frame(np.zeros((n + 1, 3)), np.tile([1.0, 0, 0, 0], (n + 1, 1)), zero)
         for body in self.assembly.bodies:
             if body.joint:
-                self.hang(body)
+                self.attach(body)
         for k, i in enumerate(self.scene.inputs):
             if s.u is not None:
                 known[i.name] = self.limited(i.name, s.u[k] + zero)
         for name in self.formulas:
-            self.named(name)
+            self.value_of_name(name)
         for body in self.assembly.bodies:
             if not body.joint:
                 assert body.position is not None
-                at = np.stack([self.of(x) + zero for x in body.position], axis=1)
+                at = np.stack([self.evaluate(x) + zero for x in body.position], axis=1)
                 frame = self.frames[WORLD]
                 self.frames[body.name] = replace(self.oriented(frame, body), at=at)
 
@@ -180,9 +182,9 @@ class Line:
         assert self.scene.assembly is not None
         return self.scene.assembly
 
-    def of(self, formula: Formula) -> Any:
+    def evaluate(self, formula: Formula) -> Any:
         """The value of a formula along the line."""
-        return formulas.evaluate(formula, self.algebra, self.named)
+        return formulas.evaluate(formula, self.algebra, self.value_of_name)
 
     def at_rest(self, formula: Formula) -> Any:
         """The value of a formula where all velocities are zero: of a potential, the energy."""
@@ -191,7 +193,7 @@ class Line:
         self.known |= {f"{c.name}_dot": 0 * self.nodes for c in self.scene.coordinates}
         self.algebra = {**algebra, "dot": lambda x: 0 * x}
         try:
-            return self.of(formula)
+            return self.evaluate(formula)
         finally:
             self.known, self.algebra = known, algebra
 
@@ -200,42 +202,42 @@ class Line:
         """Those of definitions and signals, each of which may hold the other."""
         return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
 
-    def named(self, name: str) -> Any:
+    def value_of_name(self, name: str) -> Any:
         """The value of a name along the line."""
         if name not in self.known:
-            self.known[name] = self.limited(name, self.of(self.formulas[name]))
+            self.known[name] = self.limited(name, self.evaluate(self.formulas[name]))
         return self.known[name]
 
     def limited(self, name: str, value: Any) -> Any:
         """What acts of an input; all else as it is."""
         for ends in (i.limits for i in self.scene.inputs if i.name == name):
             for end, within in zip(ends, (np.maximum, np.minimum), strict=True):
-                value = value if end is None else within(value, self.of(end))
+                value = value if end is None else within(value, self.evaluate(end))
         return value
 
-    def vector(self, of: Sequence[Formula]) -> Vector:
+    def vector(self, entries: Sequence[Formula]) -> Vector:
         """Three numbers that do not change."""
-        return np.array([float(self.of(x)) for x in of])
+        return np.array([float(self.evaluate(x)) for x in entries])
 
     def oriented(self, frame: Frame, body: Body) -> Frame:
         """The frame turned as the body's tables say."""
         for turn in body.rotation:
             axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
-            frame = frame.turned(self.of(turn.angle) + 0 * self.nodes, axis)
+            frame = frame.turned(self.evaluate(turn.angle) + 0 * self.nodes, axis)
         return frame
 
-    def hang(self, body: Body) -> None:
+    def attach(self, body: Body) -> None:
         """The frame of a body on its joint, and the names of its centre."""
         frame = self.frames[body.parent]
         if body.offset:
             frame = replace(frame, at=frame.point(self.vector(body.offset)))
         frame = self.oriented(frame, body)
-        given = list(body.axes)
+        axes = list(body.axes)
         for k, (motion, own) in enumerate(_MOTIONS[body.joint]):
             # a joint with one axis slides along it and turns about it
-            axis = np.array(given[min(k, len(given) - 1)], float) if own is None else own
+            axis = np.array(axes[min(k, len(axes) - 1)], float) if own is None else own
             axis = axis / np.linalg.norm(axis)
-            by = self.of(body.coordinates[k]) + 0 * self.nodes
+            by = self.evaluate(body.coordinates[k]) + 0 * self.nodes
             frame = frame.slid(by, axis) if motion == "t" else frame.turned(by, axis)
         self.frames[body.name] = frame
         centre = frame.point(self.vector(body.center))
@@ -247,27 +249,29 @@ class Line:
     def value(self, name: str) -> float:
         """What is compared, at the state itself."""
         if name == "kinetic_energy":
-            return self.here(self.of(self.scene.kinetic) + sum(map(self.kinetic, self.bodies)))
+            return self.at_middle(
+                self.evaluate(self.scene.kinetic) + sum(map(self.kinetic, self.bodies))
+            )
         if name == "potential_energy":
             weights = sum(map(self.weight, self.assembly.bodies))
             springs = sum(map(self.spring, self.assembly.springs))
-            return self.here(self.at_rest(self.scene.potential) + weights + springs)
-        return self.here(self.forces()) - self.loss()
+            return self.at_middle(self.at_rest(self.scene.potential) + weights + springs)
+        return self.at_middle(self.forces()) - self.loss()
 
     @property
     def bodies(self) -> Sequence[Body]:
         """Those that move."""
-        return [b for b in self.assembly.bodies if b.name not in self.still()]
+        return [b for b in self.assembly.bodies if b.name not in self.immovable_bodies()]
 
-    def still(self) -> set[str]:
+    def immovable_bodies(self) -> set[str]:
         """The bodies that nothing moves."""
-        found = {WORLD}
+        immovable = {WORLD}
         for body in self.assembly.bodies:
-            if body.joint == "fixed" and body.parent in found:
-                found.add(body.name)
-        return found
+            if body.joint == "fixed" and body.parent in immovable:
+                immovable.add(body.name)
+        return immovable
 
-    def here(self, values: Any) -> float:
+    def at_middle(self, values: Any) -> float:
         """The value in the middle of the line."""
         return float((values + 0 * self.nodes)[self.middle])
 
@@ -277,14 +281,14 @@ class Line:
         With J = tr(I)/2 - I, the second moments of the mass: two for each eigenvector of J at a
         unit's distance from the centre, the rest in the centre.
         """
-        m, centre = float(self.of(body.mass)), self.vector(body.center)
-        xx, yy, zz, xy, xz, yz = (float(self.of(entry)) for entry in body.inertia)
+        m, centre = float(self.evaluate(body.mass)), self.vector(body.center)
+        xx, yy, zz, xy, xz, yz = (float(self.evaluate(entry)) for entry in body.inertia)
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         moments, axes = np.linalg.eigh(np.trace(tensor) / 2 * np.eye(3) - tensor)
-        found = [(m - float(np.sum(moments)), centre)]
+        masses = [(m - float(np.sum(moments)), centre)]
         for moment, axis in zip(moments.tolist(), axes.T, strict=True):
-            found += [(moment / 2, centre + axis), (moment / 2, centre - axis)]
-        return found
+            masses += [(moment / 2, centre + axis), (moment / 2, centre - axis)]
+        return masses
 
     def kinetic(self, body: Body) -> Vector:
         """Of a body's point masses, and of the rotors at its joint."""
@@ -293,18 +297,18 @@ class Line:
             velocity = self.rate @ frame.point(x)
             energy = energy + m / 2 * np.sum(velocity**2, axis=1)
         for armature, rate in zip(body.armature, self.rates(body), strict=False):
-            energy = energy + self.of(armature) / 2 * rate**2
+            energy = energy + self.evaluate(armature) / 2 * rate**2
         return energy
 
     def rates(self, body: Body) -> Iterator[Vector]:
         """Those of the motions of a body's joint."""
         for formula in body.coordinates:
-            yield self.rate @ (self.of(formula) + 0 * self.nodes)
+            yield self.rate @ (self.evaluate(formula) + 0 * self.nodes)
 
     def weight(self, body: Body) -> Vector:
         """-m g.c"""
         centre = self.frames[body.name].point(self.vector(body.center))
-        energy: Vector = -self.of(body.mass) * centre @ self.vector(self.assembly.gravity)
+        energy: Vector = -self.evaluate(body.mass) * centre @ self.vector(self.assembly.gravity)
         return energy
 
     def length(self, line: Spring | Damper) -> Vector:
@@ -323,8 +327,8 @@ class Line:
 
     def spring(self, spring: Spring) -> Vector:
         """k/2 times the square of what it is longer than at rest."""
-        longer = self.length(spring) - self.of(spring.length)
-        energy: Vector = self.of(spring.stiffness) / 2 * longer**2
+        longer = self.length(spring) - self.evaluate(spring.length)
+        energy: Vector = self.evaluate(spring.stiffness) / 2 * longer**2
         return energy
 
     # --- forces ----------------------------------------------------------------------------------
@@ -333,45 +337,49 @@ class Line:
         """The power of forces, friction and drives at joints, without that of dissipation."""
         power = 0 * self.nodes
         for name, formula in self.scene.forces.items():
-            power = power + self.of(formula) * self.known[f"{name}_dot"]
+            power = power + self.evaluate(formula) * self.known[f"{name}_dot"]
         for c in self.scene.coordinates:
             if c.friction:
                 rate = self.known[f"{c.name}_dot"]
-                power = power - self.of(c.friction) * self.way(c.name, rate, c.friction_width)
+                power = power - self.evaluate(c.friction) * self.unit_friction_power(
+                    c.name, rate, c.friction_width
+                )
         for body in self.assembly.bodies:
             for k, rate in enumerate(self.rates(body)):
                 if body.friction:
                     name, width = body.coordinates[k].text, body.friction_width
-                    power = power - self.of(body.friction[k]) * self.way(name, rate, width)
+                    power = power - self.evaluate(body.friction[k]) * self.unit_friction_power(
+                        name, rate, width
+                    )
                 if body.actuator:
-                    power = power + self.of(body.actuator[k]) * rate
+                    power = power + self.evaluate(body.actuator[k]) * rate
         if self.assembly.forces:  # what moves with time alone is none of the coordinates' work
-            still = Line(self.scene, self.state, self.width, 0.0)
-            power = power + sum(self.work(f, still) for f in self.assembly.forces)
+            at_rest = Line(self.scene, self.state, self.width, 0.0)
+            power = power + sum(self.work(f, at_rest) for f in self.assembly.forces)
         return power
 
-    def way(self, name: str, rate: Vector, width: Formula | None) -> Vector:
+    def unit_friction_power(self, name: str, rate: Vector, width: Formula | None) -> Vector:
         """What friction of 1 takes, as it is smoothed, or as what may stick slides."""
         if name in self.slides:
             return self.slides[name] * rate
-        return np.tanh(rate / (self.of(width) if width else 1.0)) * rate
+        return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate
 
-    def work(self, force: Force, still: Line) -> Vector:
+    def work(self, force: Force, at_rest: Line) -> Vector:
         """F.v + torque.omega of a force on a body, less that of what moves at rest."""
         frame, zero = self.frames[force.body], 0 * self.nodes
         F, torque = (
-            np.stack([self.of(x) + zero for x in given], axis=1)
+            np.stack([self.evaluate(x) + zero for x in given], axis=1)
             for given in (force.force, force.torque)
         )
         if force.in_body:
-            F, torque = rotated(frame.turn, F), rotated(frame.turn, torque)
+            F, torque = rotate(frame.turn, F), rotate(frame.turn, torque)
         point = self.vector(force.point)
-        (v, w), (v0, w0) = (line.motion(line.frames[force.body], point) for line in (self, still))
+        (v, w), (v0, w0) = (line.motion(line.frames[force.body], point) for line in (self, at_rest))
         return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
 
     def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
         """The velocity of a point of a frame, and the frame's angular velocity, 2 dq/dt q*."""
-        turning = multiplied(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
+        turning = quaternion_product(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
         return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
     def loss(self) -> float:
@@ -383,7 +391,7 @@ class Line:
             for sign in (1, -1):
                 by = 0.01 * n * sign
                 line = Line(self.scene, self.state, self.width, 1 + by)
-                total += sign * weight / 0.01 * line.here(line.dissipation())
+                total += sign * weight / 0.01 * line.at_middle(line.dissipation())
         return total
 
     def loses(self) -> bool:
@@ -393,12 +401,12 @@ class Line:
 
     def dissipation(self) -> Vector:
         """R of the scene, of joints and of dampers."""
-        R: Vector = self.of(self.scene.dissipation) + 0 * self.nodes
+        R: Vector = self.evaluate(self.scene.dissipation) + 0 * self.nodes
         for body in self.assembly.bodies:
             for damping, rate in zip(body.damping, self.rates(body), strict=False):
-                R = R + self.of(damping) / 2 * rate**2
+                R = R + self.evaluate(damping) / 2 * rate**2
         for damper in self.assembly.dampers:
-            R = R + self.of(damper.damping) / 2 * (self.rate @ self.length(damper)) ** 2
+            R = R + self.evaluate(damper.damping) / 2 * (self.rate @ self.length(damper)) ** 2
         return R
 
 
@@ -416,7 +424,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)
 
 
-def multiplied(a: Vector, b: Vector) -> Vector:
+def quaternion_product(a: Vector, b: Vector) -> Vector:
     """The product of quaternions (n, 4), the real part first: b, then a."""
     w, x = a[:, :1], a[:, 1:]
     v, y = b[:, :1], b[:, 1:]
@@ -424,7 +432,7 @@ def multiplied(a: Vector, b: Vector) -> Vector:
     return np.hstack([real, w * y + v * x + _cross(x, y)])
 
 
-def rotated(turn: Vector, x: Vector) -> Vector:
+def rotate(turn: Vector, x: Vector) -> Vector:
     """A vector turned by a unit quaternion: x + 2 w (a x) + 2 a (a x), a its vector part."""
     w, a = turn[:, :1], turn[:, 1:]
     across = 2 * _cross(a, np.broadcast_to(x, a.shape))

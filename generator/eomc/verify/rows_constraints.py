@@ -19,11 +19,19 @@ import numpy as np
 from eomc.scene.assembly import Loop
 from eomc.verify import rows_projection
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import STENCIL, Vector
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_bodies import Line, widths
-from eomc.verify.sampling import EPS, FARTHEST, Expected, State, along, ask, simulate
+from eomc.verify.sampling import (
+    EPS,
+    MAX_DISTANCE,
+    Expected,
+    State,
+    evaluate_module,
+    simulate,
+    states_of_run,
+)
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
 WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
@@ -31,85 +39,85 @@ ROUNDED = 30  # roundings of multipliers and forces, where those are more: in si
 STATES = 4
 STEPS = 200  # of a run that is to stay on the rows
 SHARE = 0.02  # of how far things go, in a step of it
-HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
+MAX_RESIDUAL = 450.0  # units: what rows may be along it, 1e-13 of their terms
 SLOPE = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
 SLIGHT = 1e-4  # of how far things go: a difference for the size of a slope
 UNITS = "units of rounding"
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the rows of a scene with constraints."""
-    rows = Rows(of, of.module)
+    rows = FormRows(check, check.module)
     for name in VALUES:
-        of.row(name, LIMIT, UNITS, partial(of.value, name))
-    if of.dtype == np.float64:  # single precision leaves differences too few digits
-        of.row("A beside differences", SLOPE, "of A", rows.slopes)
-        if of.system.run.needs_derivatives and not of.system.modes:
-            of.row("tangent", SLOPE, "of the rows' slopes", rows.tangent)
-    of.row("power of multipliers", LIMIT, UNITS, rows.power)
-    if of.system.reactions:
-        limit = max(WORK, ROUNDED * of.eps)
-        of.row("reactions: virtual work", limit, "of its size", rows.reactions)
-    for module, form in of.forms:
-        own = Rows(of, module)
+        check.row(name, LIMIT, UNITS, partial(check.value, name))
+    if check.dtype == np.float64:  # single precision leaves differences too few digits
+        check.row("A beside differences", SLOPE, "of A", rows.slopes)
+        if check.system.run.needs_derivatives and not check.system.modes:
+            check.row("tangent", SLOPE, "of the rows' slopes", rows.tangent)
+    check.row("power of multipliers", LIMIT, UNITS, rows.power)
+    if check.system.reactions:
+        limit = max(WORK, ROUNDED * check.eps)
+        check.row("reactions: virtual work", limit, "of its size", rows.reactions)
+    for module, form in check.forms:
+        own = FormRows(check, module)
         if form:
-            find = partial(_values, of, module)
-            of.row("plain C: constraints", LIMIT, UNITS, find)
-        rows_projection.report(of, module, form)
-        for method in of.methods:
-            kept = partial(own.kept, method)
-            of.row(f"{form}{method} on the constraints", HELD, UNITS, kept)
+            find = partial(_values, check, module)
+            check.row("plain C: constraints", LIMIT, UNITS, find)
+        rows_projection.report(check, module, form)
+        for method in check.methods:
+            measure = partial(own.residual_along_run, method)
+            check.row(f"{form}{method} on the constraints", MAX_RESIDUAL, UNITS, measure)
 
 
-def _values(of: Comparison, module: Any) -> float:
+def _values(check: Comparison, module: Any) -> float:
     """All values of another form at all states."""
 
     def error(e: Expected) -> float:
-        found = ((ask(module, n, e.state), e.value[n], e.size[n]) for n in VALUES)
-        return float(np.max([of.units(*each) for each in found]))
+        entries = ((evaluate_module(module, n, e.state), e.value[n], e.size[n]) for n in VALUES)
+        return float(np.max([check.units(*each) for each in entries]))
 
-    return of.largest(error)
+    return check.largest(error)
 
 
-class Rows:
+class FormRows:
     """What is measured of one form's module."""
 
-    def __init__(self, of: Comparison, module: Any) -> None:
-        self.of, self.module, self.system = of, module, of.system
-        self.holonomic = np.array([c.holonomic for c in of.system.constraints])
+    def __init__(self, check: Comparison, module: Any) -> None:
+        self.check, self.module, self.system = check, module, check.system
+        self.holonomic = np.array([c.holonomic for c in check.system.constraints])
 
     def slopes(self) -> float:
         """A of the module beside differences of its rows: along q, of rows of rates along qd.
 
         The best of some widths counts: no width makes a wrong A right.
         """
-        of, spread = self.of, self.of.sampler.spread
+        check, spread = self.check, self.check.sampler.spread
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
 
         def error(e: Expected) -> float:
             s = e.state
-            A = ask(self.module, "constraint_jacobian", s)
+            A = evaluate_module(self.module, "constraint_jacobian", s)
             size = (
                 np.abs(A) + np.max(np.abs(A), axis=1, keepdims=True) + e.size["constraint_jacobian"]
             )
 
             def off(width: float) -> float:
-                found = np.zeros_like(A)
+                slopes_found = np.zeros_like(A)
                 for i in moving:
                     step = width * spread[i]
                     for field, rows in (("q", self.holonomic), ("qd", ~self.holonomic)):
                         if np.any(rows):
-                            found[rows, i] = self._slope(s, field, i, step)[rows]
-                return float(np.max(np.abs(found - A) / size))
+                            slopes_found[rows, i] = self._slope(s, field, i, step)[rows]
+                return float(np.max(np.abs(slopes_found - A) / size))
 
             return min(off(width) for width in (0.1, 0.03, 0.01, 0.003, 1e-3))
 
-        return of.largest(error)
+        return check.largest(error)
 
     def tangent(self) -> float:
         """What rows and their rates change by along changes that keep them, by differences: 0."""
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
-        steps = {"q": self.of.sampler.spread, "qd": self.of.sampler.speed}
+        steps = {"q": self.check.sampler.spread, "qd": self.check.sampler.speed}
 
         def error(e: Expected) -> float:
             s, n = e.state, len(self.system.q)
@@ -128,7 +136,7 @@ class Rows:
 
             return min(off(width) for width in (0.1, 0.03, 0.01, 0.003, 1e-3))
 
-        return self.of.largest(error, 2)
+        return self.check.largest(error, 2)
 
     def _slope(
         self, s: State, field: str, i: int, step: float, name: str = "constraints"
@@ -139,7 +147,9 @@ class Rows:
                 x = getattr(s, field).copy()
                 x[i] += k * step
                 at = replace(s, **{field: x})
-                total += (weight if k > 0 else -weight) * ask(self.module, name, at) / step
+                total += (
+                    (weight if k > 0 else -weight) * evaluate_module(self.module, name, at) / step
+                )
         return total
 
     def power(self) -> float:
@@ -148,14 +158,14 @@ class Rows:
         def error(e: Expected) -> float:
             s = e.state
             names = ("multipliers", "constraint_jacobian")
-            multipliers, A = (ask(self.module, n, s) for n in names)
-            b = ask(self.module, "constraint_rates", replace(s, qd=0 * s.qd))
+            multipliers, A = (evaluate_module(self.module, n, s) for n in names)
+            b = evaluate_module(self.module, "constraint_rates", replace(s, qd=0 * s.qd))
             work, done = multipliers * (A @ s.qd), -multipliers * b
             size = np.abs(multipliers) * e.size["constraint_rates"]
             size = size + e.size["multipliers"] * (np.abs(A) @ np.abs(s.qd))
-            return self.of.units(work, done, size)
+            return self.check.units(work, done, size)
 
-        return self.of.largest(error)
+        return self.check.largest(error)
 
     def reactions(self) -> float:
         """Virtual work: what reactions do as one coordinate moves, beside lambda . A of the loop.
@@ -163,36 +173,43 @@ class Rows:
         The force acts at the second body's point, on it and against the first one; so does the
         moment. Velocities are those of rows_bodies.py, from the scene's own tables.
         """
-        return self.of.largest(self._work, STATES)
+        return self.check.largest(self._work, STATES)
 
     def _work(self, e: Expected) -> float:
         s, scene = e.state, self.system.scene
         assert scene is not None and scene.assembly is not None
-        found = self.module.reactions(s.q, s.qd, t=s.t, u=s.u, params=s.params)
-        multipliers, A = (ask(self.module, n, s) for n in ("multipliers", "constraint_jacobian"))
+        reactions = self.module.reactions(s.q, s.qd, t=s.t, u=s.u, params=s.params)
+        multipliers, A = (
+            evaluate_module(self.module, n, s) for n in ("multipliers", "constraint_jacobian")
+        )
         loops = {loop.name: loop for loop in scene.assembly.loops}
-        spread, worst = self.of.sampler.spread, 0.0
+        spread, worst = self.check.sampler.spread, 0.0
         for name in (r.name for r in self.system.reactions):
             rows = [k for k, c in enumerate(self.system.constraints) if c.loop == name]
-            force = np.asarray(found[name], float)
+            force = np.asarray(reactions[name], float)
             expected = multipliers[rows] @ A[rows]
             size = np.abs(multipliers[rows]) @ np.abs(A[rows])
             least = float(np.max(size, initial=0)) or 1.0
             for j, moving in enumerate(np.diag(np.maximum(spread, 1))):
                 powers = (
-                    self._along(loops[name], s, moving, x, force) for x in widths(spread, moving)
+                    self._reaction_power(loops[name], s, moving, x, force)
+                    for x in widths(spread, moving)
                 )
                 off = (abs(power - expected[j]) for power in powers if not math.isnan(power))
                 worst = max(worst, min(off, default=math.inf) / least)
         return worst
 
-    def _along(self, loop: Loop, s: State, moving: Vector, width: float, force: Vector) -> float:
+    def _reaction_power(
+        self, loop: Loop, s: State, moving: Vector, width: float, force: Vector
+    ) -> float:
         """The power of a reaction at velocities `moving`, less that at rest, per their sum."""
         total, scene = 0.0, self.system.scene
         assert scene is not None
         for sign, qd in ((1, moving), (-1, 0 * moving)):
             with np.errstate(all="ignore"):
-                line = Line(scene, self.of.sampler.told(replace(s, qd=qd)), width)
+                line = Line(
+                    scene, self.check.sampler.with_discrete_parameters(replace(s, qd=qd)), width
+                )
                 m, second = line.middle, line.frames[loop.bodies[1]]
                 point = line.vector(loop.points[1]) if loop.points else np.zeros(3)
                 at = second.point(point)[m]
@@ -204,61 +221,65 @@ class Rows:
             total += sign * float(force @ np.array(twist))
         return float(total / np.sum(moving))
 
-    def kept(self, method: str) -> float | Finding:
+    def residual_along_run(self, method: str) -> float | Measurement:
         """What rows and their rates are along a run, in units of their terms there."""
-        of = self.of
+        check = self.check
         errors: list[float | None] = []
-        for e in of.few(3):
+        for e in check.few(3):
             s = replace(e.state, u=None)
             with np.errstate(divide="ignore"):  # no longer than a stepper follows
-                longest = SHARE * float(np.min(of.sampler.spread / np.abs(s.qd)))
-            how = {"h": min(of.system.run.h, longest), "steps": STEPS, "every": STEPS // 40}
+                longest = SHARE * float(np.min(check.sampler.spread / np.abs(s.qd)))
+            how = {"h": min(check.system.run.h, longest), "steps": STEPS, "every": STEPS // 40}
             run = simulate(self.module, s, t0=s.t, method=method, **how)
-            for at in along(run, s)[1:]:  # of a run that stops early the rows up to there
+            for at in states_of_run(run, s)[1:]:  # of a run that stops early the rows up to there
                 far = np.abs([at.q - s.q, at.qd - s.qd])
-                if np.any(far >= FARTHEST * of.sampler.scale):  # as h is too long
+                if np.any(far >= MAX_DISTANCE * check.sampler.scale):  # as h is too long
                     break
                 errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
         return largest(errors, "no step is taken, or all lead too far")
 
     def _off(self, s: State, name: str) -> float | None:
-        A = np.abs(ask(self.module, "constraint_jacobian", s))
-        off = np.abs(ask(self.module, name, s))
+        A = np.abs(evaluate_module(self.module, "constraint_jacobian", s))
+        off = np.abs(evaluate_module(self.module, name, s))
         if name == "constraints":
             off, A = off[self.holonomic], A[self.holonomic]
-            scale = np.abs(s.q) + self.of.sampler.spread
+            scale = np.abs(s.q) + self.check.sampler.spread
         else:
-            scale = np.abs(s.qd) + self.of.sampler.speed
+            scale = np.abs(s.qd) + self.check.sampler.speed
         if not len(off):
             return None
-        turned = self._turned(s) if name == "constraint_rates" else 0.0
+        turned = self._rate_sensitivity(s) if name == "constraint_rates" else 0.0
         size = A @ scale + turned
-        found = self.of.units(off, 0 * off, size)
-        if found > HELD:  # where rows all but depend on each other, those left out hold less
-            found = self.of.units(off, 0 * off, size + self._left(name, s)[: len(off)])
-        return found
+        residual = self.check.units(off, 0 * off, size)
+        if (
+            residual > MAX_RESIDUAL
+        ):  # where rows all but depend on each other, those left out hold less
+            residual = self.check.units(
+                off, 0 * off, size + self._reference_residual(name, s)[: len(off)]
+            )
+        return residual
 
-    def _left(self, name: str, s: State) -> Vector:
+    def _reference_residual(self, name: str, s: State) -> Vector:
         """What the reference leaves of rows near a state, in units."""
-        q, qd = self.of.sampler.rounded(s)
+        q, qd = self.check.sampler.rounded(s)
         with np.errstate(all="ignore"):
-            q, qd = self.of.reference.corrected(q, qd, s.t, s.params)
-            found = [
-                self.of.reference.evaluate(name, *x, s.t, None, s.params)
+            q, qd = self.check.reference.corrected(q, qd, s.t, s.params)
+            residuals = [
+                self.check.reference.evaluate(name, *x, s.t, None, s.params)
                 for x in zip(q, qd, strict=True)
             ]
-        return np.asarray(np.nan_to_num(np.max(np.abs(found), axis=0)) / EPS)
+        return np.asarray(np.nan_to_num(np.max(np.abs(residuals), axis=0)) / EPS)
 
-    def _turned(self, s: State) -> Vector:
+    def _rate_sensitivity(self, s: State) -> Vector:
         """What rates of rows change by with each coordinate, times how large that is.
 
         A sine that is predicted is as exact as its angle, which may have gone far.
         """
         total = np.zeros(len(self.system.constraints))
         for i, q in enumerate(s.q):
-            step, x = SLIGHT * self.of.sampler.spread[i], s.q.copy()
+            step, x = SLIGHT * self.check.sampler.spread[i], s.q.copy()
             x[i] += step
-            change = ask(self.module, "constraint_rates", replace(s, q=x))
-            change = change - ask(self.module, "constraint_rates", s)
+            change = evaluate_module(self.module, "constraint_rates", replace(s, q=x))
+            change = change - evaluate_module(self.module, "constraint_rates", s)
             total += np.abs(change) / step * abs(q)
         return total

@@ -10,10 +10,10 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, Expected, State, ask, nudged
+from eomc.verify.sampling import NUDGE, Expected, State, evaluate_module, perturb_each_input
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 
@@ -34,7 +34,7 @@ def _has(check: Comparison, name: str) -> bool:
     return run.needs_derivatives or any(METHODS[method].newton for method in check.methods)
 
 
-def slopes(check: Comparison, name: str) -> float | Finding:
+def slopes(check: Comparison, name: str) -> float | Measurement:
     """linearize or sensitivity against differences of the reference's accelerations.
 
     The best of some widths counts for each entry, as of skewness.
@@ -42,43 +42,49 @@ def slopes(check: Comparison, name: str) -> float | Finding:
     scale = check.sampler.scale
     n, nu = len(check.system.q), len(check.system.inputs)
     known: list[float | None] = []
-    farther = [e for e in check.sampler.farther() if check.moves(e.state)]
-    for e in (*check.few(check.effort.few), *farther):
+    far = [e for e in check.sampler.far_states() if check.has_finite_accelerations(e.state)]
+    for e in (*check.few(check.effort.few), *far):
         s, size = e.state, e.size["acceleration"] + NUDGE * scale[1] ** 2 / scale[0]
-        found = told(check, name, s)
-        if found is None:
+        derivatives_ = module_derivatives(check, name, s)
+        if derivatives_ is None:
             return math.inf  # not even dq/dt = qd
         part = slice(0, 2 * n + nu) if name == "linearize" else slice(2 * n + nu, None)
         with np.errstate(all="ignore"):
-            exact = derivatives.by_differences(check.reference, s, scale, check.sampler.defaults)
-            off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
+            exact = derivatives.differentiate(check.reference, s, scale, check.sampler.defaults)
+            off = [
+                derivatives.relative_differences(derivatives_, J[:, part], by[part], size)
+                for J, by in exact
+            ]
         least = np.fmin.reduce(off)  # each entry's: what is wrong is so at every width
         if check.dtype != np.float64:
-            least /= max(1.0, _growth(check, name, e, found))
+            least /= max(1.0, _growth(check, name, e, derivatives_))
         known.append(float(np.max(least, initial=0)) if np.all(least >= 0) else None)
     return largest(known, "no state has finite differences")
 
 
-def told(check: Comparison, name: str, s: State) -> Vector | None:
+def module_derivatives(check: Comparison, name: str, s: State) -> Vector | None:
     """What the module has of a state; None where dq/dt is not qd."""
-    n, held = len(check.system.q), {"u": s.u, "t": s.t, "params": s.params}
+    n, arguments = len(check.system.q), {"u": s.u, "t": s.t, "params": s.params}
     if name == "sensitivity":
-        return np.asarray(check.module.sensitivity(s.q, s.qd, **held))
-    A, B = check.module.linearize(s.q, s.qd, **held)
+        return np.asarray(check.module.sensitivity(s.q, s.qd, **arguments))
+    A, B = check.module.linearize(s.q, s.qd, **arguments)
     if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
         return None
     return np.hstack([A[n:], B[n:]])
 
 
-def _growth(check: Comparison, name: str, e: Expected, found: Vector) -> float:
+def _growth(check: Comparison, name: str, e: Expected, derivatives_: Vector) -> float:
     """How many roundings single precision makes of the derivatives, of the largest.
 
     As many as a rounding of every input makes, and as the accelerations have lost there, to
     sums that cancel.
     """
-    near = [told(check, name, x) for x in nudged(e.state, check.sampler.defaults)]
-    moved = sum(np.abs(x - found) for x in near if x is not None)
+    near = [
+        module_derivatives(check, name, x)
+        for x in perturb_each_input(e.state, check.sampler.defaults)
+    ]
+    moved = sum(np.abs(x - derivatives_) for x in near if x is not None)
     sure = e.value["acceleration"]
-    lost = np.abs(ask(check.module, "acceleration", e.state) - sure) / check.eps
-    parts = (moved / NUDGE, found), (lost, sure)
+    lost_digits = np.abs(evaluate_module(check.module, "acceleration", e.state) - sure) / check.eps
+    parts = (moved / NUDGE, derivatives_), (lost_digits, sure)
     return float(max(np.max(x, initial=0) / (np.max(np.abs(y)) + 1e-300) for x, y in parts))

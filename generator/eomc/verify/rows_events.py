@@ -15,36 +15,38 @@ import numpy as np
 from eomc.model.symbols import Output
 from eomc.model.system import System
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.rows_outputs import Formulas, apart
+from eomc.verify.rows_outputs import Formulas, compare_outputs
 from eomc.verify.sampling import State
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the rows of a scene that has events of its own."""
-    system = of.system
+    system = check.system
     events = system.own_events
-    asked = {"events": [Output(e.name, e.when) for e in events]}
+    groups = {"events": [Output(e.name, e.when) for e in events]}
     names = [*(str(q) for q in system.q), *(str(qd) for qd in system.qd)]
     states = dict(zip(names, (*system.q, *system.qd), strict=True))
     if any(e.action == "jump" for e in events):
-        asked["jumps"] = [
+        groups["jumps"] = [
             Output(name, (states | dict(e.jump))[name]) for e in events for name in names
         ]
-    for name, formulas in asked.items():
+    for name, formulas in groups.items():
         if formulas:
-            for module, form in of.forms:
-                find = partial(_values, of, module, name, replace(system, outputs=tuple(formulas)))
-                of.row(f"{form}{name}", LIMIT, "units of rounding", find)
+            for module, form in check.forms:
+                find = partial(
+                    _values, check, module, name, replace(system, outputs=tuple(formulas))
+                )
+                check.row(f"{form}{name}", LIMIT, "units of rounding", find)
 
 
-def _values(of: Comparison, module: Any, name: str, asked: System) -> float:
+def _values(check: Comparison, module: Any, name: str, system: System) -> float:
     """A function of all events beside its formulas, as far as these are the scene's."""
     model = module._model
 
-    def found(s: State) -> Vector:
+    def module_values(s: State) -> Vector:
         values = model._evaluate(name, s.q, s.qd, s.t, s.u, s.params)
-        return np.asarray(values, float).ravel()[: len(asked.outputs)]
+        return np.asarray(values, float).ravel()[: len(system.outputs)]
 
-    return apart(of, module, Formulas(asked), found)
+    return compare_outputs(check, module, Formulas(system), module_values)

@@ -15,26 +15,26 @@ import numpy as np
 
 from eomc.scene.scene import Scene
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT as ROUNDINGS
-from eomc.verify.rows_bodies import LIMIT, UNITS, Line, rotated, widths
+from eomc.verify.rows_bodies import LIMIT, UNITS, Line, rotate, widths
 from eomc.verify.sampling import Expected, State
 
 STATES = 4
 TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 
 
-def report(of: Comparison, scene: Scene) -> None:
+def report(check: Comparison, scene: Scene) -> None:
     """Add the rows of what the scene asks for."""
-    run, eps = of.system.run, of.eps
-    for module, form in of.forms:
-        frames = _Frames(of, module, scene)
+    run, eps = check.system.run, check.eps
+    for module, form in check.forms:
+        frames = _Frames(check, module, scene)
 
         def row(name: str, limit: float, measure: Callable[[Expected], float]) -> None:
-            largest = partial(of.largest, measure, STATES)
-            of.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
+            largest = partial(check.largest, measure, STATES)
+            check.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
 
-        if of.system.asked:
+        if check.system.asked:
             row("poses of frames", LIMIT, frames.poses)
             row("velocities of frames", LIMIT, frames.velocities)
             row("accelerations of frames", TWICE, frames.accelerations)
@@ -44,39 +44,41 @@ def report(of: Comparison, scene: Scene) -> None:
             row("momentum", LIMIT, frames.momentum)
 
 
-def inverse_dynamics(of: Comparison) -> None:
+def inverse_dynamics(check: Comparison) -> None:
     """Add the rows of D qdd + bias, against the reference."""
-    for module, form in of.forms:
-        measure = partial(of.largest, partial(_inverse, of, module), STATES)
-        of.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
+    for module, form in check.forms:
+        measure = partial(check.largest, partial(_inverse, check, module), STATES)
+        check.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
 
 
-def _inverse(of: Comparison, module: Any, e: Expected) -> float:
+def _inverse(check: Comparison, module: Any, e: Expected) -> float:
     """At twice the accelerations of the motion, and of alternating signs."""
     s, D = e.state, e.value["D"]
     qdd = 2 * e.value["acceleration"]
-    qdd = qdd + of.sampler.speed**2 / of.sampler.spread * (-1.0) ** np.arange(len(qdd))
-    found = module.inverse_dynamics(s.q, s.qd, qdd, t=s.t, params=s.params)
+    qdd = qdd + check.sampler.speed**2 / check.sampler.spread * (-1.0) ** np.arange(len(qdd))
+    forces = module.inverse_dynamics(s.q, s.qd, qdd, t=s.t, params=s.params)
     size = e.size["D"] @ np.abs(qdd) + e.size["bias"]
-    return of.units(found, D @ qdd + e.value["bias"], size)
+    return check.units(forces, D @ qdd + e.value["bias"], size)
 
 
 class _Frames:
     """What a module says of frames, and what the scene's tables do."""
 
-    def __init__(self, of: Comparison, module: Any, scene: Scene) -> None:
-        self.of, self.module, self.scene = of, module, scene
-        self.names = [f.name for f in of.system.asked]
-        self.plane = of.system.plane
+    def __init__(self, check: Comparison, module: Any, scene: Scene) -> None:
+        self.check, self.module, self.scene = check, module, scene
+        self.names = [f.name for f in check.system.asked]
+        self.plane = check.system.plane
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:
         """Of several widths: the best counts."""
-        for width in widths(self.of.sampler.spread, s.qd, bend):
+        for width in widths(self.check.sampler.spread, s.qd, bend):
             with np.errstate(all="ignore"):
-                yield Line(self.scene, self.of.sampler.told(s), width, 1.0, bend)
+                yield Line(
+                    self.scene, self.check.sampler.with_discrete_parameters(s), width, 1.0, bend
+                )
 
     def off(
-        self, found: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
+        self, values: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
     ) -> float:
         """The difference in parts of the largest number, which is `least` at rest."""
         best = np.inf
@@ -84,35 +86,35 @@ class _Frames:
             with np.errstate(all="ignore"):
                 expected = exact(line)
                 size = max(float(np.max(np.abs(expected))), least) or 1.0
-                off = float(np.max(np.abs(found - expected))) / size
+                off = float(np.max(np.abs(values - expected))) / size
             best = min(best, off) if off == off else best
             if best < LIMIT / 10:
                 break
         return best
 
-    def held(self, s: State) -> dict[str, Any]:
+    def arguments(self, s: State) -> dict[str, Any]:
         """How the module is called at a state."""
         return {"t": s.t, "params": s.params}
 
-    def flat(self, linear: Vector, angular: Vector) -> Vector:
+    def relevant_components(self, linear: Vector, angular: Vector) -> Vector:
         """What counts of both in the plane, or in space."""
         return np.array([*linear[:2], angular[2]] if self.plane else [*linear, *angular])
 
     def poses(self, e: Expected) -> float:
         """Positions, and axes of frames."""
-        found = self.module.pose(e.state.q, **self.held(e.state))
+        poses = self.module.pose(e.state.q, **self.arguments(e.state))
 
         def exact(line: Line) -> Vector:
             rows = []
             for name in self.names:
                 frame, m = line.frames[name], line.middle
-                axes = [rotated(frame.turn, x)[m] for x in np.eye(3)]
+                axes = [rotate(frame.turn, x)[m] for x in np.eye(3)]
                 turn = [frame.angle[m]] if self.plane else np.array(axes).T.ravel()
                 rows.append([*frame.at[m][: 2 if self.plane else 3], *turn])
             return np.array(rows)
 
         n = len(self.names)
-        both = np.hstack([found.position, np.reshape(found.rotation, (n, -1))])
+        both = np.hstack([poses.position, np.reshape(poses.rotation, (n, -1))])
         return self.off(both, exact, e.state)
 
     def twists(self, line: Line) -> Vector:
@@ -120,70 +122,70 @@ class _Frames:
         motions = (line.motion(line.frames[name], np.zeros(3)) for name in self.names)
         return np.array([np.hstack(motion).T for motion in motions])
 
-    def of_twists(self, twists: Vector) -> Vector:
+    def relevant_twists(self, twists: Vector) -> Vector:
         """What counts of them."""
-        return np.array([self.flat(x[:3], x[3:]) for x in twists])
+        return np.array([self.relevant_components(x[:3], x[3:]) for x in twists])
 
     def velocities(self, e: Expected) -> float:
         """Twists."""
         s = e.state
-        found = self.module.frame_velocity(s.q, s.qd, **self.held(s))
-        least = self.usual(s, self.of.sampler.speed)
+        twists = self.module.frame_velocity(s.q, s.qd, **self.arguments(s))
+        least = self.twist_scale(s, self.check.sampler.speed)
 
         def exact(line: Line) -> Vector:
-            return self.of_twists(self.twists(line)[..., line.middle])
+            return self.relevant_twists(self.twists(line)[..., line.middle])
 
-        return self.off(found, exact, s, least=least)
+        return self.off(twists, exact, s, least=least)
 
-    def usual(self, s: State, rates: Vector) -> float:
+    def twist_scale(self, s: State, rates: Vector) -> float:
         """The largest twist at such rates."""
-        J = np.abs(self.module.jacobian(s.q, **self.held(s)))
+        J = np.abs(self.module.jacobian(s.q, **self.arguments(s)))
         return float(np.max(J @ rates, initial=0))
 
     def accelerations(self, e: Expected) -> float:
         """Their rates, at the accelerations of the motion."""
         s, qdd = e.state, e.value["acceleration"]
-        found = self.module.frame_acceleration(s.q, s.qd, qdd, **self.held(s))
+        rates = self.module.frame_acceleration(s.q, s.qd, qdd, **self.arguments(s))
 
         def exact(line: Line) -> Vector:
-            return self.of_twists(self.twists(line) @ line.rate[line.middle])
+            return self.relevant_twists(self.twists(line) @ line.rate[line.middle])
 
-        sampler = self.of.sampler
-        least = self.usual(s, sampler.speed**2 / sampler.spread)
-        return self.off(found, exact, s, qdd, least=least)
+        sampler = self.check.sampler
+        least = self.twist_scale(s, sampler.speed**2 / sampler.spread)
+        return self.off(rates, exact, s, qdd, least=least)
 
     def jacobians(self, e: Expected) -> float:
         """Twists by one rate after the other, less what moves with time alone."""
         s = e.state
-        found = np.asarray(self.module.jacobian(s.q, **self.held(s)), float)
-        still = self.of.sampler.told(replace(s, qd=0 * s.qd))
-        rates, worst = np.maximum(self.of.sampler.spread, 1), 0.0
+        J = np.asarray(self.module.jacobian(s.q, **self.arguments(s)), float)
+        at_rest = self.check.sampler.with_discrete_parameters(replace(s, qd=0 * s.qd))
+        rates, worst = np.maximum(self.check.sampler.spread, 1), 0.0
         for k, direction in enumerate(np.eye(len(s.q))):
 
             def exact(line: Line) -> Vector:
-                rest = Line(self.scene, still, line.width)
-                both = [self.of_twists(self.twists(x)[..., x.middle]) for x in (line, rest)]
+                rest = Line(self.scene, at_rest, line.width)
+                both = [self.relevant_twists(self.twists(x)[..., x.middle]) for x in (line, rest)]
                 return both[0] - both[1]
 
             moving = replace(s, qd=direction * rates)
-            worst = max(worst, self.off(found[..., k] * rates[k], exact, moving))
+            worst = max(worst, self.off(J[..., k] * rates[k], exact, moving))
         return worst
 
     def forces(self, e: Expected) -> float:
         """J^T w of the module's own Jacobians."""
-        s, held = e.state, self.held(e.state)
-        J = np.asarray(self.module.jacobian(s.q, **held), float)
+        s, arguments = e.state, self.arguments(e.state)
+        J = np.asarray(self.module.jacobian(s.q, **arguments), float)
         w = np.random.default_rng(0).normal(size=J.shape[:2])
-        found = self.module.frame_forces(s.q, w, **held)
+        forces = self.module.frame_forces(s.q, w, **arguments)
         size = np.einsum("fik,fi->k", np.abs(J), np.abs(w))
-        off = np.abs(found - np.einsum("fik,fi->k", J, w))
+        off = np.abs(forces - np.einsum("fik,fi->k", J, w))
         return float(np.max(off) / (np.max(size) or 1.0))
 
     def momentum(self, e: Expected) -> float:
         """Of point masses: their sum, its centre, momentum and that about the centre."""
         s = e.state
-        m = self.module.momentum(s.q, s.qd, **self.held(s))
-        found = np.hstack([m.mass, m.center, m.linear, m.angular])
+        m = self.module.momentum(s.q, s.qd, **self.arguments(s))
+        momentum = np.hstack([m.mass, m.center, m.linear, m.angular])
 
         def exact(line: Line) -> Vector:
             bodies = line.bodies
@@ -195,6 +197,6 @@ class _Frames:
             center, linear = weights @ at / sum(weights), weights @ v
             angular = np.sum(np.cross(at - center, weights[:, None] * v), axis=0)
             d = 2 if self.plane else 3
-            return np.hstack([sum(weights), center[:d], self.flat(linear, angular)])
+            return np.hstack([sum(weights), center[:d], self.relevant_components(linear, angular)])
 
-        return self.off(found, exact, s)
+        return self.off(momentum, exact, s)

@@ -11,31 +11,31 @@ import numpy as np
 from eomc.model.symbols import symbol
 from eomc.model.system import System
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 from eomc.verify.sampling import State
 
 STATES = 4
 FAR = 3.0  # times what lies between limits
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the rows of a scene with limits."""
-    if all(x is None for i in of.system.inputs for x in i.limits):
+    if all(x is None for i in check.system.inputs for x in i.limits):
         return
-    for module, form in of.forms:
-        of.row(f"{form}limits of inputs", 0, "that differ", partial(_differ, of, module))
+    for module, form in check.forms:
+        check.row(f"{form}limits of inputs", 0, "that differ", partial(_differ, check, module))
 
 
-def _differ(of: Comparison, module: Any) -> float:
+def _differ(check: Comparison, module: Any) -> float:
     """How many of applied inputs, accelerations and steps are not those at the limits."""
-    found = 0
-    for e in of.few(STATES):
+    differing = 0
+    for e in check.few(STATES):
         s = e.state
-        least, most = limits(of.system, s.params or of.sampler.defaults)
+        least, most = limits(check.system, s.params or check.sampler.defaults)
         for beyond in _beyond(least, most):
             both = [list(_answers(module, s, u)) for u in (beyond, np.clip(beyond, least, most))]
-            found += sum(not np.array_equal(a, b) for a, b in zip(*both, strict=True))
-    return float(found)
+            differing += sum(not np.array_equal(a, b) for a, b in zip(*both, strict=True))
+    return float(differing)
 
 
 def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]:
@@ -63,12 +63,12 @@ def _beyond(least: Vector, most: Vector) -> Iterator[Vector]:
 
 
 def _answers(module: Any, s: State, u: Vector) -> Iterator[Vector]:
-    held = {"t": s.t, "u": u, "params": s.params}
-    yield module.applied(s.q, s.qd, **held)
-    yield module.acceleration(s.q, s.qd, **held)
+    arguments = {"t": s.t, "u": u, "params": s.params}
+    yield module.applied(s.q, s.qd, **arguments)
+    yield module.acceleration(s.q, s.qd, **arguments)
     for method in module.methods:
-        yield np.array(module.step(s.q, s.qd, method=method, **held))
+        yield np.array(module.step(s.q, s.qd, method=method, **arguments))
     if hasattr(module, "step_batch"):
         q, qd = np.array([s.q], module.dtype), np.array([s.qd], module.dtype)
-        yield module.step_batch(q, qd, **held)
+        yield module.step_batch(q, qd, **arguments)
         yield np.array([q, qd])

@@ -17,24 +17,30 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding
-from eomc.verify.oracle import Vector
-from eomc.verify.rows_runs import drive
+from eomc.verify.measurement import Measurement
+from eomc.verify.reference import Vector
+from eomc.verify.rows_runs import run_in_c
 from eomc.verify.sampling import State
 
 LENGTHS = (1.5, 3.0, 6.0, 15.0)  # steps, in times the fastest mode's own
 STEPS = 3
-NEAR = 1e-6  # of how far things go: the start beside the equilibrium, linear for two plain sweeps
-LINEAR = 0.01  # the same: as far as a run may go from there
-SEARCH = 40  # for an equilibrium
-PLAIN = 1 / 7  # by which plain sweeps contract: they get there in fewer than twenty
-MOST = 8  # sweeps of a step by the reference: more say that the motion is not linear
-EXTRA = 8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract
-OFF = 1e4  # roundings of the end, magnified as the fastest mode does
+START_DISTANCE = (
+    1e-6  # of how far things go: the start beside the equilibrium, linear for two plain sweeps
+)
+LINEAR_RANGE = 0.01  # the same: as far as a run may go from there
+MAX_SEARCH_STEPS = 40  # for an equilibrium
+MAX_PLAIN_CONTRACTION = 1 / 7  # by which plain sweeps contract: they get there in fewer than twenty
+MAX_REFERENCE_SWEEPS = (
+    8  # sweeps of a step by the reference: more say that the motion is not linear
+)
+MAX_EXTRA_SWEEPS = (
+    8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract
+)
+MAX_END_ERROR = 1e4  # roundings of the end, magnified as the fastest mode does
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Equilibrium:
     """An equilibrium, a state beside it, and the derivatives of the accelerations there."""
 
     centre: State
@@ -60,7 +66,12 @@ def report(check: Comparison) -> None:
     for method in check.methods:
         if METHODS[method].newton and check.dtype == np.float64:
             unit = "sweeps a step more than Newton's method"
-            check.row(f"{method} in stiff steps", EXTRA, unit, partial(newton.beyond, method))
+            check.row(
+                f"{method} in stiff steps",
+                MAX_EXTRA_SWEEPS,
+                unit,
+                partial(newton.extra_sweeps, method),
+            )
 
 
 class Newton:
@@ -70,45 +81,47 @@ class Newton:
         self.check = check
         self.scale = check.sampler.scale
 
-    def beyond(self, method: str) -> float | Finding:
+    def extra_sweeps(self, method: str) -> float | Measurement:
         """The most sweeps that the module needs beyond the reference's; inf where it ends wrong."""
         place = self.place()
         if place is None or not place.fastest:
-            return Finding(math.inf if place else math.nan, "no mode turns or decays")
-        found = [self.sweeps(method, place, x / place.fastest) for x in LENGTHS]
-        known = [x for x in found if x is not None]
-        return float(np.max(known)) if known else Finding(math.nan, "no stiff motion is linear")
+            return Measurement(math.inf if place else math.nan, "no mode turns or decays")
+        sweeps = [self.sweeps(method, place, x / place.fastest) for x in LENGTHS]
+        known = [x for x in sweeps if x is not None]
+        return float(np.max(known)) if known else Measurement(math.nan, "no stiff motion is linear")
 
-    def sweeps(self, method: str, place: _Place, h: float) -> float | None:
+    def sweeps(self, method: str, place: _Equilibrium, h: float) -> float | None:
         """The same for one step size; None where the reference's motion is not linear.
 
         And where plain sweeps get there, if slowly: the module may leave it at these.
         """
         m, s = METHODS[method], place.start
-        if one_step.contraction(m, place.slopes, h) < PLAIN:
+        if one_step.contraction_factor(m, place.slopes, h) < MAX_PLAIN_CONTRACTION:
             return None
         x, counts = np.array([s.q, s.qd]), []
         rows = [x]
         for n in range(STEPS):
             with np.errstate(all="ignore"):
-                x, count = one_step.by_newton(m, self.accelerations, x[0], x[1], s.t + n * h, h)
+                x, count = one_step.step_by_newton(
+                    m, self.accelerations, x[0], x[1], s.t + n * h, h
+                )
             far = np.abs(x - [place.centre.q, place.centre.qd]) / self.reach(place)
-            if count > MOST or not np.all(far < LINEAR):
+            if count > MAX_REFERENCE_SWEEPS or not np.all(far < LINEAR_RANGE):
                 return None
             counts.append(count)
             rows.append(x)
-        run = drive(self.check.module._model, method, s, h, STEPS)
+        run = run_in_c(self.check.module._model, method, s, h, STEPS)
         if run.status:
             return math.inf
         off = np.max(np.abs(run.rows[:, -1] - x) / self.reach(place))
         grown = (1 + h * place.fastest) ** 2 * STEPS
         size = float(np.max(np.abs([place.centre.q, place.centre.qd]) / self.reach(place))) + 1
-        if not off <= OFF * grown * size * self.check.eps:
+        if not off <= MAX_END_ERROR * grown * size * self.check.eps:
             return math.inf
         work = self.check.simulate(s, method=method, h=h, steps=STEPS).evaluations
         return float(work / m.stages - sum(counts)) / STEPS
 
-    def reach(self, place: _Place) -> Vector:
+    def reach(self, place: _Equilibrium) -> Vector:
         """How far things go, (2, nq): velocities as the fastest mode has them."""
         return np.array([self.scale[0], np.maximum(self.scale[1], self.scale[0] * place.fastest)])
 
@@ -116,13 +129,13 @@ class Newton:
         """The reference's, with the scene's own parameters and signals: all (n, nq), t (n,)."""
         return self.check.reference.acceleration(q, qd, t)
 
-    def place(self) -> _Place | None:
+    def place(self) -> _Equilibrium | None:
         """Beside an equilibrium that Newton's method finds from the start; None: there is none."""
         s = self.check.sampler.start
         q, rest = s.q.copy(), np.zeros_like(s.q)
         n = len(q)
         with np.errstate(all="ignore"):
-            for _ in range(SEARCH):
+            for _ in range(MAX_SEARCH_STEPS):
                 a = self.accelerations(q[None], rest[None], np.array([s.t]))[0]
                 slopes = one_step.slopes(self.accelerations, q, rest, s.t, self.scale)
                 if not (np.all(np.isfinite(a)) and np.all(np.isfinite(slopes))):
@@ -130,9 +143,9 @@ class Newton:
                 step = np.linalg.lstsq(slopes[:, :n], -a, rcond=1e-10)[0]
                 step /= max(1.0, 4 * float(np.max(np.abs(step) / self.scale[0])))
                 q = q + step
-                if np.max(np.abs(step) / self.scale[0]) < NEAR**2:
+                if np.max(np.abs(step) / self.scale[0]) < START_DISTANCE**2:
                     break
         centre = State(q, rest, s.t)
-        signs = np.random.default_rng(4).choice([-1.0, 1.0], (2, n)) * NEAR
+        signs = np.random.default_rng(4).choice([-1.0, 1.0], (2, n)) * START_DISTANCE
         start = State(q + signs[0] * self.scale[0], signs[1] * self.scale[1], s.t)
-        return _Place(centre, start, slopes)
+        return _Equilibrium(centre, start, slopes)

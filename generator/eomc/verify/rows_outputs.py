@@ -21,118 +21,127 @@ from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, symbol, t
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, Expected, State, ask, nudged
+from eomc.verify.sampling import NUDGE, Expected, State, evaluate_module, perturb_each_input
 
 DIGITS = 80  # three differences leave some thirty
 WIDTH = mpmath.mpf(10) ** -15  # of differences
 SLOPE_LIMIT = 1e-9  # of a row's largest derivative
-OF_MULTIPLIERS = 1e-6  # likewise, where an output reads multipliers
+MULTIPLIER_SLOPE_LIMIT = 1e-6  # likewise, where an output reads multipliers
 STATES = 4
 _NONE: Vector = np.zeros(0)
 
 _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the rows of a scene that has outputs."""
-    formulas = Formulas(of.system)
-    limit = max(OF_MULTIPLIERS if formulas.multipliers else SLOPE_LIMIT, LIMIT * of.eps)
-    for module, form in of.forms:
-        of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
-        if of.system.run.needs_derivatives:
-            unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
-            of.row(f"{form}outputs: C, D", limit, unit, slopes)
-            if of.system.run.linearize == "parameters" and of.system.parameters:
-                by_parameters = partial(_slopes, of, module, formulas, by_parameters=True)
-                of.row(f"{form}outputs: by parameters", limit, unit, by_parameters)
+    formulas = Formulas(check.system)
+    limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
+    for module, form in check.forms:
+        check.row(
+            f"{form}outputs", LIMIT, "units of rounding", partial(_values, check, module, formulas)
+        )
+        if check.system.run.needs_derivatives:
+            unit, slopes = "of the largest derivative", partial(_slopes, check, module, formulas)
+            check.row(f"{form}outputs: C, D", limit, unit, slopes)
+            if check.system.run.linearize == "parameters" and check.system.parameters:
+                by_parameters = partial(_slopes, check, module, formulas, by_parameters=True)
+                check.row(f"{form}outputs: by parameters", limit, unit, by_parameters)
 
 
-def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
+def _values(check: Comparison, module: Any, formulas: Formulas) -> float:
     """The outputs at some states, with the module's own accelerations and multipliers."""
 
-    def found(s: State) -> Vector:
+    def module_outputs(s: State) -> Vector:
         return np.asarray(module.output(s.q, s.qd, s.t, s.u, s.params), float)
 
-    return apart(of, module, formulas, found)
+    return compare_outputs(check, module, formulas, module_outputs)
 
 
-def apart(
-    of: Comparison, module: Any, formulas: Formulas, found: Callable[[State], Vector]
+def compare_outputs(
+    check: Comparison, module: Any, formulas: Formulas, function: Callable[[State], Vector]
 ) -> float:
     """What a function of the module's finds at some states beside formulas, in units."""
 
     def error(e: Expected) -> float:
-        s = _held(of, module, e.state)
-        value = found(s)
-        near = [found(x) for x in nudged(s, of.sampler.defaults)]
+        s = _with_fixed_inputs(check, module, e.state)
+        value = function(s)
+        near = [function(x) for x in perturb_each_input(s, check.sampler.defaults)]
         size = np.abs(value) + np.nansum([np.abs(x - value) / NUDGE for x in near], axis=0)
         qdd, forces = _solved(module, s)
-        exact = formulas.at(s, qdd, forces)
+        exact = formulas.evaluate(s, qdd, forces)
         # terms that cancel against an acceleration leave its rounding error
         for k in range(len(qdd)):
             moved = np.where(np.arange(len(qdd)) == k, 1 + NUDGE, 1.0) * qdd
-            size += np.nan_to_num(np.abs(formulas.at(s, moved, forces) - exact) / NUDGE)
+            size += np.nan_to_num(np.abs(formulas.evaluate(s, moved, forces) - exact) / NUDGE)
         real = np.isfinite(value) | np.isfinite(exact)  # sqrt(x) of x < 0 is neither
-        return of.units(value[real], exact[real], size[real]) if np.any(real) else 0.0
+        return check.units(value[real], exact[real], size[real]) if np.any(real) else 0.0
 
-    return of.largest(error, STATES)
+    return check.largest(error, STATES)
 
 
-def _slopes(of: Comparison, module: Any, formulas: Formulas, by_parameters: bool = False) -> float:
+def _slopes(
+    check: Comparison, module: Any, formulas: Formulas, by_parameters: bool = False
+) -> float:
     """Compare C and D, or dy/dp, with differences of the outputs, through A, B or E."""
 
     def error(e: Expected) -> float:
-        s = _held(of, module, e.state)
-        n, held = len(s.q), {"u": s.u, "t": s.t, "params": s.params}
+        s = _with_fixed_inputs(check, module, e.state)
+        n, arguments = len(s.q), {"u": s.u, "t": s.t, "params": s.params}
         if by_parameters:
-            solved, found = (
-                np.asarray(x, float) for x in module.sensitivity(s.q, s.qd, outputs=True, **held)
+            solved, module_slopes = (
+                np.asarray(x, float)
+                for x in module.sensitivity(s.q, s.qd, outputs=True, **arguments)
             )
         else:
             A, B, C, D = (
-                np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **held)
+                np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **arguments)
             )
-            solved, found = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
-        slopes, m = formulas.slopes(s, *_solved(module, s), by_parameters), found.shape[1]
+            solved, module_slopes = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
+        slopes, m = formulas.slopes(s, *_solved(module, s), by_parameters), module_slopes.shape[1]
         own, by_qdd, by_force = np.split(slopes, [m, m + n], axis=1)
         least: Vector = np.full(
             (1, 1), np.inf
         )  # of all widths of differences: what is wrong is so at each
         for forces in (
-            _of_multipliers(of, s, by_parameters) if formulas.multipliers else [by_force[:0]]
+            _multiplier_slopes(check, s, by_parameters) if formulas.multipliers else [by_force[:0]]
         ):
             exact, sizes = own + by_qdd @ solved, abs(own) + abs(by_qdd) @ abs(solved)
             if formulas.multipliers:
                 exact, sizes = exact + by_force @ forces, sizes + abs(by_force) @ abs(forces)
-            off = np.abs(found - exact) / (np.max(sizes, axis=1, keepdims=True) + 1e-300)
-            least = np.fmin(least, np.where(np.isfinite(found) | np.isfinite(exact), off, 0.0))
+            off = np.abs(module_slopes - exact) / (np.max(sizes, axis=1, keepdims=True) + 1e-300)
+            least = np.fmin(
+                least, np.where(np.isfinite(module_slopes) | np.isfinite(exact), off, 0.0)
+            )
         return float(np.max(least, initial=0))
 
-    return of.largest(error, 2)
+    return check.largest(error, 2)
 
 
-def _of_multipliers(of: Comparison, s: State, by_parameters: bool) -> Iterator[Vector]:
+def _multiplier_slopes(check: Comparison, s: State, by_parameters: bool) -> Iterator[Vector]:
     """Derivatives of the multipliers, by differences of several widths.
 
     With respect to q, qd and u, (nc, 2 nq + nu), or to the parameters, (nc, np).
     """
-    first = 2 * len(s.q) + len(of.system.inputs)
-    given = (of.reference, s, of.sampler.scale, of.sampler.defaults, "multipliers")
-    for slopes, _ in derivatives.by_differences(*given):
+    first = 2 * len(s.q) + len(check.system.inputs)
+    arguments = (check.reference, s, check.sampler.scale, check.sampler.defaults, "multipliers")
+    for slopes, _ in derivatives.differentiate(*arguments):
         yield slopes[:, first:] if by_parameters else slopes[:, :first]
 
 
 def _solved(module: Any, s: State) -> tuple[Vector, Vector]:
     """The module's accelerations and multipliers."""
     rows = getattr(module, "constraint_names", ())
-    return ask(module, "acceleration", s), ask(module, "multipliers", s) if rows else np.zeros(0)
+    return evaluate_module(module, "acceleration", s), evaluate_module(
+        module, "multipliers", s
+    ) if rows else np.zeros(0)
 
 
-def _held(of: Comparison, module: Any, s: State) -> State:
+def _with_fixed_inputs(check: Comparison, module: Any, s: State) -> State:
     """The state with inputs that don't follow it."""
-    if s.u is not None or not of.system.inputs:
+    if s.u is not None or not check.system.inputs:
         return s
     return replace(s, u=np.asarray(module.signal(s.q, s.qd, s.t, s.params), float))
 
@@ -150,13 +159,13 @@ class Formulas:
     def multipliers(self) -> tuple[Symbol, ...]:
         """Those of all constraints, where an output reads one."""
         read = {x for o in self.system.outputs for x in o.formula.free_symbols}
-        found = tuple(c.multiplier for c in self.system.constraints)
-        return found if read & {*found} else ()
+        multipliers = tuple(c.multiplier for c in self.system.constraints)
+        return multipliers if read & {*multipliers} else ()
 
-    def at(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
+    def evaluate(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
         """(ny,): at a state with inputs, accelerations and multipliers."""
         with mpmath.workdps(DIGITS):
-            return np.array([float(y) for y in self._values(self._given(s, qdd, forces))])
+            return np.array([float(y) for y in self._values(self._symbol_values(s, qdd, forces))])
 
     def slopes(
         self, s: State, qdd: Vector, forces: Vector = _NONE, by_parameters: bool = False
@@ -171,26 +180,31 @@ class Formulas:
         if by_parameters:
             own = tuple(p.symbol for p in system.parameters)
         with mpmath.workdps(DIGITS):
-            given, columns = self._given(s, qdd, forces), []
+            symbol_values, columns = self._symbol_values(s, qdd, forces), []
             for x in (*own, *system.qdd, *self.multipliers):
-                ends = [self._values({**given, x: given[x] + h}) for h in (WIDTH, -WIDTH)]
+                ends = [
+                    self._values({**symbol_values, x: symbol_values[x] + h})
+                    for h in (WIDTH, -WIDTH)
+                ]
                 columns.append([float((a - b) / (2 * WIDTH)) for a, b in zip(*ends, strict=True)])
         return np.array(columns).T
 
-    def _given(self, s: State, qdd: Vector, forces: Vector) -> dict[Symbol, Any]:
+    def _symbol_values(self, s: State, qdd: Vector, forces: Vector) -> dict[Symbol, Any]:
         system = self.system
-        given = dict(zip((*system.q, *system.qd, *system.qdd), (*s.q, *s.qd, *qdd), strict=True))
-        given |= dict(zip(system.u, () if s.u is None else s.u, strict=True))
-        given |= dict(zip(self.multipliers, forces, strict=bool(self.multipliers)))
-        given |= {symbol(n): v for n, v in (s.params or self._defaults).items()} | {t: s.t}
-        return {name: mpmath.mpf(float(value)) for name, value in given.items()}
+        symbol_values = dict(
+            zip((*system.q, *system.qd, *system.qdd), (*s.q, *s.qd, *qdd), strict=True)
+        )
+        symbol_values |= dict(zip(system.u, () if s.u is None else s.u, strict=True))
+        symbol_values |= dict(zip(self.multipliers, forces, strict=bool(self.multipliers)))
+        symbol_values |= {symbol(n): v for n, v in (s.params or self._defaults).items()} | {t: s.t}
+        return {name: mpmath.mpf(float(value)) for name, value in symbol_values.items()}
 
     @property
     def _defaults(self) -> dict[str, float]:
         return {p.name: p.value for p in self.system.parameters}
 
-    def _values(self, given: Mapping[Symbol, Any]) -> list[Any]:
-        motion = _Motion(self, given)
+    def _values(self, symbol_values: Mapping[Symbol, Any]) -> list[Any]:
+        motion = _Motion(self, symbol_values)
         return [_real(motion, o.formula) for o in self.system.outputs]
 
     def compiled(self, e: Expr) -> tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]:
@@ -217,8 +231,8 @@ def _real(motion: _Motion, formula: Expr) -> Any:
 class _Motion:
     """What formulas are near one state, as functions of the time since then."""
 
-    def __init__(self, formulas: Formulas, given: Mapping[Symbol, Any]) -> None:
-        self.formulas, self.given, system = formulas, given, formulas.system
+    def __init__(self, formulas: Formulas, symbol_values: Mapping[Symbol, Any]) -> None:
+        self.formulas, self.symbol_values, system = formulas, symbol_values, formulas.system
         self.definitions = dict(system.definitions)
         self.rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True))}
         self.known: dict[tuple[Symbol, Any], Any] = {}
@@ -234,12 +248,12 @@ class _Motion:
         """Of a name."""
         if (x, time) not in self.known:
             if x in self.definitions:
-                found = self.value(self.definitions[x], time)
+                value = self.value(self.definitions[x], time)
             elif x in self.rates:  # at constant accelerations
                 rate = self.rates[x]
-                half = self.given[self.rates[rate]] * time / 2 if rate in self.rates else 0
-                found = self.given[x] + (self.given[rate] + half) * time
+                half = self.symbol_values[self.rates[rate]] * time / 2 if rate in self.rates else 0
+                value = self.symbol_values[x] + (self.symbol_values[rate] + half) * time
             else:
-                found = self.given[x] + (time if x == t else 0)
-            self.known[x, time] = found
+                value = self.symbol_values[x] + (time if x == t else 0)
+            self.known[x, time] = value
         return self.known[x, time]

@@ -15,12 +15,12 @@ import numpy as np
 
 from eomc.verify import kkt
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_refusals import FACTORS, Refusals
-from eomc.verify.rows_runs import drive, parameters
-from eomc.verify.sampling import Expected, State, ask
+from eomc.verify.rows_runs import parameters, run_in_c
+from eomc.verify.sampling import Expected, State, evaluate_module
 
 AWAY = (1e-6, 1e-3, 1e-2)  # of how far things go: from a state to where it is projected from
 FAR = (3.0, 30.0, 300.0)  # times as far as they go: no state may be found
@@ -55,7 +55,7 @@ class Projection:
     of: Comparison
     module: Any
 
-    def projected(self, some: bool) -> float | Finding:
+    def projected(self, some: bool) -> float | Measurement:
         """A state moved away is put back where the reference puts it. some: one is held."""
         of = self.of
         scale = of.sampler.scale
@@ -93,7 +93,7 @@ class Projection:
         """Where the reference puts a state."""
         with np.errstate(all="ignore"):
             if not held:
-                return self.of.sampler.onto(s)
+                return self.of.sampler.project(s)
             q, qd = self.of.reference.project(s.q, s.qd, s.t, s.params, held)
         return replace(s, q=q, qd=qd)
 
@@ -102,7 +102,7 @@ class Projection:
         D = self.of.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         A = self.of.sampler.rows("constraint_jacobian", s)
         for i in random.permutation(len(s.q)).tolist():
-            if kkt.regular(*kkt.kept(D, A, (i,)), FIRM):
+            if kkt.is_regular(*kkt.with_fixed_coordinates(D, A, (i,)), FIRM):
                 return (i,)
         return None
 
@@ -127,13 +127,13 @@ class Projection:
     def _lost(self, s: State, scale: Vector) -> Iterator[tuple[State, tuple[int, int]]]:
         """States that are on no row, and what is held of them: positions, rates."""
         rows = np.array([c.holonomic for c in self.of.system.constraints])
-        A = np.abs(ask(self.module, "constraint_jacobian", s))
+        A = np.abs(evaluate_module(self.module, "constraint_jacobian", s))
         off = replace(s, q=s.q + OFF * scale[0])
-        lack = np.abs(ask(self.module, "constraints", off))
+        lack = np.abs(evaluate_module(self.module, "constraints", off))
         if np.any((lack > OFF / 10 * (A @ scale[0]))[rows]):
             yield off, (1, 1)
         off = replace(s, qd=s.qd + OFF * scale[1])
-        lack = np.abs(ask(self.module, "constraint_rates", off))
+        lack = np.abs(evaluate_module(self.module, "constraint_rates", off))
         if np.any(lack > OFF / 10 * (A @ scale[1])):
             yield off, (0, 1)
         q, qd = s.q.copy(), s.qd.copy()
@@ -152,9 +152,9 @@ class Projection:
         if status:
             return kept
         holds = 1e-3 if self.of.dtype == np.float32 else HOLDS
-        A = np.abs(ask(self.module, "constraint_jacobian", found))
+        A = np.abs(evaluate_module(self.module, "constraint_jacobian", found))
         rows = np.array([c.holonomic for c in self.of.system.constraints])
-        off = np.abs(ask(self.module, "constraints", found))[rows]
+        off = np.abs(evaluate_module(self.module, "constraints", found))[rows]
         level = (A @ (np.abs(found.q) + self.of.sampler.spread + np.max(np.abs(found.q))))[rows]
         return bool(np.all(np.isfinite(found.q)) and np.all(off <= holds * level))
 
@@ -199,8 +199,8 @@ class Weightless:
             status, clean = self.refusals.accelerate(s)
             wrong += status != SINGULAR or not clean
             for method in self.of.methods:
-                run = drive(self.of.module._model, method, s, self.of.system.run.h, 3)
-                wrong += run.done != 0 or run.status != SINGULAR
+                run = run_in_c(self.of.module._model, method, s, self.of.system.run.h, 3)
+                wrong += run.steps != 0 or run.status != SINGULAR
             for off in (s.q + 1e-3 * self.of.sampler.spread, s.q):
                 x = replace(s, q=off, qd=s.qd + 1e-3 * self.of.sampler.speed)
                 status, kept, _ = Projection(self.of, self.of.module)._put(x, (0, 0))

@@ -17,27 +17,29 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import kkt
 from eomc.verify.comparison import Comparison
-from eomc.verify.kkt import CLEAR
-from eomc.verify.oracle import Vector
-from eomc.verify.rows_runs import drive, parameters
+from eomc.verify.kkt import EIGENVALUE_TOLERANCE
+from eomc.verify.reference import Vector
+from eomc.verify.rows_runs import parameters, run_in_c
 from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
 REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)
 FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
 MIXED = 60  # changes of all parameters at random
-ALONE = 8  # changes of all at random, of which one alone is negative
+SINGLE_SIGN_CHANGES = 8  # changes of all at random, of which one alone is negative
 SPREAD = 3.0  # of their logarithms
 MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
-LOST = 1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
+LOST_DIGITS = (
+    1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
+)
 ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
 # of how far a coordinate goes: from a singular state to a regular one
-AWAY = (-0.1, 0.1, -0.4, 0.4)
-ALONG = np.linspace(0, 1, 9)  # of a step: where its stages may lie
+DISPLACEMENTS = (-0.1, 0.1, -0.4, 0.4)
+STEP_POINTS = np.linspace(0, 1, 9)  # of a step: where its stages may lie
 MARK = -7.0  # what is to be left alone
 
 
-def unfinite(s: State) -> Iterator[tuple[str, int, float, State]]:
+def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
     """The state with nan or inf in place of one coordinate or velocity: which, at which place."""
     for field in ("q", "qd"):
         for i in range(len(s.q)):
@@ -64,7 +66,7 @@ class Refusals:
             self.report_constrained()
         else:
             self.report_singular()
-        row("not finite", 0, "calls that do not refuse", self.odd)
+        row("not finite", 0, "calls that do not refuse", self.nonfinite_errors)
         for method in self.check.methods:
             find = partial(self.overflow, method)
             row(f"{method} too long", 0, "runs that end otherwise", find)
@@ -82,12 +84,12 @@ class Refusals:
     def report_constrained(self) -> None:
         """Add those about D that is negative along changes that rows allow."""
         row, unit = self.check.row, "calls that do not refuse"
-        row("negative D along the rows", 0, unit, self.held)
+        row("negative D along the rows", 0, unit, self.negative_inertia_errors)
         row("negative D along the rows: refusals", 0, unit, self.refuse)
 
     # where D is singular
 
-    def held(self) -> float:
+    def negative_inertia_errors(self) -> float:
         """How often the module finds accelerations where D is negative along the rows.
 
         Rows hold what has no inertia of its own, so that D alone says nothing.
@@ -99,11 +101,11 @@ class Refusals:
                     np.asarray(self.check.reference.evaluate(name, s.q, s.qd, 0.0, None, s.params))
                     for name in ("D", "constraint_jacobian")
                 )
-            if kkt.least_along(D, A) < -CLEAR:
+            if kkt.least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE:
                 if self.accelerate(s)[0] == SINGULAR:
                     self.singular.append(s)
                 else:
-                    wrong += not self.lost(s, D)
+                    wrong += not self.digits_lost(s, D)
         return float(wrong)
 
     def definite(self) -> float:
@@ -118,16 +120,18 @@ class Refusals:
             },
         }
         with np.errstate(all="ignore"):
-            found = np.asarray(self.check.reference.evaluate("D", t=0.0, u=None, **stacked))
+            mass_matrices = np.asarray(self.check.reference.evaluate("D", t=0.0, u=None, **stacked))
         wrong = 0
-        for s, D, least in zip(suspects, found, _least(found).tolist(), strict=True):
-            singular = least < -CLEAR or (least == 0 and self.exact(s))
-            if not (singular or least > CLEAR):
+        for s, D, least in zip(
+            suspects, mass_matrices, _least_eigenvalues(mass_matrices).tolist(), strict=True
+        ):
+            singular = least < -EIGENVALUE_TOLERANCE or (least == 0 and self.exact(s))
+            if not (singular or least > EIGENVALUE_TOLERANCE):
                 continue
             if (self.accelerate(s)[0] == SINGULAR) == singular:
                 (self.singular if singular else self.regular).append(s)
             elif singular or (self.natural(s) and self.exact(s)):
-                wrong += not self.lost(s, D)
+                wrong += not self.digits_lost(s, D)
         return float(wrong)
 
     def exact(self, s: State) -> bool:
@@ -146,16 +150,16 @@ class Refusals:
         pairs = [(x, self.defaults[name]) for name, x in (s.params or {}).items()]
         return all(x * default > 0 or default == 0 for x, default in pairs)
 
-    def lost(self, s: State, D: Vector) -> bool:
+    def digits_lost(self, s: State, D: Vector) -> bool:
         """Whether the module's own D has lost the digits that decide, as where lengths are huge."""
         size = np.sqrt(np.abs(np.diag(D)))
         off = np.abs(self.check.ask("D", s) - D)
-        return bool(np.any(off > LOST * np.outer(size, size)))
+        return bool(np.any(off > LOST_DIGITS * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
         """The start and some other states with parameters changed in every way."""
         states = self.places()
-        found = []
+        suspects_ = []
         changes: list[dict[str, float]] = [{}]
         for name, value in self.defaults.items():
             changes += [{name: factor * (value or 1.0)} for factor in FACTORS]
@@ -163,7 +167,7 @@ class Refusals:
             changes.append({name: scale * value for name, value in self.defaults.items()})
         n = len(self.defaults)
         # one negative eigenvalue makes one negative pivot, whatever the order of elimination
-        alone = np.repeat(1 - 2 * np.eye(n), ALONE, axis=0)
+        alone = np.repeat(1 - 2 * np.eye(n), SINGLE_SIGN_CHANGES, axis=0)
         for signs in (*alone, *self.random.choice([-1, 1, 1], (MIXED, n))):
             sizes = np.exp(self.random.uniform(-SPREAD, SPREAD, n))
             changes.append({
@@ -172,10 +176,10 @@ class Refusals:
                     self.defaults.items(), signs.tolist(), sizes.tolist(), strict=True)
             })  # fmt: skip
         for change in changes:
-            found += [replace(s, params={**self.defaults, **change}) for s in states]
+            suspects_ += [replace(s, params={**self.defaults, **change}) for s in states]
         most = FEWER if self.check.large else MOST
-        order = self.random.permutation(len(found))[:most]
-        return [found[k] for k in sorted(order)]
+        order = self.random.permutation(len(suspects_))[:most]
+        return [suspects_[k] for k in sorted(order)]
 
     def places(self) -> list[State]:
         """Where a D may be singular: at the start, upright, level, and anywhere."""
@@ -193,12 +197,12 @@ class Refusals:
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
         u = None if s.u is None else np.array(s.u, model.dtype)
         p = parameters(model, s)
-        found = model._lib.acceleration(
+        status = model._lib.acceleration(
             1, model._pointer(a), model._pointer(q), model._pointer(qd), s.t, model._pointer(u),
             model._pointer(p), model._c[2],
         ) & 7  # fmt: skip
-        clean = bool(np.all(a == MARK)) if found else bool(np.all(np.isfinite(a)))
-        return found, clean
+        clean = bool(np.all(a == MARK)) if status else bool(np.all(np.isfinite(a)))
+        return status, clean
 
     def refuse(self) -> float:
         """How many calls at singular states do not refuse, or write all the same."""
@@ -210,8 +214,8 @@ class Refusals:
                 wrong += not self.raises(partial(self.call, name, s), "singular")
             for method in self.check.methods:
                 wrong += not self.stays(method, s, "singular")
-            sloped = {"linearize": self.model.has_slopes, "discretize": run.discretize}
-            for name in (name for name, there in sloped.items() if there):
+            derivatives_present = {"linearize": self.model.has_slopes, "discretize": run.discretize}
+            for name in (name for name, there in derivatives_present.items() if there):
                 wrong += not self.raises(partial(self.call, name, s), "singular")
         return float(wrong)
 
@@ -230,16 +234,18 @@ class Refusals:
     def stays(self, method: str, s: State, status: str) -> bool:
         """Whether a step and a run refuse: where they were, with the words for it."""
         out = tuple(np.full(len(s.q), MARK, self.model.dtype) for _ in range(2))
-        way = {"params": s.params, "u": s.u, "method": method}
-        step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **way)
+        options = {"params": s.params, "u": s.u, "method": method}
+        step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **options)
         if not self.raises(step, status) or not np.all(np.array(out) == MARK):
             return False
         try:
             run = self.check.simulate(s, method=method, steps=5)
         except ArithmeticError:  # D puts a start onto the rows, too
             return bool(self.check.system.constraints)
-        kept = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
-        return bool(kept and run.status == status and run.steps == 0 and "stopped" in run.message)
+        unchanged = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
+        return bool(
+            unchanged and run.status == status and run.steps == 0 and "stopped" in run.message
+        )
 
     def run_into(self) -> float:
         """How many runs with a regular start go on where D is singular, or keep such a state.
@@ -254,20 +260,24 @@ class Refusals:
                 if tried == 24:
                     break
                 tried += 1
-                ways = [(start, 0.5), (start, 20.5), *((x, 20.5) for x in self.beside(s, tried))]
+                ways = [
+                    (start, 0.5),
+                    (start, 20.5),
+                    *((x, 20.5) for x in self.regular_neighbour(s, tried)),
+                ]
                 for begin, parts in ways:
                     at = replace(begin, qd=(s.q - begin.q) / (parts * h))
                     for method in self.check.methods:
                         wrong += self.goes_on(method, at, math.ceil(parts))
         return float(wrong)
 
-    def beside(self, s: State, turn: int) -> list[State]:
+    def regular_neighbour(self, s: State, turn: int) -> list[State]:
         """A regular state that differs from a singular one in one coordinate, if one is found.
 
         From there a run may come gently to where D is singular: nothing else moves.
         """
         i = turn % len(s.q)
-        for by in AWAY:
+        for by in DISPLACEMENTS:
             q = s.q.copy()
             q[i] += by * self.check.sampler.spread[i]
             at = replace(s, q=q, qd=np.zeros_like(q))
@@ -277,68 +287,70 @@ class Refusals:
 
     def goes_on(self, method: str, s: State, steps: int) -> bool:
         """Whether a run has kept a state whose D is not positive definite."""
-        run = drive(self.model, method, s, self.check.system.run.h, steps + 3)
-        rows = run.rows[:, : run.done + 1].astype(float)
+        run = run_in_c(self.model, method, s, self.check.system.run.h, steps + 3)
+        rows = run.rows[:, : run.steps + 1].astype(float)
         if not np.all(np.isfinite(rows)):
             return True
         # an angle of 1e20 has no digit left that says what D is
-        digits = np.abs(rows[0]) * self.check.eps < CLEAR * self.check.sampler.spread
+        digits = np.abs(rows[0]) * self.check.eps < EIGENVALUE_TOLERANCE * self.check.sampler.spread
         known = int(np.argmin([*np.all(digits, axis=1), False]))
         # the last state kept may be singular, but no step is made from it
-        least = self.least(rows[0, : min(known, run.done)], s)
+        least = self.least_eigenvalues(rows[0, : min(known, run.steps)], s)
         if METHODS[method].c[0]:  # no stage is where the step begins: all along it then
-            begun = np.flatnonzero(least[: max(0, known - 1)] < -CLEAR)
-            along = self.between(rows[:, begun], rows[:, begun + 1])
-            least = np.max([self.least(q, s) for q in along], axis=0)
-        return bool(np.any(least < -CLEAR))
+            starts_negative = np.flatnonzero(least[: max(0, known - 1)] < -EIGENVALUE_TOLERANCE)
+            positions = self.positions_along_step(
+                rows[:, starts_negative], rows[:, starts_negative + 1]
+            )
+            least = np.max([self.least_eigenvalues(q, s) for q in positions], axis=0)
+        return bool(np.any(least < -EIGENVALUE_TOLERANCE))
 
-    def between(self, starts: Vector, ends: Vector) -> list[Vector]:
+    def positions_along_step(self, starts: Vector, ends: Vector) -> list[Vector]:
         """Positions along all steps, by the cubic through both ends of each: (n, nq) for ALONG."""
         (q, qd), (r, v), h = starts, ends, self.check.system.run.h
         return [
             q + (r - q) * x**2 * (3 - 2 * x) + h * x * (1 - x) * (qd * (1 - x) - v * x)
-            for x in ALONG.tolist()
+            for x in STEP_POINTS.tolist()
         ]
 
-    def least(self, q: Vector, s: State) -> Vector:
+    def least_eigenvalues(self, q: Vector, s: State) -> Vector:
         """The least scaled eigenvalues of the reference's D at positions (n, nq)."""
         if not len(q):
             return np.zeros(0)
         with np.errstate(all="ignore"):
             D = self.check.reference.evaluate("D", q, 0 * q, 0.0, None, s.params)
-        return _least(np.asarray(D))
+        return _least_eigenvalues(np.asarray(D))
 
     # what is not finite
 
-    def odd(self) -> float:
+    def nonfinite_errors(self) -> float:
         """How many functions take a number for granted that is none, or infinite."""
         s, wrong = self.check.few(2)[-1].state, 0
-        for field, i, what, at in unfinite(s):
-            found, clean = self.accelerate(at)
+        for field, i, what, at in with_nonfinite_entries(s):
+            status, clean = self.accelerate(at)
             wrong += not clean
             # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
-            silent = math.isnan(what) and not found and self.matters(s, field, i)
+            silent = math.isnan(what) and not status and self.matters(s, field, i)
             wrong += silent and not self.bounded(at)
             if self.check.system.constraints:
                 wrong += not self.multiplied(at)
             for method in self.check.methods:
-                run = drive(self.model, method, at, self.check.system.run.h, 3)
-                wrong += run.done != 0 or run.status not in REFUSED
+                run = run_in_c(self.model, method, at, self.check.system.run.h, 3)
+                wrong += run.steps != 0 or run.status not in REFUSED
             wrong += self.model.has_slopes and not self.linearized(at)
         return float(wrong)
 
     def multiplied(self, s: State) -> bool:
         """Whether multipliers are finite, or refused by the C function: nan for each then."""
         model = self.model
-        found = np.zeros(len(model.constraint_names), model.dtype)
+        multipliers = np.zeros(len(model.constraint_names), model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
         u = None if s.u is None else np.array(s.u, model.dtype)
         p = parameters(model, s)
         refused = model._lib.multipliers(
-            1, model._pointer(found), model._pointer(q), model._pointer(qd), s.t,
+            1, model._pointer(multipliers), model._pointer(q), model._pointer(qd), s.t,
             model._pointer(u), model._pointer(p), model._c[2],
         )  # fmt: skip
-        return bool(np.all(np.isnan(found) if refused else np.isfinite(found)))
+        return bool(np.all(np.isnan(multipliers) if refused else np.isfinite(multipliers)))
 
     def matters(self, s: State, field: str, i: int) -> bool:
         """Whether accelerations depend on a coordinate or velocity."""
@@ -362,13 +374,13 @@ class Refusals:
         A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
         p = parameters(model, s)
-        found = model._lib.linearization(
+        status = model._lib.linearization(
             1, *(model._pointer(x) for x in (A_q, A_qd, B, q, qd)), s.t,
             model._pointer(None if s.u is None else np.array(s.u, model.dtype)),
             model._pointer(p), model._c[2],
         )  # fmt: skip
         written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
-        return bool(np.all(written == MARK) if found & 7 else np.all(np.isfinite(written)))
+        return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
         """Steps so long that the state leaves the finite numbers, or no stages are found."""
@@ -378,23 +390,23 @@ class Refusals:
             h = self.check.system.run.h * 10.0**power
             if h > float(np.finfo(self.model.dtype).max):
                 break
-            run = drive(self.model, method, s, h, 12)
-            kept = run.rows[:, : run.done + 1]
-            wrong += not np.all(np.isfinite(kept))
-            wrong += bool(run.status == OK) != (run.done == 12)
+            run = run_in_c(self.model, method, s, h, 12)
+            stored = run.rows[:, : run.steps + 1]
+            wrong += not np.all(np.isfinite(stored))
+            wrong += bool(run.status == OK) != (run.steps == 12)
             wrong += run.status == NO_CONVERGENCE and not METHODS[method].implicit
             ended.append(run.status)
         # one coordinate leaves the finite numbers at the very end, where forces let it
         huge = float(np.finfo(self.model.dtype).max) / 2
         for unit in np.eye(len(s.q)):
-            run = drive(
+            run = run_in_c(
                 self.model, method, replace(s, q=huge * unit, qd=1.01 * huge * unit), 1.0, 1
             )
-            wrong += not np.all(np.isfinite(run.rows[:, : run.done + 1]))
+            wrong += not np.all(np.isfinite(run.rows[:, : run.steps + 1]))
         return float(wrong + (ended[-1] == OK))
 
 
-def _least(D: Vector) -> Vector:
+def _least_eigenvalues(D: Vector) -> Vector:
     """The least eigenvalue of D_ij / sqrt(|D_ii D_jj|) of each D (n, nq, nq): (n,).
 
     0: a diagonal entry is; nan: not to be judged.

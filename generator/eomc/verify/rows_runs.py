@@ -21,9 +21,9 @@ from eomc.model.system import System, t
 from eomc.verify import derivatives
 from eomc.verify.angles import largest_angle
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
-from eomc.verify.sampling import EPS, FARTHEST, NUDGE, Expected, State
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
+from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
@@ -52,17 +52,17 @@ ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
 
 
 @dataclass(frozen=True)
-class Driven:
+class RunResult:
     """What a run by the C function gave: rows (2, n, nq), how many steps, and the status."""
 
     rows: Vector
-    done: int
+    steps: int
     status: int
 
-    def same(self, other: Driven) -> bool:
+    def is_identical(self, other: RunResult) -> bool:
         """To the last bit; a number that is not one is the same as another."""
         return (
-            self.done == other.done
+            self.steps == other.steps
             and self.status == other.status
             and np.array_equal(self.rows, other.rows, equal_nan=True)
         )
@@ -74,14 +74,14 @@ def parameters(model: Any, s: State) -> Vector:
     return np.array(values, model.dtype)
 
 
-def drive(
+def run_in_c(
     model: Any, method: str, s: State, h: float, steps: int, *, cuts: Sequence[int] = (),
-    every: int = 1, moved: float = 0.0, anew: bool = False,
-) -> Driven:  # fmt: skip
+    every: int = 1, moved: float = 0.0, fresh_memory: bool = False,
+) -> RunResult:  # fmt: skip
     """A run of the C function from s, in calls that end at `cuts`; s.u (nu,) or (steps, nu).
 
     moved: the part by which a state's first number is changed at a cut, as if from elsewhere.
-    anew: every call has a memory of its own.
+    fresh_memory: every call has a memory of its own.
     """
     _, run, _, _, work_type, _ = model._loops[method]
     q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -89,23 +89,23 @@ def drive(
     u = None if s.u is None else np.array(s.u, model.dtype)
     stride = 0 if u is None or u.ndim == 1 else model.nu
     work = model._ffi.new(work_type) if cuts else model._c[2]
-    done, status, p = 0, 0, parameters(model, s)
+    steps_done, status, p = 0, 0, parameters(model, s)
     for end in (*(c for c in cuts if c < steps), steps):
-        if moved and done:
-            row = rows[0, -(-done // every)]
+        if moved and steps_done:
+            row = rows[0, -(-steps_done // every)]
             row[0] += moved * (1 + abs(row[0]))  # also where it has been thrown far out
-        if anew and done:
+        if fresh_memory and steps_done:
             work = model._ffi.new(work_type)
-            work.done = done
-        found = run(
+            work.steps = steps_done
+        code = run(
             model._pointer(rows[0]), model._pointer(rows[1]), model._pointer(q),
-            model._pointer(qd), s.t, h, end - done, model._pointer(u), stride, every,
+            model._pointer(qd), s.t, h, end - steps_done, model._pointer(u), stride, every,
             model._pointer(p), work,
         )  # fmt: skip
-        done, status = found >> 3, found & 7
+        steps_done, status = code >> 3, code & 7
         if status:
             break
-    return Driven(rows, done, status)
+    return RunResult(rows, steps_done, status)
 
 
 def _reads_time(system: System) -> bool:
@@ -129,8 +129,12 @@ class Runs:
         self.starts = check.few(2)
         self.states = [e.state for e in self.starts]
         self.few = FEWER if check.large else FEW
-        faster = [self.sampler.onto(replace(s, qd=k * s.qd)) for s in self.states for k in SPEEDS]
-        self.turning = [e for s in faster if check.moves(s) and (e := self._expected(s))]
+        faster = [
+            self.sampler.project(replace(s, qd=k * s.qd)) for s in self.states for k in SPEEDS
+        ]
+        self.turning = [
+            e for s in faster if check.has_finite_accelerations(s) and (e := self._expected(s))
+        ]
 
     def _expected(self, s: State) -> Expected | None:
         with np.errstate(all="ignore"):
@@ -185,7 +189,7 @@ class Runs:
         steps += [2 * moved / rate] if rate > 0 else []
         return min([*steps, 100 * self.h]) if steps else self.h
 
-    def long(self) -> float | Finding:
+    def long(self) -> float | Measurement:
         """Long steps beside the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         pairs = [
@@ -197,14 +201,14 @@ class Runs:
             )
         ]
         pairs += [(e, self.turning_step(e.state, ON, ROTATED)) for e in self.turning]
-        found = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
-        return largest(found, "a difference grows too much in one long step")
+        errors = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
+        return largest(errors, "a difference grows too much in one long step")
 
-    def short(self) -> float | Finding:
+    def short(self) -> float | Measurement:
         """Steps in which angles hardly turn beside the reference's."""
         starts = self.check.few(2 if self.check.large else 8)
-        found = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
-        return largest(found, "a difference grows too much in one short step")
+        errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
+        return largest(errors, "a difference grows too much in one short step")
 
     def sines(self) -> float:
         """D, g and bias all around the circle, where sines need all of their terms."""
@@ -224,16 +228,18 @@ class Runs:
         for at, values in zip(states, expected, strict=True):
             for name, width in size.items():
                 if np.all(np.isfinite(values[name])):
-                    found = self.check.ask(name, at)
-                    errors.append(self.check.units(found, values[name], width))
+                    value = self.check.ask(name, at)
+                    errors.append(self.check.units(value, values[name], width))
         return float(np.max(errors, initial=0))
 
     def expected(self, states: Sequence[State]) -> list[dict[str, Vector]]:
         """The reference's D, g and bias at states that differ in q alone."""
         s, ask = states[0], self.sampler.reference.evaluate
         q, qd = (np.array([getattr(at, x) for at in states]) for x in ("q", "qd"))
-        found = {name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")}
-        return [{name: values[k] for name, values in found.items()} for k in range(len(states))]
+        values_found = {name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")}
+        return [
+            {name: values[k] for name, values in values_found.items()} for k in range(len(states))
+        ]
 
     def far(self) -> float:
         """Values, accelerations and steps at angles and times that sines are too small for.
@@ -246,15 +252,15 @@ class Runs:
         for e in self.check.few(2):
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
-            held = bool(self.check.system.constraints)  # which do not hold at another time
-            t = LATE if _reads_time(self.check.system) and not held else 0.0
+            constrained = bool(self.check.system.constraints)  # which do not hold at another time
+            t = LATE if _reads_time(self.check.system) and not constrained else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
             while t > 1 and angle(at) > FARTHEST_ANGLE:
                 t /= 2
                 at = replace(at, t=s.t + t)
             if angle(at) > 2 / EPS:
                 continue
-            if held and not self.holds(at):
+            if constrained and not self.holds(at):
                 continue
             with np.errstate(all="ignore"):
                 far = self.sampler.expected(at)
@@ -277,12 +283,14 @@ class Runs:
             for method in self.check.methods:
                 if method != "rk4":
                     solved = self.solved(far) if METHODS[method].implicit else far
-                    errors.append(self.check.one_step_of(method, solved, self.h) or 0.0)
+                    errors.append(self.check.one_step_error(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
 
     def holds(self, s: State) -> bool:
         """Whether constraints hold with angles turned so far: gears need turns of their own."""
-        off, size = self.sampler.reach(partial(self.sampler.reference.evaluate, "constraints"), s)
+        off, size = self.sampler.value_and_size(
+            partial(self.sampler.reference.evaluate, "constraints"), s
+        )
         return bool(np.all(np.abs(off) <= 1e3 * self.check.eps * size))
 
     def solved(self, e: Expected) -> Expected:
@@ -293,7 +301,7 @@ class Runs:
         s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
         scale = self.sampler.scale
         with np.errstate(all="ignore"):
-            by = derivatives.by_differences(self.sampler.reference, s, scale, self.sampler.defaults)
+            by = derivatives.differentiate(self.sampler.reference, s, scale, self.sampler.defaults)
             slopes = np.fmax.reduce([np.abs(J[:, n : 2 * n]) for J, _ in by])
         gain = e.size["acceleration"] + rounded / self.h + slopes @ rounded
         return replace(e, size={**e.size, "acceleration": gain})
@@ -307,14 +315,14 @@ class Runs:
             for n in range(self.few):
                 x = np.array(self.sampler.reference.step(x[0], x[1], h, s.t + n * h, u, s.params))
                 off = np.fmax(off, np.max(np.abs(x - x[:, :1]), axis=1) / EPS)
-            if not np.all(np.abs(x[:, 0] - [s.q, s.qd]) < FARTHEST * scale):
+            if not np.all(np.abs(x[:, 0] - [s.q, s.qd]) < MAX_DISTANCE * scale):
                 return 0.0  # as where a force that is wound up throws another coordinate
         gain = self.few * h * acceleration
         size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain]) + off
-        found = drive(self.model, "rk4", s, h, self.few).rows[:, -1]
-        return self.check.units(found, x[:, 0], size)
+        end = run_in_c(self.model, "rk4", s, h, self.few).rows[:, -1]
+        return self.check.units(end, x[:, 0], size)
 
-    def inputs(self) -> float | Finding:
+    def inputs(self) -> float | Measurement:
         """A row of inputs each step beside the reference, and cut as one."""
         errors, spread = [], self.sampler.scale
         for s in self.states:
@@ -323,7 +331,7 @@ class Runs:
             u = self.random.normal(size=(FEW, self.model.nu)) * scale
             at = replace(s, u=u)
             n, x, growth = self.driven(s, u, spread)
-            run = drive(self.model, self.check.methods[0], at, self.h, FEW)
+            run = run_in_c(self.model, self.check.methods[0], at, self.h, FEW)
             size = np.abs(np.array([s.q, s.qd])) + np.abs(x)
             size = FEW * (size + growth * spread)
             errors.append(self.check.units(run.rows[:, n], x, size) if n else None)
@@ -346,10 +354,10 @@ class Runs:
         sure = 0, start, 1.0
         with np.errstate(all="ignore"):
             for n, row in enumerate(u):
-                t, held = s.t + n * self.h, np.array([row, row])
+                t, inputs = s.t + n * self.h, np.array([row, row])
                 step = self.sampler.reference.step
-                x = np.array(step(x[0], x[1], self.h, t, held, s.params))
-                if not np.all(np.abs(x[:, 0] - start) < FARTHEST * spread):
+                x = np.array(step(x[0], x[1], self.h, t, inputs, s.params))
+                if not np.all(np.abs(x[:, 0] - start) < MAX_DISTANCE * spread):
                     break  # what blows up says nothing
                 growth = float(np.max(np.abs(x[:, 1] - x[:, 0]) / spread)) / NUDGE
                 sure = n + 1, x[:, 0], max(growth, 1.0)
@@ -374,23 +382,25 @@ class Runs:
 
     def differ(self, method: str, s: State, h: float) -> int:
         """How many of the runs of one state and step differ."""
-        whole = drive(self.model, method, s, h, STEPS)
-        pieces = drive(self.model, method, s, h, STEPS, cuts=CUTS)
-        sparse = drive(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)
-        last = -(-whole.done // EVERY)
-        kept = whole.rows[:, np.minimum(EVERY * np.arange(last + 1), whole.done)]
+        whole = run_in_c(self.model, method, s, h, STEPS)
+        pieces = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS)
+        sparse = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)
+        last = -(-whole.steps // EVERY)
+        stored = whole.rows[:, np.minimum(EVERY * np.arange(last + 1), whole.steps)]
         rows = np.full_like(sparse.rows, np.nan)
-        rows[:, : last + 1] = kept
-        wrong = (not pieces.same(whole)) + (not sparse.same(replace(whole, rows=rows)))
+        rows[:, : last + 1] = stored
+        wrong = (not pieces.is_identical(whole)) + (
+            not sparse.is_identical(replace(whole, rows=rows))
+        )
         # a state that is another than was left has no memory
         by = max(1e-3 * float(self.sampler.spread[0]), 64 * self.check.eps)
-        moved, anew = (
-            drive(self.model, method, s, h, CUTS[3], cuts=CUTS, moved=by, anew=anew)
-            for anew in (False, True)
+        moved, fresh = (
+            run_in_c(self.model, method, s, h, CUTS[3], cuts=CUTS, moved=by, fresh_memory=fresh)
+            for fresh in (False, True)
         )
-        return wrong + (not moved.same(anew))
+        return wrong + (not moved.is_identical(fresh))
 
-    def fine(self, method: str) -> float | Finding:
+    def fine(self, method: str) -> float | Measurement:
         """How far rounding moves the end of a run of thousands of steps, in units of the state.
 
         Two runs over the same time in so short steps that the method is exact differ by rounding
@@ -398,27 +408,27 @@ class Runs:
         is short enough where forces jump or bend within it; where they are steep, what is left gets
         less with shorter steps, as rounding does not.
         """
-        states, found = self.check.few(4), list[float]()
+        states, errors = self.check.few(4), list[float]()
         for parts in FINE:
-            found.append(self.rounded(method, states, parts))
-            if found[-1] <= ROUNDED:
-                return found[-1]
+            errors.append(self.rounded(method, states, parts))
+            if errors[-1] <= ROUNDED:
+                return errors[-1]
         if corners := self.check.corners:
-            return Finding(found[-1], f"steps leap over {corners}")
-        if found[-1] < found[0] / 2:
-            return Finding(found[-1], "forces are so steep that shorter steps differ less")
-        return min(found)
+            return Measurement(errors[-1], f"steps leap over {corners}")
+        if errors[-1] < errors[0] / 2:
+            return Measurement(errors[-1], "forces are so steep that shorter steps differ less")
+        return min(errors)
 
     def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
         """The same with h in so many parts."""
-        found, T = [], 2 * self.h
+        errors, T = [], 2 * self.h
         for e in states:
             s, gain = replace(e.state, u=None), T * e.size["acceleration"]
             one, other = (
-                drive(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in parts
+                run_in_c(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in parts
             )
             if not (one.status or other.status):
                 size = np.abs([s.q, s.qd]) + np.array([T * (np.abs(s.qd) + gain), gain])
                 size = size + e.size.get("place", 0.0)  # onto which each step is put
-                found.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
-        return float(median(found)) if found else 0.0
+                errors.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
+        return float(median(errors)) if errors else 0.0

@@ -17,15 +17,15 @@ from eomc.verify.rows_outputs import SLOPE_LIMIT, Formulas
 from eomc.verify.sampling import Expected
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the rows of a scene with a smooth feedback."""
-    if not of.system.run.needs_derivatives or not _is_feedback(of.system):
+    if not check.system.run.needs_derivatives or not _is_feedback(check.system):
         return
-    signals = tuple(Output(i.name, i.signal) for i in of.system.inputs)
-    formulas = Formulas(replace(of.system, outputs=signals, inputs=()))
-    limit, unit = max(SLOPE_LIMIT, LIMIT * of.eps), "of the largest derivative"
-    for module, form in of.forms:
-        of.row(f"{form}closed loop", limit, unit, partial(_loop, of, module, formulas))
+    signals = tuple(Output(i.name, i.signal) for i in check.system.inputs)
+    formulas = Formulas(replace(check.system, outputs=signals, inputs=()))
+    limit, unit = max(SLOPE_LIMIT, LIMIT * check.eps), "of the largest derivative"
+    for module, form in check.forms:
+        check.row(f"{form}closed loop", limit, unit, partial(_loop, check, module, formulas))
 
 
 def _is_feedback(system: System) -> bool:
@@ -36,22 +36,22 @@ def _is_feedback(system: System) -> bool:
     return bool(moves) and not signals.has(sympy.sign, sympy.Heaviside)
 
 
-def _loop(of: Comparison, module: Any, formulas: Formulas) -> float:
+def _loop(check: Comparison, module: Any, formulas: Formulas) -> float:
     """A of the closed loop beside A + B du/dx, by the module's own A and B."""
 
     def error(e: Expected) -> float:
         s = replace(e.state, u=None)
-        held = {"t": s.t, "params": s.params}
+        arguments = {"t": s.t, "params": s.params}
         n = 2 * len(s.q)
         A, B, closed = (
             np.asarray(x, float)
             for x in (
-                *module.linearize(s.q, s.qd, **held),
-                module.linearize(s.q, s.qd, closed=True, **held)[0],
+                *module.linearize(s.q, s.qd, **arguments),
+                module.linearize(s.q, s.qd, closed=True, **arguments)[0],
             )
         )
         K = formulas.slopes(s, np.zeros(len(s.q)))[:, :n]
         size = np.max(abs(A) + abs(B) @ abs(K), axis=1, keepdims=True)
         return float(np.max(abs(closed - A - B @ K) / (size + 1e-300)))
 
-    return of.largest(error, 2)
+    return check.largest(error, 2)

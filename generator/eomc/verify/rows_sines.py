@@ -15,15 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding
-from eomc.verify.oracle import Vector
+from eomc.verify.measurement import Measurement
+from eomc.verify.reference import Vector
 from eomc.verify.sampling import Expected
 
 LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
 QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
 # doubles beside each; some far, as from one to the next what a sum rounds may hardly change
 NEIGHBOURS = (-613, -2, -1, 0, 1, 2, 389)
-ALIKE = 1e-6  # an entry over its sine, at neighbours
+PROPORTION_TOLERANCE = 1e-6  # an entry over its sine, at neighbours
 CLEAR = 0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
 Errors = dict[tuple[str, int], float]  # of entries of D and g
 # of other coordinates, which change what sums round, no sine: also the power of two whose roundings
@@ -37,7 +37,7 @@ def report(check: Comparison) -> None:
         check.row("sines that vanish", LIMIT, "units of rounding", lambda: vanishing(check))
 
 
-def vanishing(check: Comparison) -> float | Finding:
+def vanishing(check: Comparison) -> float | Measurement:
     """The largest error of an entry that is one sine times something, in roundings of itself.
 
     It is so at all quarter turns where that sine vanishes: what is so at some may be a sum that
@@ -47,21 +47,21 @@ def vanishing(check: Comparison) -> float | Finding:
     for i in map(int, np.flatnonzero(check.sampler.angles)):
         for odd in (0, 1):
             places = [n for n in QUARTERS if n % 2 == odd]
-            found = [dict(_beside(check, i, n, e)) for n in places]
-            alone = set.intersection(*map(set, found))
-            for quarters, here in zip(places, found, strict=True):
-                errors += _sure(check, i, quarters, e, {k: here[k] for k in alone})
+            error_tables = [dict(_entry_errors(check, i, n, e)) for n in places]
+            common = set.intersection(*map(set, error_tables))
+            for quarters, here in zip(places, error_tables, strict=True):
+                errors += _sure(check, i, quarters, e, {k: here[k] for k in common})
     if not errors:
-        return Finding(math.inf, "no entry of D or g is one sine times something")
+        return Measurement(math.inf, "no entry of D or g is one sine times something")
     return max(errors)
 
 
-def _sure(check: Comparison, i: int, quarters: int, e: Expected, found: Errors) -> Iterable[float]:
+def _sure(check: Comparison, i: int, quarters: int, e: Expected, errors: Errors) -> Iterable[float]:
     """The errors that are the same, in parts of the entry, with other coordinates moved."""
-    if max(found.values(), default=0.0) <= LIMIT:
-        return found.values()
-    again = [dict(_beside(check, i, quarters, other)) for other in _moved(e)]
-    each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in found.items()}
+    if max(errors.values(), default=0.0) <= LIMIT:
+        return errors.values()
+    again = [dict(_entry_errors(check, i, quarters, other)) for other in _moved(e)]
+    each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in errors.items()}
     return [min(x) for x in each.values() if np.ptp(x) <= CLEAR * max(x)]
 
 
@@ -71,7 +71,7 @@ def _moved(e: Expected) -> Iterator[Expected]:
         yield replace(e, state=replace(s, q=s.q * (1 + by), t=s.t * (1 + by)))
 
 
-def _beside(
+def _entry_errors(
     check: Comparison, i: int, quarters: int, e: Expected
 ) -> Iterator[tuple[tuple[str, int], float]]:
     """The errors of entries with coordinate i at so many quarter turns."""
@@ -84,12 +84,14 @@ def _beside(
             known = [check.reference.evaluate(name, x.q, x.qd, x.t, None, x.params) for x in states]
             expected = np.reshape(known, (len(states), -1))
             parts = expected / sines[:, None]
-            found = np.reshape([check.ask(name, x) for x in states], expected.shape)
+            values = np.reshape([check.ask(name, x) for x in states], expected.shape)
             least = LIMIT * check.eps * np.ravel(e.size[name])
             for k, (part, entry, value) in enumerate(
-                zip(parts.T, expected.T, found.T, strict=True)
+                zip(parts.T, expected.T, values.T, strict=True)
             ):
-                if np.all(np.abs(part) > least[k]) and np.ptp(part) <= ALIKE * np.max(np.abs(part)):
+                if np.all(np.abs(part) > least[k]) and np.ptp(
+                    part
+                ) <= PROPORTION_TOLERANCE * np.max(np.abs(part)):
                     yield (name, k), _error(value - entry, entry, check.eps)
 
 

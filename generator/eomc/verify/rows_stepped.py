@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.measurement import Measurement, largest
+from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import State, simulate
 
@@ -24,45 +24,47 @@ CLEAR = 1e-6  # of what an event watches: more is on one side of zero
 SIDES = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
 
 
-def report(of: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Add the row of a scene with events."""
-    for module, form in of.forms:
-        for method in of.methods:
-            of.row(
+    for module, form in check.forms:
+        for method in check.methods:
+            check.row(
                 f"{form}events in steps of {method}", LIMIT, "units of rounding",
-                partial(_worst, of, module, method),
+                partial(_worst, check, module, method),
             )  # fmt: skip
 
 
-def _worst(of: Comparison, module: Any, method: str) -> float | Finding:
+def _worst(check: Comparison, module: Any, method: str) -> float | Measurement:
     model, passed = module._model, module._model._passes_over
     model._passes_over = False
     try:
-        errors = [_error(of, module, method, e.state) for e in of.few(4)]
+        errors = [_error(check, module, method, e.state) for e in check.few(4)]
     finally:
         model._passes_over = passed
     return largest(errors, "no step can be made")
 
 
-def _error(of: Comparison, module: Any, method: str, s: State) -> float | None:
+def _error(check: Comparison, module: Any, method: str, s: State) -> float | None:
     """Of a run from one state; inf where an event is missing."""
-    run = simulate(module, s, t0=s.t, h=of.system.run.h, steps=STEPS, method=method)
+    run = simulate(module, s, t0=s.t, h=check.system.run.h, steps=STEPS, method=method)
     if len(run) < 2:
         return None
-    if _missing(of, module, run, s):
+    if _missing(check, module, run, s):
         return math.inf
-    scale = of.sampler.scale.ravel()
+    scale = check.sampler.scale.ravel()
     worst = 0.0
     for k, t, end in _steps(run):
         h, size = t - run.t[k], np.abs(run.x[k]) + scale
         if (np.abs(end - run.x[k]) > FAR * size).any():  # it grows without bounds, rounding too
             continue
         try:
-            made = module.step(run.q[k], run.qd[k], h, run.t[k], s.u, s.params, method)
+            step_end = module.step(run.q[k], run.qd[k], h, run.t[k], s.u, s.params, method)
         except module.MotionError:
             return math.inf
-        moved = np.abs(np.concatenate(made) - run.x[k]) * (abs(t) + abs(h)) / h  # by rounding of t
-        off = np.abs(np.concatenate(made) - end) / (of.eps * (size + moved))
+        moved = (
+            np.abs(np.concatenate(step_end) - run.x[k]) * (abs(t) + abs(h)) / h
+        )  # by rounding of t
+        off = np.abs(np.concatenate(step_end) - end) / (check.eps * (size + moved))
         worst = max(worst, float(np.nan_to_num(off.max(), nan=math.inf)))
     return worst
 
@@ -72,25 +74,25 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 
     The state behind a jump at the start is in no row, nor that between jumps at one time.
     """
-    _, told = run._happened
-    first = int(len(told) > 0 and told[0, 0] <= run.t[0])
+    _, recorded = run._happened
+    first = int(len(recorded) > 0 and recorded[0, 0] <= run.t[0])
     for k in range(first, len(run) - 1):
         if run.t[k + 1] > run.t[k]:
             yield k, float(run.t[k + 1]), run.x[k + 1]
-    for t, *x in told[np.diff(told[:, 0], prepend=-np.inf) > 0]:
+    for t, *x in recorded[np.diff(recorded[:, 0], prepend=-np.inf) > 0]:
         if (k := int(np.searchsorted(run.t, t)) - 1) >= first:
             yield k, float(t), np.array(x)
 
 
-def _missing(of: Comparison, module: Any, run: Any, s: State) -> bool:
+def _missing(check: Comparison, module: Any, run: Any, s: State) -> bool:
     """Whether what an event watches comes from clearly one side to the other, which is not told."""
-    events = of.system.events
+    events = check.system.events
     values = module._model._evaluate("events", run.q, run.qd, run.t, s.u, s.params)
     for event, g in zip(events, values.T, strict=True):
         sides = np.where(np.abs(g) > CLEAR * np.abs(g).max(), np.sign(g), 0)
-        told = run.events[event.name].t
+        recorded = run.events[event.name].t
         for k in np.flatnonzero((sides[1:] * sides[:-1] < 0) & (np.diff(run.t) > 0)):
-            here = (told > run.t[k]) & (told <= run.t[k + 1])
+            here = (recorded > run.t[k]) & (recorded <= run.t[k + 1])
             if sides[k + 1] in SIDES[event.direction] and not here.any():
                 return True
     return False

@@ -20,41 +20,47 @@ from sympy import Symbol
 
 from eomc.model.loops import find_wrong_rotations
 from eomc.verify import kkt
-from eomc.verify.oracle import Answer, Vector
+from eomc.verify.reference import Reference, Vector
 
 EPS = 2.0**-52
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
-REGULAR = 1e-6  # singular values of the scaled KKT matrix: the least of a state
+MIN_SINGULAR_VALUE = 1e-6  # singular values of the scaled KKT matrix: the least of a state
 TINY = 1e-12  # the same, of a row without terms
-HOLDS = 1e-9  # of the terms of a row: what it may be at a state, redundant rows too
+CONSTRAINT_TOLERANCE = 1e-9  # of the terms of a row: what it may be at a state, redundant rows too
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
-FARTHEST = 100.0  # of the spread: steps that lead further are not compared
+MAX_DISTANCE = 100.0  # of the spread: steps that lead further are not compared
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
-HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
-FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
-STUCK = 1 / 2  # in so many states something does, of what may stick so much
-SLOWER = (2.0**-6, 2.0**-10)  # times as fast
+MAX_HALVINGS, CONVERGED_CHANGE = (
+    5,
+    0.1,
+)  # of steps ahead, until how far things go changes by so little
+FAR_FACTOR = 8.0  # times as far from the start, where a term that is small near it counts
+STICKING_SHARE = 1 / 2  # in so many states something does, of what may stick so much
+SLOW_FACTORS = (2.0**-6, 2.0**-10)  # times as fast
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 
 
 @dataclass(frozen=True)
-class Effort:
-    """How much is compared with the reference, as far as an answer of it costs time.
+class SampleBudget:
+    """How much is compared with the reference, depending on the cost of its evaluation.
 
-    states: at how many; ahead: steps taken to see how far things go, each `stride` times the
-    scene's h; few: how many states for one step; run: steps of a run.
+    states: number of states. prediction_steps: steps taken to estimate the range of the motion,
+    each of `stride` times the scene's h. few: number of states for single steps. run: steps of a
+    run.
     """
 
     states: int
-    ahead: int
+    prediction_steps: int
     stride: int
     few: int
     run: int
 
 
-SMALL = Effort(states=16, ahead=50, stride=1, few=4, run=100)
-LARGE = Effort(states=6, ahead=5, stride=10, few=4, run=4)  # a tenth of a second an answer
+SMALL = SampleBudget(states=16, prediction_steps=50, stride=1, few=4, run=100)
+LARGE = SampleBudget(
+    states=6, prediction_steps=5, stride=10, few=4, run=4
+)  # a tenth of a second an answer
 
 # the module's name for a value, and the reference's
 VALUES = {
@@ -85,14 +91,14 @@ class State:
     params: Mapping[str, float] | None = None
 
 
-def ask(module: Any, name: str, s: State) -> Vector:
+def evaluate_module(module: Any, name: str, s: State) -> Vector:
     """The module's value of that name."""
     place = (s.q,) if name in OF_POSITIONS else (s.q, s.qd)
     inputs = {"u": s.u} if name in OF_INPUTS else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
 
 
-def started(module: Any, s: State) -> State:
+def projected_start(module: Any, s: State) -> State:
     """The state as a run starts from it: on the module's constraints, nothing held."""
     if not getattr(module, "constraint_names", ()):
         return s
@@ -106,30 +112,30 @@ def simulate(module: Any, s: State, **how: Any) -> Any:
         return module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
 
 
-def along(run: Any, s: State) -> list[State]:
+def states_of_run(run: Any, s: State) -> list[State]:
     """The states that a run from `s` went through."""
     rows = zip(run.t, run.q, run.qd, strict=True)
     return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
 
 
-def nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
+def perturb_each_input(s: State, defaults: Mapping[str, float]) -> list[State]:
     """The state with one input after the other changed by a small part of itself."""
-    found = []
+    states = []
     for field in ("q", "qd", "u"):
         values = getattr(s, field)
         for i in np.flatnonzero(values) if values is not None else ():
             changed = values.copy()
             changed[i] *= 1 + NUDGE
-            found.append(replace(s, **{field: changed}))
+            states.append(replace(s, **{field: changed}))
     if s.t:
-        found.append(replace(s, t=s.t * (1 + NUDGE)))
+        states.append(replace(s, t=s.t * (1 + NUDGE)))
     params = s.params or defaults
     for name, value in params.items():
-        found.append(replace(s, params={**params, name: value * (1 + NUDGE)}))
-    return found
+        states.append(replace(s, params={**params, name: value * (1 + NUDGE)}))
+    return states
 
 
-def _shaken(s: State, defaults: Mapping[str, float], random: np.random.Generator) -> State:
+def _perturbed(s: State, defaults: Mapping[str, float], random: np.random.Generator) -> State:
     """The state with all inputs changed at random by small parts of themselves."""
 
     def shake(x: Any) -> Any:
@@ -164,7 +170,9 @@ class Expected:
 class Sampler:
     """Draws states around the start that are finite and have a regular D."""
 
-    def __init__(self, reference: Answer, random: np.random.Generator, effort: Effort) -> None:
+    def __init__(
+        self, reference: Reference, random: np.random.Generator, effort: SampleBudget
+    ) -> None:
         self.reference, self.random = reference, random
         self.system = system = reference.system
         self.defaults = {p.name: p.value for p in system.parameters}
@@ -177,98 +185,102 @@ class Sampler:
         slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
         self.discrete = [k for k, c in enumerate(system.coordinates) if c.name in system.discrete]
-        far, fast = self._ahead(effort)
+        far, fast = self._predicted_ranges(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
         self.scale = np.array([self.spread, self.speed])
 
-    def _ahead(self, effort: Effort) -> Vector:
+    def _predicted_ranges(self, effort: SampleBudget) -> Vector:
         """(2, nq): how far coordinates and velocities get, 0 where it is not finite.
 
         In steps so short that half of them make no difference: the scene's own may be too long for
         its motion, which then goes to 1e40. From the start, and turned from there, as what rests
         where it starts moves from elsewhere.
         """
-        start, h, steps = self.start, effort.stride * self.system.run.h, effort.ahead
+        start, h, steps = self.start, effort.stride * self.system.run.h, effort.prediction_steps
         q = np.array([start.q, start.q + self.angles])
         qd = np.array([start.qd, start.qd])
         if self.system.constraints:  # off these a step's correction throws it
             with np.errstate(all="ignore"):
                 q[1], qd[1] = self.reference.project(q[1], qd[1])
-        found = np.full((2, *q.shape), math.inf)
-        for part in (2**k for k in range(HALVINGS + 1)):
-            before = found
+        ranges = np.full((2, *q.shape), math.inf)
+        for part in (2**k for k in range(MAX_HALVINGS + 1)):
+            before = ranges
             with np.errstate(all="ignore"):
                 _, *x = self.reference.simulate(q, qd, h=h / part, steps=steps * part)
-                found = np.array([np.max(np.abs(y), axis=0) for y in x])
-                if np.all(np.abs(found - before) <= RESOLVED * found + NOISE):
+                ranges = np.array([np.max(np.abs(y), axis=0) for y in x])
+                if np.all(np.abs(ranges - before) <= CONVERGED_CHANGE * ranges + NOISE):
                     break
-        return np.asarray(np.max(np.nan_to_num(found, posinf=0), axis=1))
+        return np.asarray(np.max(np.nan_to_num(ranges, posinf=0), axis=1))
 
     def states(self, count: int) -> list[Expected]:
         """The start, some states with the parameters' defaults, then all at random."""
-        found: list[Expected] = []
+        states_: list[Expected] = []
         nearness = 1.0  # every rejection moves the next draw closer to the start
         for attempt in range(20 * count):
-            if len(found) == count:
+            if len(states_) == count:
                 break
-            usual = len(found) < count // 4
-            state = self.start if attempt == 0 else self.draw(nearness, usual, len(found) % 2 == 1)
-            expected = self.known(state)
+            with_defaults = len(states_) < count // 4
+            state = (
+                self.start
+                if attempt == 0
+                else self.draw(nearness, with_defaults, len(states_) % 2 == 1)
+            )
+            expected = self.regular_expected(state)
             if expected is None:
                 self.rejected += 1
                 nearness *= 0.7
             else:
-                found.append(expected)
+                states_.append(expected)
                 nearness = 1.0
-        return found
+        return states_
 
-    def elsewhere(self, slow: int) -> list[Expected]:
+    def unusual_states(self, slow: int) -> list[Expected]:
         """States that a run hardly comes to: a unit away, and `slow` that are almost at rest, where
         what smooths friction acts. Fewer, where some are none.
         """
-        usual = [self.draw(1.0, True, False) for _ in range(1 + slow)]
-        way = np.array([usual[0].q - self.start.q, usual[0].qd - self.start.qd])
+        drawn = [self.draw(1.0, True, False) for _ in range(1 + slow)]
+        way = np.array([drawn[0].q - self.start.q, drawn[0].qd - self.start.qd])
         q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / self.scale)
-        q[self.discrete] = usual[0].q[self.discrete]
-        states = [replace(usual[0], q=q, qd=qd)]
-        states += [replace(s, qd=p * s.qd) for s, p in zip(usual[1:], SLOWER, strict=False)]
-        return [e for state in states if (e := self.known(self.onto(state)))]
+        q[self.discrete] = drawn[0].q[self.discrete]
+        states = [replace(drawn[0], q=q, qd=qd)]
+        states += [replace(s, qd=p * s.qd) for s, p in zip(drawn[1:], SLOW_FACTORS, strict=False)]
+        return [e for state in states if (e := self.regular_expected(self.project(state)))]
 
-    def farther(self) -> list[Expected]:
+    def far_states(self) -> list[Expected]:
         """A state FARTHER times as far from the start as the others; none where it is no state."""
-        drawn = [self.draw(FARTHER, True, False) for _ in range(4)]
+        drawn = [self.draw(FAR_FACTOR, True, False) for _ in range(4)]
         state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
-        expected = self.known(state)
+        expected = self.regular_expected(state)
         return [] if expected is None else [expected]
 
-    def draw(self, nearness: float, usual: bool, given: bool) -> State:
-        """A random state; `usual`: default parameters; `given`: inputs from outside."""
+    def draw(self, nearness: float, with_defaults: bool, with_inputs: bool) -> State:
+        """Return a random state, with the parameters' defaults or with inputs from outside."""
         random, n, start = self.random, len(self.start.q), self.start
         centre = np.where(self.angles, nearness < 1, 1) * start.q
         q = centre + nearness * self.spread * random.uniform(-1, 1, n)
         qd = start.qd + nearness * self.speed * random.uniform(-1, 1, n)
         for k in self.discrete:
-            q[k], qd[k] = self._near(float(start.q[k]), random.uniform(-0.5, 0.5)), 0.0
-        self._in_modes(q, qd)
+            q[k], qd[k] = self._random_factor_of(float(start.q[k]), random.uniform(-0.5, 0.5)), 0.0
+        self._choose_modes(q, qd)
         t = random.uniform(0, self.system.run.duration)
         u = None
-        if given and self.system.inputs:
+        if with_inputs and self.system.inputs:
             signals = np.abs(self.reference.evaluate("signals", q, qd, t))
             u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
         # a loop may not close with lengths that are far from the scene's
         some = nearness if self.system.constraints else 1.0
         by = some * random.uniform(-0.5, 0.5, len(self.defaults))
         params = {
-            name: self._near(value, x)
+            name: self._random_factor_of(value, x)
             for (name, value), x in zip(self.defaults.items(), by.tolist(), strict=True)
         }
-        found = self.onto(State(q, qd, t, u, None if usual else params))
+        state = self.project(State(q, qd, t, u, None if with_defaults else params))
         for mode in self.system.modes:  # the rows may have turned what slides
-            found.q[mode.at] = np.sign(found.qd[mode.of]) * abs(q[mode.at])
-        return found
+            state.q[mode.at] = np.sign(state.qd[mode.of]) * abs(q[mode.at])
+        return state
 
-    def told(self, s: State) -> State:
+    def with_discrete_parameters(self, s: State) -> State:
         """The state with parameters that jumps set among the others, as the scene has them."""
         if not self.discrete:
             return s
@@ -276,38 +288,38 @@ class Sampler:
         return replace(s, params={**(s.params or self.defaults), **values})
 
     @staticmethod
-    def _near(value: float, by: float) -> float:
+    def _random_factor_of(value: float, by: float) -> float:
         """A parameter's, as far away as `by`; one that is 0, such as a friction, is tried too."""
         return value * math.exp(by) if value else math.exp(by) - 0.5
 
-    def _in_modes(self, q: Vector, qd: Vector) -> None:
+    def _choose_modes(self, q: Vector, qd: Vector) -> None:
         """Of friction that sticks, modes as velocities say; in some states some are made 0.
 
         Some freedom is left.
         """
         if self.system.modes and self.system.closure:
-            left = self.system.closure.freedoms - 1
-            some = self.random.uniform() < STUCK
+            freedoms_left = self.system.closure.freedoms - 1
+            some = self.random.uniform() < STICKING_SHARE
             for mode in self.system.modes:
-                sticks = some and left > 0 and self.random.uniform() < STUCK
-                left -= sticks
+                sticks = some and freedoms_left > 0 and self.random.uniform() < STICKING_SHARE
+                freedoms_left -= sticks
                 qd[mode.of] *= not sticks
                 q[mode.at], qd[mode.at] = np.sign(qd[mode.of]), 0.0
 
-    def onto(self, s: State) -> State:
+    def project(self, s: State) -> State:
         """The state put onto the constraints; nan where that leads nowhere, or some row is off."""
         if not self.system.constraints:
             return s
         with np.errstate(all="ignore"):
             q, qd = self.reference.project(s.q, s.qd, s.t, s.params)
-        found = replace(s, q=q, qd=qd)
+        projected = replace(s, q=q, qd=qd)
         rows = [
-            self.reach(partial(self.reference.evaluate, name), found)
+            self.value_and_size(partial(self.reference.evaluate, name), projected)
             for name in ("constraints", "constraint_rates")
         ]
-        holds = all(np.all(np.abs(off) <= HOLDS * size + TINY) for off, size in rows)
-        if holds and not self.wrong_rotations(found):
-            return found
+        holds = all(np.all(np.abs(off) <= CONSTRAINT_TOLERANCE * size + TINY) for off, size in rows)
+        if holds and not self.wrong_rotations(projected):
+            return projected
         return replace(s, q=np.full_like(q, np.nan), qd=np.full_like(q, np.nan))
 
     @cached_property
@@ -322,8 +334,8 @@ class Sampler:
 
     def rows(self, name: str, s: State) -> Vector:
         """Of the constraints that are solved for."""
-        found = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
-        return np.asarray(self.reference.solved @ found)
+        values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
+        return np.asarray(self.reference.solved @ values)
 
     def regular(self, s: State) -> bool:
         """D finite and far from singular, and positive definite where we chose the parameters.
@@ -335,7 +347,9 @@ class Sampler:
             A = self.rows("constraint_jacobian", s)
             off = self.reference.switched & ~np.any(A, axis=1)
             weighted = bool(self.system.closure and self.system.closure.weights)
-            return kkt.regular(D, A[~off], REGULAR) and kkt.inert(D, A[~off] if weighted else A[:0])
+            return kkt.is_regular(D, A[~off], MIN_SINGULAR_VALUE) and kkt.is_nonnegative(
+                D, A[~off] if weighted else A[:0]
+            )
         diagonal = np.abs(np.diag(D))
         if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
             return False
@@ -343,7 +357,7 @@ class Sampler:
         least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
         return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
 
-    def known(self, s: State) -> Expected | None:
+    def regular_expected(self, s: State) -> Expected | None:
         """As `expected`; None where D is not regular, too."""
         with np.errstate(all="ignore"):
             return self.expected(s) if self.regular(s) else None
@@ -353,12 +367,14 @@ class Sampler:
         value: dict[str, Vector] = {}
         reach: dict[str, Vector] = {}
         for name, field in VALUES.items():
-            value[name], reach[name] = self.reach(partial(self.reference.evaluate, field), s)
+            value[name], reach[name] = self.value_and_size(
+                partial(self.reference.evaluate, field), s
+            )
         D, qd = value["D"], np.abs(s.qd)
         if self.system.constraints:
-            given = (s.q, s.qd, s.t, s.u, s.params)
-            qdd = self.reference.acceleration(*given)
-            value["multipliers"] = self.reference.multipliers(*given)
+            state = (s.q, s.qd, s.t, s.u, s.params)
+            qdd = self.reference.acceleration(*state)
+            value["multipliers"] = self.reference.multipliers(*state)
         else:
             qdd = np.asarray(np.linalg.solve(D, value["tau"] - value["bias"]), float)
         value["acceleration"] = qdd
@@ -395,18 +411,18 @@ class Sampler:
     def _rows_of(self, s: State, value: dict[str, Vector], size: dict[str, Vector]) -> None:
         """Values of the constraints; sizes of these, multipliers, accelerations and corrections."""
         for name in ("constraint_jacobian", "constraints", "constraint_rates", "gamma"):
-            value[name], size[name] = self.reach(partial(self.reference.evaluate, name), s)
+            value[name], size[name] = self.value_and_size(partial(self.reference.evaluate, name), s)
         A, a, n = size["constraint_jacobian"], np.abs(value["acceleration"]), len(s.q)
         scale = kkt.scales(value["D"], value["constraint_jacobian"])
 
-        def whole(x: Vector) -> Vector:
+        def row_size(x: Vector) -> Vector:
             """Of each row what x makes, were its largest part along that row."""
             return np.asarray(A @ np.abs(x) + np.max(np.abs(x) / scale[:n]) / scale[n:])
 
         # an entry may be a sum that cancels, of terms that others of its row have whole
         size["constraint_jacobian"] = A + np.outer(1 / scale[n:], 1 / scale[:n])
-        size["constraints"] = size["constraints"] + whole(s.q)
-        size["constraint_rates"] = size["constraint_rates"] + whole(s.qd)
+        size["constraints"] = size["constraints"] + row_size(s.q)
+        size["constraint_rates"] = size["constraint_rates"] + row_size(s.qd)
         motion = size["motion"] + np.abs(value["multipliers"]) @ A
         size["motion"] = np.maximum(motion, np.max(motion * scale[:n]) / scale[:n])
         # of rows that move by themselves in time
@@ -414,13 +430,15 @@ class Sampler:
         value["power"] = value["power"] + pushed
         size["power"] = size["power"] + np.abs(value["multipliers"]) @ A @ np.abs(s.qd)
         solved, A_s = self.reference.solved, self.reference.solved @ value["constraint_jacobian"]
-        spread = kkt.inverse(value["D"], A_s)
-        rounded = [size["motion"], np.abs(solved) @ (size["gamma"] + whole(a))]
+        spread = kkt.absolute_inverse(value["D"], A_s)
+        rounded = [size["motion"], np.abs(solved) @ (size["gamma"] + row_size(a))]
         both = spread @ np.concatenate(rounded)
         size["acceleration"] = both[:n]
         if self.system.modes:  # what sticks is held by forces that cancel what else moves it
-            held = np.where(self.reference.switched[:, None], 0.0, A_s)
-            size["acceleration"] += kkt.inverse(value["D"], held)[:n, :n] @ size["motion"]
+            fixed_rows = np.where(self.reference.switched[:, None], 0.0, A_s)
+            size["acceleration"] += (
+                kkt.absolute_inverse(value["D"], fixed_rows)[:n, :n] @ size["motion"]
+            )
         size["multipliers"] = both[n:] @ np.abs(solved)
         # what rounding of the rows makes of a state that is put onto them
         size["place"] = np.array([
@@ -442,21 +460,21 @@ class Sampler:
     def energy(self, s: State) -> tuple[Vector, Vector]:
         """K + P and its size."""
         names = ("kinetic", "potential")
-        K, P = (self.reach(partial(self.reference.evaluate, name), s)[1] for name in names)
+        K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
         size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
         return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
-    def reach(self, of: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
-        """f and |f| + sum_i |x_i df/dx_i|; of: f of states as rows.
+    def value_and_size(self, function: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
+        """f and |f| + sum_i |x_i df/dx_i|; function: f of states as rows.
 
         Where there are many inputs the sum is the root of that of the squares, from DRAWS changes
         of all at once: no larger, and smaller by the root of their number at most.
         """
-        near = nudged(s, self.defaults)
+        near = perturb_each_input(s, self.defaults)
         many = len(near) > MOST_NUDGES
         if many:
-            near = [_shaken(s, self.defaults, self.random) for _ in range(DRAWS)]
-        found = np.asarray(of(**_stacked([s, *near], self.defaults)))
-        value, off = found[0], np.nan_to_num(np.abs(found[1:] - found[0]) / NUDGE)
+            near = [_perturbed(s, self.defaults, self.random) for _ in range(DRAWS)]
+        values = np.asarray(function(**_stacked([s, *near], self.defaults)))
+        value, off = values[0], np.nan_to_num(np.abs(values[1:] - values[0]) / NUDGE)
         spread = np.sqrt(np.mean(off**2, axis=0)) if many else np.sum(off, axis=0)
         return value, np.abs(value) + spread

@@ -22,16 +22,16 @@ from eomc.base.errors import EomcError
 from eomc.model.discrete import constant
 from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, t
-from eomc.verify.discrete import Discrete
-from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector, by_rows
-from eomc.verify.shorter import by_rates, shorter
-from eomc.verify.taylor import Jets
+from eomc.verify.discrete import DiscreteReference
+from eomc.verify.reference import MATRICES, SCALARS, Reference, Values, Vector, by_rows
+from eomc.verify.taylor import TaylorReference
+from eomc.verify.trig_simplify import simplify_by_rates, simplify_trig
 
-WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
+MAX_SIZE = 10_000  # some seconds of SymPy at five links
 
 
 @lru_cache(maxsize=16)
-def derive(system: System) -> Reference:
+def derive(system: System) -> SymbolicReference:
     """D qdd + C qd + g = tau from d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - U - P, plainly.
 
     U is the linear part of a generalized potential. T = K - U is split by its degree in qd,
@@ -78,8 +78,8 @@ def derive(system: System) -> Reference:
     tau = ImmutableMatrix([expand(e) for e in forces]) - friction
     for y, force in system.applied:
         tau += gradient(expand(y), q) * expand(force)
-    zero, A, rates, gamma = _rows(system, expand)
-    return Reference(
+    zero, A, rates, gamma = _constraint_expressions(system, expand)
+    return SymbolicReference(
         system=system,
         constraints=zero,
         constraint_jacobian=A,
@@ -101,7 +101,7 @@ def derive(system: System) -> Reference:
     )
 
 
-def _rows(
+def _constraint_expressions(
     system: System, expand: Callable[[Expr], Expr]
 ) -> tuple[ImmutableMatrix, ImmutableMatrix, ImmutableMatrix, ImmutableMatrix]:
     """Of the constraints: what is zero, A, its rates without qdd, and gamma."""
@@ -120,36 +120,36 @@ def _rows(
     return zero, ImmutableMatrix(A), ImmutableMatrix(rates), ImmutableMatrix(gamma)
 
 
-def written_out(system: System) -> System:
+def without_definitions(system: System) -> System:
     """The same system without definitions, its energies in short forms: quick to derive from."""
     expand = _expander(system)
     names = ("kinetic", "potential", "linear_potential", "dissipation")
-    energies = {name: by_rates(expand(getattr(system, name)), system.qd) for name in names}
+    energies = {name: simplify_by_rates(expand(getattr(system, name)), system.qd) for name in names}
     return replace(
         system, **energies, definitions=(), forces=tuple(map(expand, system.forces)),
-        applied=tuple((shorter(expand(y)), expand(force)) for y, force in system.applied),
+        applied=tuple((simplify_trig(expand(y)), expand(force)) for y, force in system.applied),
         outputs=(),
         constraints=tuple(replace(c, formula=expand(c.formula)) for c in system.constraints),
         reactions=(),
     )  # fmt: skip
 
 
-def of(system: System) -> Answer:
+def reference_for(system: System) -> Reference:
     """The independent answer: written out where that is small, else by Taylor arithmetic.
 
     Raises EomcError as `derive` and `Jets` do.
     """
     if system.discrete:
-        return Discrete(system, of(constant(system)))
-    return derive(system) if is_small(system) else Jets(system)
+        return DiscreteReference(system, reference_for(constant(system)))
+    return derive(system) if is_small(system) else TaylorReference(system)
 
 
 def is_small(system: System, most: float | None = None) -> bool:
     """Whether `derive` takes seconds at most; or what is to have at most so many operations."""
-    return _written_out(system) <= (WRITTEN_OUT if most is None else most)
+    return _expanded_size(system) <= (MAX_SIZE if most is None else most)
 
 
-def _written_out(system: System) -> float:
+def _expanded_size(system: System) -> float:
     """Roughly how many operations `derive` would have in hand: those of K, written out, nq^2 times.
 
     What a definition hangs on is counted as often as it is named; dot(e) is e once a coordinate.
@@ -159,8 +159,8 @@ def _written_out(system: System) -> float:
 
     def size(e: Expr) -> float:
         if e not in sizes:
-            held = [reach.get(s, frozenset()) for s in e.free_symbols]
-            reach[e] = reach.get(e, frozenset()).union(*held)
+            dependencies = [reach.get(s, frozenset()) for s in e.free_symbols]
+            reach[e] = reach.get(e, frozenset()).union(*dependencies)
             inside = sum(size(a) for a in e.args)
             sizes[e] = inside * max(1, len(reach[e])) if isinstance(e, dot) else inside + 1
         return sizes[e]
@@ -209,7 +209,7 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 
 @dataclass(frozen=True)
-class Reference(Answer):
+class SymbolicReference(Reference):
     """The equations of `system` as expressions over q, qd, t, u and the parameters.
 
     constraints, constraint_rates, gamma: (m, 1); constraint_jacobian: (m, nq); D, C: (nq, nq);
@@ -262,17 +262,17 @@ class Reference(Answer):
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
         if q.ndim == 1:
-            return self._one(name, q, qd, float(t), u, values)
+            return self._value_at_state(name, q, qd, float(t), u, values)
         states = self._states(q, qd, t, u, values)
-        return np.array([self._one(name, *state) for state in states])
+        return np.array([self._value_at_state(name, *state) for state in states])
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
         """D and tau - bias, of one evaluation."""
         n = q.shape[-1]
-        found = self._value("motion", q, qd, t, u, values)
-        D, bias, tau = found[..., : n * n], found[..., n * n : -n], found[..., -n:]
+        motion = self._value("motion", q, qd, t, u, values)
+        D, bias, tau = motion[..., : n * n], motion[..., n * n : -n], motion[..., -n:]
         return D.reshape(*q.shape, n), tau - bias
 
     def _states(
@@ -285,24 +285,24 @@ class Reference(Answer):
         params = zip(*each, strict=True) if each else [()] * rows
         return zip(q, qd, times, us, params, strict=True)
 
-    def _one(
+    def _value_at_state(
         self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: Values
     ) -> Any:
         """The value at one state."""
         if name == "signals" or not self.system.inputs:
             u = np.zeros(len(self.system.inputs))
         elif u is None:
-            u = self._one("signals", q, qd, t, None, values)
+            u = self._value_at_state("signals", q, qd, t, None, values)
         expr = getattr(self, name)
         shape = () if name in SCALARS else expr.shape if name in MATRICES else (expr.rows,)
         try:
-            found = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
+            values_ = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
         except (ArithmeticError, ValueError):
             return np.full(shape, math.nan)[()]
-        made = np.array(found)
-        if made.dtype.kind == "c":  # Python's power of a negative number
+        array = np.array(values_)
+        if array.dtype.kind == "c":  # Python's power of a negative number
             return np.full(shape, math.nan)[()]
-        return made.astype(float, copy=False).reshape(shape)[()]
+        return array.astype(float, copy=False).reshape(shape)[()]
 
     def _function(self, name: str) -> Callable[..., Any]:
         if name not in self._functions:

@@ -33,16 +33,16 @@ from sympy import Expr
 
 from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
-from eomc.verify.oracle import SCALARS, Answer, Values, Vector
+from eomc.verify.reference import SCALARS, Reference, Values, Vector
 from eomc.verify.taylor_rules import FEEDS, FUNCTIONS, PAIRS, RULES, Fields, Jet, Op, Point, step_at
 
 BLOCK = 2**16  # entries of (nq, nq) matrices, of so many states at once: what caches hold
 
-_OF_VELOCITIES = {"v", "vs", *PAIRS}
+_VELOCITY_FIELDS = {"v", "vs", *PAIRS}
 
 # what each answer takes of K, of T = K - a.qd with a.qd the linear potential, of P, R, of every
 # force Q and of every signal
-_WANTED: Mapping[str, Mapping[str, str]] = {
+_REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "D": {"T": "vv"},
     "C": {"T": "vvs N"},
     "g": {"T": "vs x", "P": "x"},
@@ -62,7 +62,7 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
 }
 
 
-class Jets(Answer):
+class TaylorReference(Reference):
     """The equations of `system`, worked out at each state; the fields of `symbolic.derive`.
 
     D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) + c(0))/2 with c = T_vvs + N: that is
@@ -76,16 +76,16 @@ class Jets(Answer):
 
     def __init__(self, system: System) -> None:
         self.system = system
-        self._list = made = _List(system)
-        degree = made.ops[made.roots["T"][0]].degree
+        self._list = operations = _List(system)
+        degree = operations.ops[operations.roots["T"][0]].degree
         if degree > 2:
             raise EomcError(
                 "the kinetic energy is not quadratic in the velocities, or can't be seen to be: "
                 "write it as a sum of products. Friction belongs in 'dissipation' or [forces]"
             )
         rates = (c for c in system.constraints if not c.holonomic)
-        for c, index in zip(rates, made.roots["psi"], strict=True):
-            if made.ops[index].degree > 1:
+        for c, index in zip(rates, operations.roots["psi"], strict=True):
+            if operations.ops[index].degree > 1:
                 raise EomcError(
                     f"{system.name}: the constraint {c.name} is not linear in the rates"
                 )
@@ -94,16 +94,16 @@ class Jets(Answer):
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        given = None if u is None else np.asarray(u, float)
+        inputs = None if u is None else np.asarray(u, float)
         if q.ndim == 1:
-            row = None if given is None else given[None]
+            row = None if inputs is None else inputs[None]
             return self._rows(name, q[None], qd[None], t, row, values)[0][()]
         step = max(1, BLOCK // q.shape[1] ** 2)
-        found = []
+        blocks = []
         for part in (slice(k, k + step) for k in range(0, len(q), step)):
-            time, us, *each = (z[part] if np.ndim(z) else z for z in (t, given, *values))
-            found.append(self._rows(name, q[part], qd[part], time, us, each))
-        return np.concatenate(found)
+            time, us, *each = (z[part] if np.ndim(z) else z for z in (t, inputs, *values))
+            blocks.append(self._rows(name, q[part], qd[part], time, us, each))
+        return np.concatenate(blocks)
 
     def _rows(
         self, name: str, q: Vector, qd: Vector, t: Any, u: Any, values: Sequence[Any]
@@ -120,9 +120,9 @@ class Jets(Answer):
             qd = np.zeros_like(qd)
         inputs, parameters = ([_column(z) for z in zs] for zs in (u.T, values))
         with np.errstate(all="ignore"):
-            found = self._outputs(name, Point(q, qd, _column(t), inputs, parameters))
-        found[~np.isfinite(found.reshape(len(found), -1)).all(axis=1)] = math.nan
-        return found
+            result = self._outputs(name, Point(q, qd, _column(t), inputs, parameters))
+        result[~np.isfinite(result.reshape(len(result), -1)).all(axis=1)] = math.nan
+        return result
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -140,14 +140,14 @@ class Jets(Answer):
             return np.broadcast_to(jets.get(index, {}).get(field, 0.0), (b, *shape))
 
         def each(root: str) -> Vector:
-            found = [np.broadcast_to(jets[index]["value"], (b, 1)) for index in roots[root]]
-            return np.concatenate([np.zeros((b, 0)), *found], axis=1)
+            result = [np.broadcast_to(jets[index]["value"], (b, 1)) for index in roots[root]]
+            return np.concatenate([np.zeros((b, 0)), *result], axis=1)
 
         def tau() -> Vector:
-            found = each("Q") - part("R", "v", nq)
+            result = each("Q") - part("R", "v", nq)
             for y, force in zip(roots["y"], roots["F"], strict=True):
-                found = found + jets[force]["value"] * jets[y]["x"][:, :nq]
-            return found
+                result = result + jets[force]["value"] * jets[y]["x"][:, :nq]
+            return result
 
         def bias() -> Vector:
             slope = part("P", "x", nq + 1) - part("T", "x", nq + 1)
@@ -155,35 +155,35 @@ class Jets(Answer):
 
         match name:
             case "D":
-                found = part("T", "vv", nq, nq)
+                result = part("T", "vv", nq, nq)
             case "C":
                 c = part("T", "vvs", nq, nq) + part("T", "N", nq, nq)
-                found = (c[: b // 2] + c[b // 2 :]) / 2
+                result = (c[: b // 2] + c[b // 2 :]) / 2
             case "bias" | "g":
-                found = bias()
+                result = bias()
             case "motion":
                 D, b = part("T", "vv", nq, nq), tau() - bias()
-                found = np.concatenate([D, b[..., None]], axis=2)
+                result = np.concatenate([D, b[..., None]], axis=2)
             case "tau":
-                found = tau()
+                result = tau()
             case "kinetic":
-                found = part("K", "value", 1)
+                result = part("K", "value", 1)
             case "potential":
-                found = part("P", "value", 1)
+                result = part("P", "value", 1)
             case "energy":
-                found = part("K", "value", 1) + part("P", "value", 1)
+                result = part("K", "value", 1) + part("P", "value", 1)
             case "jacobi":
                 twice = np.sum(part("T", "v", nq) * state.qd, axis=1, keepdims=True)
-                found = twice - part("T", "value", 1) + part("P", "value", 1)
+                result = twice - part("T", "value", 1) + part("P", "value", 1)
             case "power":
                 work = np.sum(tau() * state.qd, axis=1, keepdims=True)
                 explicit = part("T", "x", nq + 1) - part("P", "x", nq + 1)
-                found = work - explicit[:, nq:]
+                result = work - explicit[:, nq:]
             case "constraints" | "constraint_jacobian" | "constraint_rates" | "gamma":
-                found = self._rows_of(name, jets, state)
+                result = self._rows_of(name, jets, state)
             case _:
-                found = each("u")
-        return np.array(found[:, 0] if name in SCALARS else found)
+                result = each("u")
+        return np.array(result[:, 0] if name in SCALARS else result)
 
     def _rows_of(self, name: str, jets: Mapping[int, Jet], state: Point) -> Vector:
         """What is asked of the constraints: (b, m), or (b, m, nq) the Jacobian A."""
@@ -195,20 +195,20 @@ class Jets(Answer):
         phi, psi = self._list.roots["phi"], self._list.roots["psi"]
         match name:
             case "constraints":
-                found = [part(k, "value", 1) for k in (*phi, *psi)]
+                result = [part(k, "value", 1) for k in (*phi, *psi)]
             case "constraint_jacobian":
-                found = [part(k, "x", nq + 1)[:, None, :nq] for k in phi]
-                found += [part(k, "v", nq)[:, None] for k in psi]
+                result = [part(k, "x", nq + 1)[:, None, :nq] for k in phi]
+                result += [part(k, "v", nq)[:, None] for k in psi]
             case "constraint_rates":
-                found = [part(k, "s", 1) for k in phi] + [part(k, "value", 1) for k in psi]
+                result = [part(k, "s", 1) for k in phi] + [part(k, "value", 1) for k in psi]
             case _:
                 bends = (np.sum(part(k, "xs", nq + 1) * state.d, axis=1) for k in phi)
-                found = [bend[:, None] for bend in bends] + [part(k, "s", 1) for k in psi]
-        return np.concatenate(found, axis=1)
+                result = [bend[:, None] for bend in bends] + [part(k, "s", 1) for k in psi]
+        return np.concatenate(result, axis=1)
 
     def _run(self, name: str, state: Point) -> dict[int, Jet]:
         if name not in self._plans:
-            self._plans[name] = tuple(self._list.plan(_WANTED[name]))
+            self._plans[name] = tuple(self._list.plan(_REQUIRED_FIELDS[name]))
         jets: dict[int, Jet] = {}
         for index, op, want in self._plans[name]:
             jets[index] = RULES[op.kind](op, [jets.get(arg, {}) for arg in op.args], want, state)
@@ -244,7 +244,7 @@ class _List:
             self.known[qd] = self.add(Op("qd", data=i, degree=1))
         self.known[t] = self.add(Op("t", moves=1))
         for i, u in enumerate(s.u):
-            self.known[u] = self.add(Op("u", data=i, given=True))
+            self.known[u] = self.add(Op("u", data=i, has_inputs=True))
         for i, p in enumerate(s.parameters):
             self.known[p.symbol] = self.add(Op("parameter", data=i))
         for name, body in s.definitions:
@@ -273,10 +273,10 @@ class _List:
         """The operation that gives `e`."""
         e = sympy.sympify(e)
         if e not in self.known:
-            self.known[e] = self.made(e)
+            self.known[e] = self.build(e)
         return self.known[e]
 
-    def made(self, e: Expr) -> int:
+    def build(self, e: Expr) -> int:
         if e.is_number:
             return self.add(Op("number", data=np.float64(e)))
         if isinstance(e, dot):
@@ -295,10 +295,10 @@ class _List:
         if isinstance(e, sympy.atan2):
             return self.make("atan2", args, degree=degree)
         if isinstance(e, sympy.Min | sympy.Max):
-            found = args[0]
+            index = args[0]
             for other in args[1:]:
-                found = self.make("extreme", (found, other), e.func is sympy.Max, degree)
-            return found
+                index = self.make("extreme", (index, other), e.func is sympy.Max, degree)
+            return index
         if isinstance(e, sympy.Heaviside):
             return self.make("function", args[:1], step_at(float(e.args[1])), degree)
         if e.func in FUNCTIONS and len(args) == 1:
@@ -312,24 +312,24 @@ class _List:
             square = factor.is_Pow and factor.exp == 2
             factors += [self.node(factor.base)] * 2 if square else [self.node(factor)]
         factors.sort(key=lambda i: (self.ops[i].degree > 0, self.ops[i].moves, i))
-        found = factors[0]
+        index = factors[0]
         for other in factors[1:]:
-            degree = self.ops[found].degree + self.ops[other].degree
-            found = self.make("product", (found, other), degree=degree)
-        return found
+            degree = self.ops[index].degree + self.ops[other].degree
+            index = self.make("product", (index, other), degree=degree)
+        return index
 
     def rate(self, e: Expr) -> int:
         inside = self.node(e.args[0])
         op = self.ops[inside]
-        if op.degree or op.given or op.rate:
-            what = "velocities" if op.degree else "inputs" if op.given else "a dot(...)"
+        if op.degree or op.has_inputs or op.rate:
+            what = "velocities" if op.degree else "inputs" if op.has_inputs else "a dot(...)"
             raise EomcError(f"{e} hangs on {what}, whose rates are not known")
         return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
 
-    def plan(self, wanted: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
+    def plan(self, fields_by_root: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
         """The operations that the wanted derivatives need, in order, and what of each."""
         need: dict[int, set[str]] = {}
-        for root, fields in wanted.items():
+        for root, fields in fields_by_root.items():
             for index in self.roots[root]:
                 self._demand(need, index, fields.split())
         for index in range(len(self.ops) - 1, -1, -1):
@@ -347,7 +347,7 @@ class _List:
         """Note that `fields` are needed, as far as they aren't zero."""
         op, here = self.ops[index], need.setdefault(index, set())
         for name in fields:
-            if name in _OF_VELOCITIES:
+            if name in _VELOCITY_FIELDS:
                 if op.degree > 0:
                     here.add(name)
             elif name == "value" or op.moves or op.degree:

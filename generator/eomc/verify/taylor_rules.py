@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import sympy
 
-from eomc.verify.oracle import Vector
+from eomc.verify.reference import Vector
 
 Jet = dict[str, Any]  # value and derivatives, rows by states; what is zero is left out
 Fields = frozenset[str]
@@ -44,7 +44,7 @@ class Op:
     """One operation on those before it: what it is, of which, and a number, place or function.
 
     degree: in the velocities, inf where it is no polynomial in them; moves: 2 where it hangs on
-    q, 1 where on t alone; rate: hangs on a dot(...); given: hangs on an input.
+    q, 1 where on t alone; rate: hangs on a dot(...); has_inputs: hangs on an input.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Op:
     degree: float = 0
     moves: int = 0
     rate: bool = False
-    given: bool = False
+    has_inputs: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,11 @@ def _with_transpose(a: Any, sign: int = 1) -> Any:
     return None if a is None else a + a.swapaxes(1, 2) if sign > 0 else a - a.swapaxes(1, 2)
 
 
-def _kept(jet: Jet) -> Jet:
+def _without_none(jet: Jet) -> Jet:
     return {name: part for name, part in jet.items() if part is not None}
 
 
-def _leaf(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _leaf(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     match op.kind:
         case "number":
             return {"value": op.data}
@@ -121,9 +121,9 @@ def _leaf(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
     return {"value": at.qd[:, op.data, None], "v": at.unit(op.data, 0)}
 
 
-def _sum(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _sum(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     out: Jet = {}
-    for name in want:
+    for name in fields:
         total, mine = None, False
         for weight, a in zip(op.data, args, strict=True):
             if name in a:
@@ -139,18 +139,18 @@ def _sum(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
     return out
 
 
-def _product(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
-    return _times(args[0], args[1], want)
+def _product(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
+    return _times(args[0], args[1], fields)
 
 
-def _times(a: Jet, b: Jet, want: Fields) -> Jet:
+def _times(a: Jet, b: Jet, fields: Fields) -> Jet:
     """Leibniz's rule."""
     x, y, g, h = a["value"], b["value"], a.get, b.get
     if len(a) == 1:  # a number, or what hangs on parameters alone
         large = x[..., None] if isinstance(x, np.ndarray) else x
-        return {n: (large if n in PAIRS else x) * z for n, z in b.items() if n in want}
+        return {n: (large if n in PAIRS else x) * z for n, z in b.items() if n in fields}
     out: Jet = {}
-    for name in want:
+    for name in fields:
         if name == "value":
             out[name] = x * y
             continue
@@ -159,30 +159,32 @@ def _times(a: Jet, b: Jet, want: Fields) -> Jet:
             terms += [(g("s"), h(name[0])), (h("s"), g(name[0]))]
         elif name == "vvs":
             terms += [(g("s"), h("vv")), (h("s"), g("vv"))]
-        found = _weighted(*terms)
+        total = _weighted(*terms)
         if name == "vv":
-            found = _plus(found, _with_transpose(_outer(g("v"), h("v"))))
+            total = _plus(total, _with_transpose(_outer(g("v"), h("v"))))
         elif name == "vvs":
             mixed = _plus(_outer(g("v"), h("vs")), _outer(g("vs"), h("v")))
-            found = _plus(found, _with_transpose(mixed))
+            total = _plus(total, _with_transpose(mixed))
         elif name == "N":
-            mixed = _plus(_outer(g("v"), _of_q(h("x"))), _outer(h("v"), _of_q(g("x"))))
-            found = _plus(found, _with_transpose(mixed, -1))
-        out[name] = found
-    return _kept(out)
+            mixed = _plus(
+                _outer(g("v"), _without_time(h("x"))), _outer(h("v"), _without_time(g("x")))
+            )
+            total = _plus(total, _with_transpose(mixed, -1))
+        out[name] = total
+    return _without_none(out)
 
 
-def _of_q(x: Any) -> Any:
+def _without_time(x: Any) -> Any:
     """dt left out."""
     return None if x is None else x[:, :-1]
 
 
-def _chain(f: tuple[Any, Any, Any], a: Jet, want: Fields) -> Jet:
+def _chain(f: tuple[Any, Any, Any], a: Jet, fields: Fields) -> Jet:
     """A function's value and two derivatives, f, f' and f'', at a."""
     value, slope, bend = f
     g = a.get
     out: Jet = {}
-    for name in want:
+    for name in fields:
         if name == "value":
             out[name] = value
         elif name in ("s", "x", "v"):
@@ -192,24 +194,24 @@ def _chain(f: tuple[Any, Any, Any], a: Jet, want: Fields) -> Jet:
             out[name] = _weighted((slope, g(name)), (turn, g(name[0])))
         else:  # of K alone, which is a polynomial in the velocities
             raise AssertionError(name)
-    return _kept(out)
+    return _without_none(out)
 
 
-def _function(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
-    return _chain(op.data(args[0]["value"]), args[0], want)
+def _function(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
+    return _chain(op.data(args[0]["value"]), args[0], fields)
 
 
-def _power(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _power(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     """a^b; where b changes, exp(b log a)."""
     a, b = args
     x, y = np.asarray(a["value"]), b["value"]
     value = x**y
     if len(b) == 1:
         slope = _falling(y, x, y - 1)
-        return _chain((value, slope, _falling(y * (y - 1), x, y - 2)), a, want)
-    inside = frozenset(f for name in want for f in FEEDS["product"][name].split())
+        return _chain((value, slope, _falling(y * (y - 1), x, y - 2)), a, fields)
+    inside = frozenset(f for name in fields for f in FEEDS["product"][name].split())
     exponent = _times(b, _chain(FUNCTIONS[sympy.log](x), a, inside), inside)
-    return _chain((value, value, value), exponent, want)
+    return _chain((value, value, value), exponent, fields)
 
 
 def _falling(factor: Any, x: Any, y: Any) -> Any:
@@ -217,45 +219,50 @@ def _falling(factor: Any, x: Any, y: Any) -> Any:
     return np.where(np.asarray(factor) == 0, 0.0, factor * x**y)
 
 
-def _atan2(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _atan2(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     """The angle of (x, y), as atan in a frame turned so that y is 0 there."""
-    inside = frozenset(f for name in want for f in FEEDS["product"][name].split())
+    inside = frozenset(f for name in fields for f in FEEDS["product"][name].split())
     y, x = args
     r = np.hypot(x["value"], y["value"])
     c, s = x["value"] / r, y["value"] / r
     across, along = (
-        _kept({n: _weighted((i, y.get(n)), (j, x.get(n))) for n in inside - {"value"}})
+        _without_none({n: _weighted((i, y.get(n)), (j, x.get(n))) for n in inside - {"value"}})
         for i, j in ((c, -s), (s, c))
     )
     slope = _chain((1 / r, -1 / r**2, 2 / r**3), along | {"value": r}, inside)
     angle = _times(across | {"value": 0 * r}, slope, inside)  # atan' = 1 and atan'' = 0 at 0
-    return {n: z for n, z in angle.items() if n in want} | {
+    return {n: z for n, z in angle.items() if n in fields} | {
         "value": np.arctan2(y["value"], x["value"])
     }
 
 
-def _extreme(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _extreme(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     """The larger of two, or the smaller; half of each where they are equal."""
     a, b = args
     larger, x, y = op.data, np.asarray(a["value"]), b["value"]
     first = np.heaviside(x - y if larger else y - x, 0.5)
     corner = _corner(x - y)
     out: Jet = {"value": np.maximum(x, y) if larger else np.minimum(x, y)}
-    for name in want - {"value"}:
+    for name in fields - {"value"}:
         out[name] = _weighted((first, a.get(name)), (1 - first, b.get(name)))
         if name in ("xs", "vs") and out[name] is not None:
             out[name] = out[name] + corner
-    return _kept(out)
+    return _without_none(out)
 
 
-def _rate(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
+def _rate(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
     """d/dt, from the derivatives along d = (qd, 1)."""
     (e,) = args
     xs = e.get("xs")
-    out: Jet = {"value": e.get("s", 0.0), "x": xs, "v": _of_q(e.get("x")), "vs": _of_q(xs)}
-    if "s" in want and xs is not None:
+    out: Jet = {
+        "value": e.get("s", 0.0),
+        "x": xs,
+        "v": _without_time(e.get("x")),
+        "vs": _without_time(xs),
+    }
+    if "s" in fields and xs is not None:
         out["s"] = np.sum(xs * at.d, axis=1, keepdims=True)
-    return {name: part for name, part in out.items() if name in want and part is not None}
+    return {name: part for name, part in out.items() if name in fields and part is not None}
 
 
 RULES: Mapping[str, Callable[[Op, list[Jet], Fields, Point], Jet]] = {

@@ -6,7 +6,7 @@ import pytest
 import sympy
 from sympy import cos, sin, sqrt, symbols
 
-from eomc.verify.shorter import coefficients, shorter
+from eomc.verify.trig_simplify import coefficients, simplify_trig
 
 a, b, x, r, m, k = symbols("a b x r m k", real=True)
 v, w = symbols("v w", real=True)
@@ -25,7 +25,7 @@ v, w = symbols("v w", real=True)
     ],
 )
 def test_textbook_forms(given: sympy.Expr, short: sympy.Expr) -> None:
-    assert shorter(given, (v, w)) == short
+    assert simplify_trig(given, (v, w)) == short
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_forms_are_equal_and_no_longer() -> None:
     for _ in range(25):
         terms = [sympy.Mul(*pick.choices(parts, k=pick.randint(1, 6))) for _ in range(6)]
         e = sympy.Add(*(pick.randint(-3, 3) * y for y in terms))
-        made = shorter(e, (v, w))
+        made = simplify_trig(e, (v, w))
         assert abs((made - e).xreplace(at).evalf(40)) < 1e-30, e
         assert made.count_ops() <= e.count_ops()
 

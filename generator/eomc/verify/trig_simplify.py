@@ -16,21 +16,21 @@ from sympy import Expr, Symbol, cos, sin
 from sympy.polys.polyerrors import PolynomialError
 from sympy.polys.rings import PolyElement, sring
 
-CANDIDATES = 4  # forms, the shortest of some, whose common factors are taken out
-LONG = 400  # terms of a polynomial, beyond which it stays as it is
+MAX_CANDIDATES = 4  # forms, the shortest of some, whose common factors are taken out
+MAX_TERMS = 400  # terms of a polynomial, beyond which it stays as it is
 _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the generators
 
 
-def shorter(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
+def simplify_trig(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
     """An equal form of `e` of as few operations, coefficients of the rates by themselves.
 
     Exact. What is no polynomial in its parts stays as it is.
     """
     e = sympy.sympify(e)
-    return min((e, by_rates(e, rates)), key=lambda form: form.count_ops())
+    return min((e, simplify_by_rates(e, rates)), key=lambda form: form.count_ops())
 
 
-def by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
+def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
     """A sum of products of rates, each with the shortest coefficient that was found."""
     terms = coefficients(e, rates)
     if terms is None:
@@ -41,16 +41,16 @@ def by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
 def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
     """Pairs (product of rates, coefficient): `e` is their sum. None: no polynomial in the rates."""
     if not rates or not e.has(*rates):
-        made = _coefficient(e)
-        return [(sympy.S.One, made)] if made != 0 else []
+        coefficient = _coefficient(e)
+        return [(sympy.S.One, coefficient)] if coefficient != 0 else []
     try:
         polynomial = sympy.Poly(e, *rates)
     except PolynomialError:
         return None
-    found = [(m, _coefficient(c)) for m, c in polynomial.terms()]
+    terms_found = [(m, _coefficient(c)) for m, c in polynomial.terms()]
     return [
         (sympy.Mul(*(r**k for r, k in zip(rates, powers, strict=True))), c)
-        for powers, c in found
+        for powers, c in terms_found
         if c != 0
     ]
 
@@ -63,7 +63,7 @@ def _coefficient(e: Expr) -> Expr:
         ring, polynomial = sring(e)
     except (PolynomialError, sympy.CoercionFailed):
         return e
-    if len(polynomial) > LONG:
+    if len(polynomial) > MAX_TERMS:
         return e
     waves = [g for g in ring.symbols if isinstance(g, (sin, cos))]
     angles: _Angles = {g.args[0]: [sin(g.args[0]), cos(g.args[0])] for g in waves}
@@ -73,10 +73,10 @@ def _coefficient(e: Expr) -> Expr:
         forms += map(_grouped, reduced)
         fewest = min((polynomial, *reduced), key=len)
         sums = _sums(fewest, False)
-        forms += [sums, *_again(sums)]
+        forms += [sums, *_double_angles_as_squares(sums)]
         if len(angles) > 1:
             forms += [_sums(fewest, True)]
-    shortest = _ranked(forms)[:CANDIDATES]
+    shortest = _ranked(forms)[:MAX_CANDIDATES]
     return _ranked(shortest + [_factored(form) for form in shortest])[0]
 
 
@@ -142,25 +142,25 @@ def _reduced(polynomial: PolyElement, angles: _Angles) -> list[PolyElement]:
 def _grouped(polynomial: PolyElement) -> Expr:
     """Its terms gathered by their sines and cosines."""
     ring = polynomial.ring
-    found: dict[Expr, list[Expr]] = {}
+    groups: dict[Expr, list[Expr]] = {}
     for powers, c in polynomial.terms():
         parts = [g**n for g, n in zip(ring.symbols, powers, strict=True)]
         trig = sympy.Mul(*(x for x in parts if x.has(sin, cos)))
         rest = sympy.Mul(ring.domain.to_sympy(c), *(x for x in parts if not x.has(sin, cos)))
-        found.setdefault(trig, []).append(rest)
-    return sympy.Add(*(_factored(sympy.Add(*cs)) * x for x, cs in found.items()))
+        groups.setdefault(trig, []).append(rest)
+    return sympy.Add(*(_factored(sympy.Add(*cs)) * x for x, cs in groups.items()))
 
 
 def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElement) -> PolyElement:
     """1 - other^2 for this^2, both generators."""
     ring = polynomial.ring
     k = ring.gens.index(this)
-    made = ring.zero
+    result = ring.zero
     for powers, c in polynomial.terms():
         n = powers[k]
         rest = (*powers[:k], n % 2, *powers[k + 1 :])
-        made += ring.term_new(rest, c) * (1 - other**2) ** (n // 2)
-    return made
+        result += ring.term_new(rest, c) * (1 - other**2) ** (n // 2)
+    return result
 
 
 def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
@@ -191,16 +191,16 @@ def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
 
 def _waves(trig: list[Expr]) -> dict[Expr, Expr]:
     """A product of sines and cosines as a sum of single ones, by their sizes."""
-    found: dict[Expr, Expr] = {sympy.S.One: sympy.S.One}
+    waves: dict[Expr, Expr] = {sympy.S.One: sympy.S.One}
     for f in trig:
-        made: dict[Expr, Expr] = {}
-        for wave, size in found.items():
+        products: dict[Expr, Expr] = {}
+        for wave, size in waves.items():
             for new, part in _times(wave, f):
                 sign, new = (-1, -new) if new.is_Mul else (1, new)
-                made[new] = made.get(new, sympy.S.Zero) + sign * part * size
-        made.pop(sympy.S.Zero, None)
-        found = made
-    return found
+                products[new] = products.get(new, sympy.S.Zero) + sign * part * size
+        products.pop(sympy.S.Zero, None)
+        waves = products
+    return waves
 
 
 def _times(wave: Expr, f: Expr) -> list[tuple[Expr, Expr]]:
@@ -219,7 +219,7 @@ def _times(wave: Expr, f: Expr) -> list[tuple[Expr, Expr]]:
     return [(sin(more), half), (sin(less), -half)]  # sin(-x) becomes -sin(x)
 
 
-def _again(e: Expr) -> list[Expr]:
+def _double_angles_as_squares(e: Expr) -> list[Expr]:
     """Of a sum of waves: those of double angles as squares, by cos 2a = 1 - 2 sin^2 a."""
     doubled = {f: f.args[0] / 2 for f in e.atoms(sin, cos) if f.args[0].as_coeff_Mul()[0] == 2}
     if not doubled:

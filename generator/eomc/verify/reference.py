@@ -22,11 +22,11 @@ from eomc.scene.formulas import suggest
 from eomc.verify import kkt
 
 ROWS, RATES = ("D", "constraint_jacobian", "constraints"), "constraint_rates"
-CORRECTIONS = 12  # of a step, at most
-CORRECTED = 1e-8  # of a coordinate: a correction whose square is rounding
+MAX_CORRECTIONS = 12  # of a step, at most
+CORRECTION_TOLERANCE = 1e-8  # of a coordinate: a correction whose square is rounding
 # central differences of order 8 (Fornberg, 1988): at which multiples of a width, and their weights
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-LEAP = 0.02  # of a coordinate, in the differences of one
+DIFFERENCE_STEP = 0.02  # of a coordinate, in the differences of one
 
 Vector = NDArray[np.float64]
 Params = Mapping[str, Any] | None  # values in place of defaults
@@ -36,7 +36,7 @@ MATRICES = ("D", "C", "constraint_jacobian")
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", "power_terms")
 
 
-class Answer(ABC):
+class Reference(ABC):
     """D qdd + bias = tau of a system, and what belongs to it, at given states.
 
     Where q is (b, nq), there are b states: qd is (b, nq) and u (b, nu) too, t and every value in
@@ -105,8 +105,8 @@ class Answer(ABC):
     ) -> Vector:
         """Those of the m constraints, (m,); 0 of rows that are redundant."""
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        _, found = self._constrained(q, qd, t, u, self._values(params))
-        return np.asarray(found @ self.solved)
+        _, solved = self._constrained(q, qd, t, u, self._values(params))
+        return np.asarray(solved @ self.solved)
 
     def project(
         self,
@@ -122,8 +122,8 @@ class Answer(ABC):
         is found.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        onto = partial(self._onto, held=held)
-        return self._each(onto, q, qd, np.asarray(t, float), self._values(params))
+        project_one = partial(self._project_state, fixed=held)
+        return self._map_states(project_one, q, qd, np.asarray(t, float), self._values(params))
 
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
@@ -224,11 +224,11 @@ class Answer(ABC):
         try:
             return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
         except np.linalg.LinAlgError:  # of one of the states at least
-            found = np.full(force.shape, np.nan)
+            accelerations = np.full(force.shape, np.nan)
             for k in np.ndindex(force.shape[:-1]):
                 with suppress(np.linalg.LinAlgError):
-                    found[k] = np.linalg.solve(D[k], force[k])
-            return found
+                    accelerations[k] = np.linalg.solve(D[k], force[k])
+            return accelerations
 
     def _constrained(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -240,45 +240,49 @@ class Answer(ABC):
         )
         return kkt.solve(D, self.solved @ A, force, -gamma @ self.solved.T)
 
-    def _each(
-        self, of: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
+    def _map_states(
+        self, function: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
         values: Values,
     ) -> tuple[Vector, Vector]:  # fmt: skip
-        """What `of` makes of each state."""
+        """What `function` makes of each state."""
         if q.ndim == 1:
-            return of(q, qd, t, values)
+            return function(q, qd, t, values)
         times, *each = (by_rows(x, len(q)) for x in (t, *values))
         params = zip(*each, strict=True) if each else [()] * len(q)
-        ends = np.array([of(*state) for state in zip(q, qd, times, params, strict=True)])
+        ends = np.array([function(*state) for state in zip(q, qd, times, params, strict=True)])
         return ends[:, 0], ends[:, 1]
 
-    def _row(self, name: str, q: Vector, qd: Vector, t: Any, values: Values) -> Vector:
+    def _constraint_values(
+        self, name: str, q: Vector, qd: Vector, t: Any, values: Values
+    ) -> Vector:
         """D, or what is asked of the rows that are solved for."""
         u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
-        found = np.asarray(self._value(name, q, qd, t, u, values))
+        value = np.asarray(self._value(name, q, qd, t, u, values))
         if name == "D":
-            return found
+            return value
         matrix = name == "constraint_jacobian"
-        return np.asarray(self.solved @ found if matrix else found @ self.solved.T)
+        return np.asarray(self.solved @ value if matrix else value @ self.solved.T)
 
-    def _onto(
-        self, q: Vector, qd: Vector, t: Any, values: Values, held: tuple[int, ...] = ()
+    def _project_state(
+        self, q: Vector, qd: Vector, t: Any, values: Values, fixed: tuple[int, ...] = ()
     ) -> tuple[Vector, Vector]:
         """`project` of one state: rows of rates alone say nothing of where q may be."""
         positions = self._holonomic > 0
 
         def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
-            D, A, off = (self._row(name, x, qd, t, values) for name in ROWS)
-            return *kkt.kept(D, A[positions], held), off[positions]
+            D, A, off = (self._constraint_values(name, x, qd, t, values) for name in ROWS)
+            return *kkt.with_fixed_coordinates(D, A[positions], fixed), off[positions]
 
         if np.any(positions):
-            q, left = kkt.onto(q, rows)
-            if not left < 1e-10:
+            q, last_correction = kkt.project(q, rows)
+            if not last_correction < 1e-10:
                 return np.full_like(q, np.nan), np.full_like(q, np.nan)
-        D, A = (self._row(name, q, qd, t, values) for name in ROWS[:2])
-        D, A = kkt.kept(D, A, held)
+        D, A = (self._constraint_values(name, q, qd, t, values) for name in ROWS[:2])
+        D, A = kkt.with_fixed_coordinates(D, A, fixed)
         for _ in range(2):  # linear in qd: the second takes what the first has rounded
-            by, _ = kkt.solve(D, A, np.zeros(len(q)), -self._row(RATES, q, qd, t, values))
+            by, _ = kkt.solve(
+                D, A, np.zeros(len(q)), -self._constraint_values(RATES, q, qd, t, values)
+            )
             qd = qd + by
         return q, qd
 
@@ -292,31 +296,34 @@ class Answer(ABC):
             q, qd = self._corrected(q[None], qd[None], t, values)
             return q[0], qd[0]
         ends = np.full((2, *q.shape), np.nan)
-        left = np.arange(len(q))  # those that are not there yet
+        remaining = np.arange(len(q))  # those that are not there yet
         t, *each = (np.broadcast_to(x, len(q)) for x in (t, *values))
-        for _ in range(CORRECTIONS):
+        for _ in range(MAX_CORRECTIONS):
             dq, dqd = self._correction(q, qd, t, tuple(each))
             q, qd = q + dq, qd + dqd
             size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
-            small = np.all(np.abs(dq) <= CORRECTED * size, axis=-1)
-            ends[:, left[small]] = q[small], qd[small]
+            small = np.all(np.abs(dq) <= CORRECTION_TOLERANCE * size, axis=-1)
+            ends[:, remaining[small]] = q[small], qd[small]
             if np.all(small):
                 break
-            left, q, qd, t, *each = (x[~small] for x in (left, q, qd, t, *each))
+            remaining, q, qd, t, *each = (x[~small] for x in (remaining, q, qd, t, *each))
         return ends[0], ends[1]
 
     def _correction(self, q: Vector, qd: Vector, t: Vector, values: Values) -> Vector:
         """One of Newton's method, of q and of qd, (2, b, nq)."""
         rest = np.zeros_like(q)
-        D, A, off = (self._row(name, q, qd, t, values) for name in ROWS)
+        D, A, off = (self._constraint_values(name, q, qd, t, values) for name in ROWS)
         dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
         far = np.max(np.abs(dq), axis=-1, keepdims=True)
-        part = np.minimum(1 / 16, LEAP / np.maximum(far, LEAP))
+        part = np.minimum(1 / 16, DIFFERENCE_STEP / np.maximum(far, DIFFERENCE_STEP))
         slope = np.zeros_like(off)
         for k, weight in STENCIL:
-            ends = [self._row(RATES, q + x * dq, qd, t, values) for x in (-k * part, k * part)]
+            ends = [
+                self._constraint_values(RATES, q + x * dq, qd, t, values)
+                for x in (-k * part, k * part)
+            ]
             slope += weight / part * (ends[1] - ends[0])
-        moved = self._row(RATES, q, qd, t, values) + slope
+        moved = self._constraint_values(RATES, q, qd, t, values) + slope
         dqd, _ = kkt.solve(D, A, rest, -moved)
         return np.stack([dq, dqd])
 
