@@ -203,10 +203,14 @@ def test_inputs_that_are_not_held_have_constant_signals(tmp_path: Path) -> None:
     scene.write_text(INPUTS, encoding="utf-8")
     module: Any = SimpleNamespace(inputs=("f", "free", "w"), defaults={"m": 2.0}, start=(0, 0))
     module.signal = lambda q, qd, params: np.array([0.5 * params["m"], 0.0, 0.7])
-    assert run._held(scene, module, ["w=3"], {"m": 4.0}) == {"f": 2.0, "free": 0.0, "w": 3.0}
-    assert run._held(scene, module, [], {}) is None
+    assert run._fixed_inputs(scene, module, ["w=3"], {"m": 4.0}) == {
+        "f": 2.0,
+        "free": 0.0,
+        "w": 3.0,
+    }
+    assert run._fixed_inputs(scene, module, [], {}) is None
     with pytest.raises(EomcError, match=r"signal of w changes, .*: give w a value too"):
-        run._held(scene, module, ["f=1"], {})
+        run._fixed_inputs(scene, module, ["f=1"], {})
 
 
 @pytest.mark.parametrize(

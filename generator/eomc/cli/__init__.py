@@ -1,1 +1,1 @@
-"""The command eomc."""
+"""The command line interface, `eomc`."""

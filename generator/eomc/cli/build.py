@@ -57,39 +57,39 @@ def command(
         return
     if prefix is not None:
         raise EomcError("--prefix: goes with --c DIR")
-    _refuse_twins(scenes)
+    _refuse_duplicate_names(scenes)
     if wheel:
         _write_wheels(scenes, quiet, as_json)
         return
-    done = []
+    results = []
     for k, scene in enumerate(scenes):
-        with status_line(_building(scenes, k), quiet or as_json):
-            begun = time.perf_counter()
+        with status_line(_progress_text(scenes, k), quiet or as_json):
+            started_at = time.perf_counter()
             built = pipeline.build(scene, root, warn=warn)
-            spent = time.perf_counter() - begun
-        done.append(
+            seconds = time.perf_counter() - started_at
+        results.append(
             {"scene": str(scene), "name": built.name, "folder": str(built.folder),
-             "fresh": built.fresh, "seconds": round(spent, 3)}
+             "fresh": built.fresh, "seconds": round(seconds, 3)}
         )  # fmt: skip
         if not quiet and not as_json:
-            said = f"built in {spent:.1f} s" if built.fresh else "is up to date"
-            say(f"{shown(built.folder)}/: {said}")
+            outcome = f"built in {seconds:.1f} s" if built.fresh else "is up to date"
+            say(f"{shown(built.folder)}/: {outcome}")
     if as_json:
-        say(json.dumps(done, indent=1))
+        say(json.dumps(results, indent=1))
 
 
-def _building(scenes: Sequence[Path], k: int) -> str:
-    """What is going on at the k-th, where a person is watching: a robot takes a minute."""
+def _progress_text(scenes: Sequence[Path], k: int) -> str:
+    """Return the text of the status line for the k-th scene."""
     which = f", {k + 1} of {len(scenes)}" if len(scenes) > 1 else ""
     return f"building {scenes[k].stem}{which}"
 
 
-def _refuse_twins(scenes: Sequence[Path]) -> None:
-    """Raise EomcError where two scenes have one name."""
-    named: dict[str, Path] = {}
+def _refuse_duplicate_names(scenes: Sequence[Path]) -> None:
+    """Raise EomcError if two scenes have the same name."""
+    paths: dict[str, Path] = {}
     for scene in scenes:
         name = pipeline.name_and_digest(scene)[0]
-        if name and (other := named.setdefault(name, scene)) != scene:
+        if name and (other := paths.setdefault(name, scene)) != scene:
             raise EomcError(
                 f"{shown(other)} and {shown(scene)} are both named '{name}': one would replace "
                 "the other"
@@ -97,25 +97,25 @@ def _refuse_twins(scenes: Sequence[Path]) -> None:
 
 
 def _write_wheels(scenes: Sequence[Path], quiet: bool, as_json: bool) -> None:
-    """A wheel of each scene, in the current folder."""
-    done = []
+    """Write a wheel of each scene into the current folder."""
+    results = []
     for k, scene in enumerate(scenes):
-        with status_line(_building(scenes, k), quiet or as_json):
+        with status_line(_progress_text(scenes, k), quiet or as_json):
             wheel = pipeline.write_wheel(scene, Path(), warn=warn)
-        done.append({"scene": str(scene), "wheel": str(wheel)})
+        results.append({"scene": str(scene), "wheel": str(wheel)})
         if not quiet and not as_json:
             say(f"wrote {shown(wheel)}")
     if as_json:
-        say(json.dumps(done, indent=1))
+        say(json.dumps(results, indent=1))
 
 
 def _write_c(
     scenes: Sequence[Path], folder: Path, prefix: str | None, quiet: bool, as_json: bool
 ) -> None:
-    """The C of one scene, in a folder of its own."""
+    """Write the C of one scene into a folder."""
     if len(scenes) > 1:
         raise EomcError(f"--c: takes one scene, since {shown(folder)} holds the C of one")
-    with status_line(_building(scenes, 0), quiet or as_json):
+    with status_line(_progress_text(scenes, 0), quiet or as_json):
         files = pipeline.write_c(scenes[0], folder, prefix, warn=warn)
     if as_json:
         say(

@@ -30,7 +30,7 @@ def command(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json:
     \b
     eomc check scenes/*.toml
     """
-    from eomc.verify.check import check as checked
+    from eomc.verify.check import check as run_checks
 
     reports = []
     with progress_bar("checking", quiet or as_json) as progress:
@@ -38,7 +38,7 @@ def command(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json:
             system = pipeline.read(scene)
             module = pipeline.load(scene, root, warn=warn)
             plain = pipeline.load(scene, root, form="plain")
-            report = checked(system, module, plain=plain, seed=seed)
+            report = run_checks(system, module, plain=plain, seed=seed)
             progress(k + 1, len(scenes))
             reports.append(report)
             if not as_json and not (quiet and report.passed):

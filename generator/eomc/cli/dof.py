@@ -29,13 +29,13 @@ def command(scene: Path, as_json: bool) -> None:
     from eomc.model import mobility
     from eomc.scene import read as scenes
 
-    read = scenes.read(scene)
-    counted: dict[str, Any] = {"scene": read.name}
+    checked_scene = scenes.read(scene)
+    counted: dict[str, Any] = {"scene": checked_scene.name}
     lines = []
-    if not read.constrained or (read.assembly and read.assembly.bodies):
-        found = mobility.count(read)
-        counted, lines = found.as_dict(), [found.table()]
-    if read.constrained:
+    if not checked_scene.constrained or (checked_scene.assembly and checked_scene.assembly.bodies):
+        mobility_count = mobility.count(checked_scene)
+        counted, lines = mobility_count.as_dict(), [mobility_count.table()]
+    if checked_scene.constrained:
         from eomc import pipeline
         from eomc.program import singular
 

@@ -38,9 +38,9 @@ def fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> 
     """
     files.check_target(out, (".fmu",), "--out")
     with status_line("exporting", quiet):
-        made = pipeline.export_fmu(scene, out, int(fmi), binary=not sources, warn=warn)
-    if made.why:
-        say(f"sources only: {made.why}", err=True)
+        exported = pipeline.export_fmu(scene, out, int(fmi), binary=not sources, warn=warn)
+    if exported.why:
+        say(f"sources only: {exported.why}", err=True)
     if not quiet:
-        inside = f"sources and a binary for {made.binary}" if made.binary else "sources"
-        say(f"{shown(made.file)}: FMI {fmi}.0, {inside}")
+        inside = f"sources and a binary for {exported.binary}" if exported.binary else "sources"
+        say(f"{shown(exported.file)}: FMI {fmi}.0, {inside}")

@@ -1,4 +1,4 @@
-"""Files that commands write."""
+"""Write the files of commands."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from eomc.runtime.written import check_replaceable, replacing
 
 
 def scene_path(name: str) -> Path:
-    """Where a new scene goes: into scenes/ where there is one."""
+    """Return the path of a new scene, in scenes/ if that folder exists."""
     return (Path("scenes") if Path("scenes").is_dir() else Path()) / f"{name}.toml"
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that must not be there yet."""
-    made = False
+    """Write a file that must not exist yet."""
+    incomplete = False
     try:
         with path.open("x", encoding="utf-8") as file:
-            made = True
+            incomplete = True
             file.write(text)
-        made = False
+        incomplete = False
     except FileExistsError:
         raise EomcError(f"{shown(path)}: is there already, and stays as it is") from None
     except OSError as fault:
         raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
     finally:
-        if made:  # and not whole
+        if incomplete:  # and not whole
             path.unlink(missing_ok=True)
 
 
 def check_target(path: Path | None, endings: Sequence[str], option: str) -> None:
-    """Raise EomcError where an option names a file of another kind than the command writes."""
+    """Raise EomcError if an option names a file with a wrong suffix or one not replaceable."""
     if path is None:
         return
     if path.suffix not in endings:
@@ -43,6 +43,6 @@ def check_target(path: Path | None, endings: Sequence[str], option: str) -> None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file, whole, over what is there."""
+    """Write a file, replacing an existing one once the new one is complete."""
     with writing(shown(path)), replacing(path) as new:
         new.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ import click
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.cli import files
-from eomc.cli.pairs import pairs
+from eomc.cli.pairs import parse_pairs
 from eomc.cli.terminal import say, shown
 
 
@@ -71,7 +71,7 @@ def command(
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")
         robot = replace(robot, name=name)
-    values = dict(pairs(locks, "--lock", {}))
+    values = dict(parse_pairs(locks, "--lock", {}))
     try:
         robot = edit.lock(robot, values)
         robot = edit.cut(robot, root, tip)

@@ -31,7 +31,7 @@ def command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     eomc list
     """
     default = Path("scenes") if Path("scenes").is_dir() else Path()
-    here = [row for folder in folders or [default] for row in _found(folder, root)]
+    here = [row for folder in folders or [default] for row in _scenes_in(folder, root)]
     shipped: list[Row] = []
     if not folders and resources.folder("scenes").resolve() != default.resolve():
         shipped = [row for file in resources.scenes().values() if (row := _row(file, root))]
@@ -48,8 +48,8 @@ def command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
         _print([row | {"scene": row["name"], "built": False} for row in shipped])
 
 
-def _found(folder: Path, root: Path) -> Iterator[Row]:
-    """The scenes of a folder."""
+def _scenes_in(folder: Path, root: Path) -> Iterator[Row]:
+    """Yield the rows of the scenes in a folder."""
     if not folder.is_dir():
         raise EomcError(f"{shown(folder)}: is not a folder")
     for path in sorted(folder.glob("*.toml")):
@@ -58,7 +58,7 @@ def _found(folder: Path, root: Path) -> Iterator[Row]:
 
 
 def _row(path: Path, root: Path) -> Row | None:
-    """What there is to say of a scene; None of another file."""
+    """Return the row of a scene; None if the file is not a scene."""
     from eomc.scene.toml_text import tree_and_digest
     from eomc.toolchain import cache
 
@@ -81,25 +81,25 @@ def _row(path: Path, root: Path) -> Row | None:
 
 
 def _print(rows: Sequence[Row]) -> None:
-    """A line each, in columns."""
+    """Print one line per scene, in columns."""
     rows = [
         row
         | {key: shown(row[key]) for key in ("scene", "title")}
         | {key: list(map(shown, row[key])) for key in ("coordinates", "inputs")}
         for row in rows
     ]
-    wide = max((len(row["scene"]) for row in rows), default=0)
+    width = max((len(row["scene"]) for row in rows), default=0)
     titles = max((len(row["title"]) for row in rows), default=0)
     for row in rows:
         moved = f"({', '.join(row['inputs'])})" if row["inputs"] else ""
         mark = "built" if row["built"] else "     "
         say(
-            f"{row['scene']:{wide}}  {row['title']:{titles}}  "
+            f"{row['scene']:{width}}  {row['title']:{titles}}  "
             f"{mark}  {', '.join(row['coordinates'])} {moved}".rstrip()
         )
 
 
 def _keys(text: Mapping[str, Any], table: str) -> list[str]:
-    """The names in a table of a scene that nobody has checked."""
-    found = text.get(table)
-    return list(found) if isinstance(found, dict) else []
+    """Return the names in a table of an unchecked scene."""
+    entries = text.get(table)
+    return list(entries) if isinstance(entries, dict) else []

@@ -1,8 +1,8 @@
 """The command: eomc new, import, build, check, run, report, show, export, dof, list.
 
-Exit status: 0, 1 where a check failed or a run could not go on, 2 for bad input. A command is
-imported when it is called, and what takes time to import (SymPy, pydantic, rich) where it is
-needed: `eomc build` with nothing to do is over in a tenth of a second.
+Exit status: 0 for success, 1 if a check failed or a run could not continue, 2 for bad input. A
+command's module is imported when the command is called, and slow imports (SymPy, pydantic, rich)
+are made where they are needed: `eomc build` with nothing to do takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ COMMANDS = "build check dof export import list new report run show".split()
 
 
 class _Group(terminal.Group):
-    """Errors that are the user's to mend are printed as they are, with status 2."""
+    """Prints errors that the user can correct without a traceback, with exit status 2."""
 
     def list_commands(self, context: click.Context) -> list[str]:
-        """All of them, as the help lists them."""
+        """Return all commands in the order of the help text."""
         return COMMANDS
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        """A command, its module imported now."""
+        """Import and return a command."""
         if name not in COMMANDS:
             return None
         module = "import_robot" if name == "import" else name  # which Python can't import
@@ -38,7 +38,7 @@ class _Group(terminal.Group):
         return command
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
-        """As click has it; of a command that there is not, what may be meant."""
+        """Resolve a command as click does; suggest a similar one if it does not exist."""
         if args[0] not in COMMANDS:
             from eomc.scene.formulas import suggest
 
@@ -51,12 +51,12 @@ class _Group(terminal.Group):
             return super().invoke(context)
         except SceneError as fault:
             count = sum(p.severity == "error" for p in fault.problems)
-            say(noted(fault), err=True)
+            say(error_text(fault), err=True)
             fail(f"eomc: {count} error{'s' if count != 1 else ''}, nothing was built or changed")
         except FolderError as fault:
             fail(f"eomc: {fault.what}: choose another place with --build DIR")
         except EomcError as fault:
-            fail(f"eomc: {noted(fault)}")
+            fail(f"eomc: {error_text(fault)}")
         except MemoryError as fault:
             fail(f"eomc: {fault}" if str(fault) else "eomc: not enough memory")
         except KeyboardInterrupt:
@@ -64,8 +64,8 @@ class _Group(terminal.Group):
             sys.exit(130)
 
 
-def noted(fault: EomcError) -> str:
-    """Return the text of an error with the notes that were added to it."""
+def error_text(fault: EomcError) -> str:
+    """Return the message of an error with the notes added to it."""
     return "\n".join([str(fault), *getattr(fault, "__notes__", ())])
 
 

@@ -11,7 +11,7 @@ from eomc.base.errors import EomcError
 from eomc.cli import files
 from eomc.cli.terminal import say, shown
 
-DEFAULT = "pendulum"  # what the template is
+DEFAULT = "pendulum"  # name of the template's scene
 
 
 @click.command("new")
@@ -34,32 +34,32 @@ def command(name: str | None, source: str | None) -> None:
 
     if name is None:
         name = source or DEFAULT
-    copied = None if source is None else _copied(source, name)
+    copied = None if source is None else _copy_shipped(source, name)
     if why := names.module_fault(name):
         raise EomcError(why)
     path = files.scene_path(name)
-    files.write_new(path, _made(name) if copied is None else copied)
+    files.write_new(path, _driven_pendulum(name) if copied is None else copied)
     say(f"wrote {shown(path)}; try: eomc run {texts.command(str(path))}")
 
 
-def _made(name: str) -> str:
-    """The driven pendulum under this name."""
+def _driven_pendulum(name: str) -> str:
+    """Return the driven pendulum under this name."""
     from eomc.emit.render import environment
 
     title = name.replace("_", " ").capitalize()
     return environment().get_template("scene/scene.toml.jinja").render(name=name, title=title)
 
 
-def _copied(source: str, name: str) -> str:
-    """A scene that comes with eomc, under this name. Raises EomcError where there is none."""
+def _copy_shipped(source: str, name: str) -> str:
+    """Return a scene that comes with eomc under this name. Raises EomcError if unknown."""
     known = resources.scenes()
     if source not in known:
         from eomc.scene.formulas import nearest
 
         near = nearest(source, known)
-        meant = f"did you mean '{near}'? " if near else ""
+        hint = f"did you mean '{near}'? " if near else ""
         raise EomcError(
-            f"--from {shown(source)}: is no scene that comes with eomc; {meant}they are "
+            f"--from {shown(source)}: is no scene that comes with eomc; {hint}they are "
             + ", ".join(known)
         )
     text = known[source].read_text(encoding="utf-8")

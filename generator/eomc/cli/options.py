@@ -1,4 +1,4 @@
-"""What several commands take: scenes, the folder of builds, quiet, JSON."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 

@@ -7,23 +7,26 @@ from collections.abc import Iterator, Mapping, Sequence
 from eomc.base.errors import EomcError
 
 
-def pairs(
-    given: Sequence[str], option: str, known: Mapping[str, float]
+def parse_pairs(
+    arguments: Sequence[str], option: str, known: Mapping[str, float]
 ) -> Iterator[tuple[str, float]]:
-    """(name, value) of each; formulas may use the names in `known`. Raises EomcError."""
+    """Yield (name, value) of each NAME=VALUE; formulas may use the names in `known`.
+
+    Raises EomcError.
+    """
     import math
 
     from eomc.scene import formulas
 
-    seen: set[str] = set()
-    for pair in given:
+    names: set[str] = set()
+    for pair in arguments:
         name, equals, text = pair.partition("=")
         name = name.strip()
         if not equals:
             raise EomcError(f"{option} {pair}: write {option} NAME=VALUE")
-        if name in seen:
+        if name in names:
             raise EomcError(f"{option} {pair}: '{name}' has a value already: give it once")
-        seen.add(name)
+        names.add(name)
         try:
             value = float(
                 formulas.evaluate(formulas.parse(text), formulas.NUMERIC, known.__getitem__)

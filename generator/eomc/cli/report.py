@@ -47,20 +47,20 @@ def command(
             )
             raise SceneError([system.problem("run.friction", why)])
         with progress_bar(f"measuring {scene.stem}", quiet, after=0.0) as progress:
-            made = cost_of_digits.measure(system, root, progress=progress)
-        measured.append(pages.as_dict(made))
+            measurement = cost_of_digits.measure(system, root, progress=progress)
+        measured.append(pages.as_dict(measurement))
         if digits is not None:
-            say(f"{made.scene}: {pages.recommendation(made, digits)}")
+            say(f"{measurement.scene}: {pages.recommendation(measurement, digits)}")
             continue
         if not quiet:
-            say(pages.table(made))
-        page = root / made.scene / "report.html"
+            say(pages.table(measurement))
+        page = root / measurement.scene / "report.html"
         with status_line(f"writing {shown(page)}", quiet):
-            text = pages.page(made, overview.describe_scene(system, made, root))
+            text = pages.page(measurement, overview.describe_scene(system, measurement, root))
         files.write_text(page, text)
         if not quiet:
             say(f"\nwrote {shown(page)}\n")
-            if lacking := without_pictures():
-                say(f"{lacking}\n")
+            if missing_pictures := without_pictures():
+                say(f"{missing_pictures}\n")
     if file is not None:
         files.write_text(file, json.dumps(measured, indent=1) + "\n")

@@ -19,7 +19,7 @@ from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.cli import files, options
-from eomc.cli.pairs import pairs
+from eomc.cli.pairs import parse_pairs
 from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from eomc.runtime.trajectory import Run
 
 
-# what newcomers write, and what they mean
-_MEANT = {
+# hints for options of other programs
+_OPTION_HINTS = {
     "--rate": "a velocity begins by --start NAME_dot=VALUE",
     "--param": "a parameter is --set NAME=VALUE",
     "--params": "a parameter is --set NAME=VALUE",
@@ -37,20 +37,20 @@ _MEANT = {
 }
 
 
-class _Run(click.Command):
-    """The command, with a hint at options of other names."""
+class _RunCommand(click.Command):
+    """The command, with hints for options of other names."""
 
     def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
         try:
             return super().parse_args(context, args)
         except click.NoSuchOption as fault:
-            if not (meant := _MEANT.get(fault.option_name)):
+            if not (hint := _OPTION_HINTS.get(fault.option_name)):
                 raise
-            words = f"No such option '{fault.option_name}': {meant}"
+            words = f"No such option '{fault.option_name}': {hint}"
             raise click.UsageError(words, context) from None
 
 
-@click.command("run", cls=_Run)
+@click.command("run", cls=_RunCommand)
 @options.SCENE
 @options.BUILD
 @click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
@@ -104,41 +104,44 @@ def command(
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = _with_events(pipeline.load(scene, root, warn=warn), event)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
-    u = _held(scene, module, inputs, values)
+    u = _fixed_inputs(scene, module, inputs, values)
     options: dict[str, Any] = {
         "h": h, "duration": duration, "u": u, "params": values, "method": method, "tol": tol,
     }  # fmt: skip
     own, unstable, ends = module._model, None, None
     try:
-        fits = own.tolerance and h is None and method is None
-        if tol is None and method != "auto" and not fits:
+        adaptive = own.tolerance and h is None and method is None
+        if tol is None and method != "auto" and not adaptive:
             unstable = module.advice(q0, qd0, h, u, values, method)
             span = own.duration if duration is None else duration
             ends = beyond_end(own.h if h is None else h, span)
         with progress_bar("running", quiet or as_json) as progress:
-            begun = time.perf_counter()
-            with _reported_below():
-                done = module.simulate(q0, qd0, every=every, progress=progress, **options)
-            seconds = time.perf_counter() - begun
+            started_at = time.perf_counter()
+            with _without_warnings():
+                run = module.simulate(q0, qd0, every=every, progress=progress, **options)
+            seconds = time.perf_counter() - started_at
     except module.Interrupted as stop:  # what was done is kept
-        done, seconds = stop.run, time.perf_counter() - begun
+        run, seconds = stop.run, time.perf_counter() - started_at
     except (ValueError, MemoryError, module.MotionError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None
-    stopped = done.status == "interrupted"
-    if done.status == "ok" and seconds < 2:
+    stopped = run.status == "interrupted"
+    if run.status == "ok" and seconds < 2:
         try:
-            with progress_bar("finding its error", quiet or as_json) as progress, _reported_below():
-                done.estimate(progress)
+            with (
+                progress_bar("finding its error", quiet or as_json) as progress,
+                _without_warnings(),
+            ):
+                run.estimate(progress)
         except module.Interrupted:  # the run itself is whole
             stopped = True
     if out:
-        _write(out, done)
-    told = own.has_power or len(done.events) > 0  # forces, or jumps
-    balance = done.balance() if told and seconds < 2 else None
+        _write(out, run)
+    has_work = own.has_power or len(run.events) > 0  # forces, or jumps
+    balance = run.balance() if has_work and seconds < 2 else None
     if plot:
         from eomc.report import plot as plots
 
-        drawn = done._drawn
+        drawn = run._drawn
         jacobi = drawn.jacobi if own.has_jacobi else None
         system, rows = pipeline.read(scene).at(values), (drawn.t, drawn.q, drawn.qd, drawn.energy)
         words = balance.words if balance else ""
@@ -149,24 +152,24 @@ def command(
         )  # fmt: skip
     if animate:
         with status_line(f"drawing {animate.name}", quiet or as_json):
-            done.animate(animate)
+            run.animate(animate)
     written = {"plot": plot, "animate": animate, "out": out}
-    summary = _summary(module, done, balance, seconds, unstable, ends, **written)
+    summary = _summary(module, run, balance, seconds, unstable, ends, **written)
     if as_json:
         say(json.dumps(summary, indent=1))
     elif not quiet:
-        _print_summary(module, done, balance, summary)
-    whole = done.status in ("ok", "accumulated") and not done._broken
-    if done.status != "ok":
-        say(f"eomc: {done.message}", err=True)
-    if stopped or not whole:
+        _print_summary(module, run, balance, summary)
+    complete = run.status in ("ok", "accumulated") and not run._broken
+    if run.status != "ok":
+        say(f"eomc: {run.message}", err=True)
+    if stopped or not complete:
         sys.exit(130 if stopped else 1)
 
 
-def _with_events(module: ModuleType, given: Sequence[str]) -> ModuleType:
-    """The module of the same scene with the events NAME=FORMULA besides."""
+def _with_events(module: ModuleType, arguments: Sequence[str]) -> ModuleType:
+    """Return the module of the scene with additional events NAME=FORMULA."""
     events: dict[str, str] = {}
-    for pair in given:
+    for pair in arguments:
         name, equals, formula = pair.partition("=")
         if not equals:
             raise EomcError(f"--event {pair}: write --event NAME=FORMULA, as in low=theta2")
@@ -179,26 +182,26 @@ def _with_events(module: ModuleType, given: Sequence[str]) -> ModuleType:
         raise EomcError(str(fault).replace("simulate(events=)", "--event")) from None
 
 
-def _reported_below() -> AbstractContextManager[Any]:
-    """No warnings: what they say is part of the summary."""
+def _without_warnings() -> AbstractContextManager[Any]:
+    """Suppress warnings, which are part of the summary."""
     return warnings.catch_warnings(action="ignore", category=RuntimeWarning)
 
 
 def _overrides(
     scene: Path, module: Any, parameters: Sequence[str], start: Sequence[str]
 ) -> tuple[dict[str, float], Any, Any]:
-    """Parameters and start from NAME=VALUE pairs; a value may be a formula such as pi/3."""
+    """Return the parameters and the initial state, given NAME=VALUE pairs."""
     from eomc.scene.formulas import suggest
 
     values: dict[str, float] = {}
-    for name, value in pairs(parameters, "--set", module.defaults):
+    for name, value in parse_pairs(parameters, "--set", module.defaults):
         if name not in module.defaults:
-            remedy = suggest(name, module.defaults) or _there_are(module.defaults)
+            remedy = suggest(name, module.defaults) or _available(module.defaults)
             if name in module.inputs:
                 remedy = f", but an input: --input {name}={value:g}"
-            for kind, of in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
-                if of in module.coordinates:
-                    kind = "state that jumps set" if of in module._model.still else kind
+            for kind, coordinate in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
+                if coordinate in module.coordinates:
+                    kind = "state that jumps set" if coordinate in module._model.still else kind
                     remedy = f", but a {kind}: --start {name}={value:g}"
                     break
             raise EomcError(f"--set: '{name}' is not a parameter{remedy}")
@@ -207,37 +210,39 @@ def _overrides(
     if values:  # the start may be a formula in the parameters
         from eomc.scene import read as scenes
 
-        for whole, own in zip((q0, qd0), scenes.read(scene, values).start(), strict=True):
-            whole[: len(own)] = own  # and may be bad for a body; behind them is what jumps set
+        for values_of_state, own in zip((q0, qd0), scenes.read(scene, values).start(), strict=True):
+            values_of_state[: len(own)] = (
+                own  # and may be bad for a body; behind them is what jumps set
+            )
     states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
     states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
-    for name, value in pairs(start, "--start", {**module.defaults, **values}):
+    for name, value in parse_pairs(start, "--start", {**module.defaults, **values}):
         if name not in states:
-            remedy = suggest(name, states) or _there_are(states)
+            remedy = suggest(name, states) or _available(states)
             raise EomcError(f"--start: '{name}' is not a coordinate or velocity{remedy}")
         array, k = states[name]
         array[k] = value
     return values, q0, qd0
 
 
-def _held(
-    scene: Path, module: Any, given: Sequence[str], parameters: Mapping[str, float]
+def _fixed_inputs(
+    scene: Path, module: Any, arguments: Sequence[str], parameters: Mapping[str, float]
 ) -> dict[str, float] | None:
-    """The inputs that are held over the run, all of them; None where signals are followed.
+    """Return all inputs held constant over the run; None if signals are used.
 
-    Those that are not given are held at their signals, where these are constant.
+    Inputs that are not given are held at their signals, which must be constant.
     """
     from eomc.scene.formulas import suggest
 
-    values = dict(pairs(given, "--input", {**module.defaults, **parameters}))
+    values = dict(parse_pairs(arguments, "--input", {**module.defaults, **parameters}))
     for name in values:
         if name not in module.inputs:
             remedy = suggest(name, module.inputs)
-            remedy = remedy or (_there_are(module.inputs) if module.inputs else ": there are none")
+            remedy = remedy or (_available(module.inputs) if module.inputs else ": there are none")
             raise EomcError(f"--input: '{name}' is not an input{remedy}")
     if not values or not (missing := [name for name in module.inputs if name not in values]):
         return values or None
-    if moving := [name for name in _moving(scene) if name in missing]:
+    if moving := [name for name in _varying_inputs(scene) if name in missing]:
         names = texts.listed(moving)
         raise EomcError(
             f"--input: the scene's signal of {names} changes, and a run holds all inputs or none: "
@@ -247,8 +252,8 @@ def _held(
     return {**dict(zip(module.inputs, signals, strict=True)), **values}
 
 
-def _moving(scene: Path) -> Iterator[str]:
-    """The inputs whose signals depend on more than parameters."""
+def _varying_inputs(scene: Path) -> Iterator[str]:
+    """Return the inputs whose signals depend on more than parameters."""
     from eomc.model.symbols import resolved
 
     system = pipeline.read(scene)
@@ -256,7 +261,7 @@ def _moving(scene: Path) -> Iterator[str]:
     return (i.name for i in system.inputs if i.signal.xreplace(known).free_symbols - fixed)
 
 
-def _there_are(known: Iterable[str]) -> str:
+def _available(known: Iterable[str]) -> str:
     return f"; there are {texts.listed([*known])}"
 
 
@@ -265,15 +270,15 @@ def _finite(x: float) -> float | None:
 
 
 def _change(energy: Any) -> float | None:
-    """The largest from the start; None where one is not finite."""
+    """Return the largest change from the start; None if a value is not finite."""
     import numpy as np
 
     return float(np.max(np.abs(energy - energy[0]))) if np.isfinite(energy).all() else None
 
 
-def _error(done: Run) -> dict[str, Any] | None:
-    """A run's own error for JSON, which has no inf and no nan."""
-    error = done.error
+def _error(run: Run) -> dict[str, Any] | None:
+    """Return the error estimate of a run for JSON, without inf and nan."""
+    error = run.error
     if error is None:
         return None
 
@@ -292,22 +297,22 @@ def _error(done: Run) -> dict[str, Any] | None:
 
 
 def _summary(
-    module: Any, done: Run, balance: Balance | None, seconds: float, unstable: str | None,
+    module: Any, run: Run, balance: Balance | None, seconds: float, unstable: str | None,
     ends: str | None, **files: Path | None,
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
-    energy, jacobi = done.energy, done.jacobi
-    q, qd = done.q[-1] + 0.0, done.qd[-1] + 0.0  # no -0
+    energy, jacobi = run.energy, run.jacobi
+    q, qd = run.q[-1] + 0.0, run.qd[-1] + 0.0  # no -0
     return {
         "scene": module._model.name,
-        "status": done.status,
-        "message": done.message,
-        "method": done.method,
-        "h": done.h,
-        "tolerance": getattr(done, "tol", None) or None,  # 0: of fixed steps
-        "steps": done.steps,
-        "t": float(done.t[-1]),
+        "status": run.status,
+        "message": run.message,
+        "method": run.method,
+        "h": run.h,
+        "tolerance": getattr(run, "tol", None) or None,  # 0: of fixed steps
+        "steps": run.steps,
+        "t": float(run.t[-1]),
         "q": dict(zip(module.coordinates, map(float, q), strict=True)),
         "qd": dict(zip(module.coordinates, map(float, qd), strict=True)),
         "energy": {
@@ -316,32 +321,32 @@ def _summary(
             "largest_change": _change(energy),
             "balance": dataclasses.asdict(balance) if balance else None,
         },
-        "events": {name: e.t.tolist() for name, e in done.events.items()},
-        "stopped_by": getattr(done, "stopped", "") or None,
-        "saturated": _saturated(module, done),
+        "events": {name: e.t.tolist() for name, e in run.events.items()},
+        "stopped_by": getattr(run, "stopped", "") or None,
+        "saturated": _saturated(module, run),
         "jacobi_change": None if np.array_equal(energy, jacobi) else _change(jacobi),
-        "error_estimate": _error(done),
+        "error_estimate": _error(run),
         "beyond_stability": unstable,
         "beyond_duration": ends,
-        "remark": done._remark if done.status == "ok" else "",
+        "remark": run._remark if run.status == "ok" else "",
         "seconds": seconds,
-        "steps_per_second": done.steps / seconds if seconds else None,
+        "steps_per_second": run.steps / seconds if seconds else None,
         "files": [str(path) for path in files.values() if path],
     }
 
 
-def _saturated(module: Any, done: Run) -> dict[str, float]:
-    """At what part of the rows each input was beyond its limits, where any was."""
-    parts = zip(module.inputs, map(float, done.saturated.mean(axis=0)), strict=True)
+def _saturated(module: Any, run: Run) -> dict[str, float]:
+    """Return the fraction of rows in which each input was beyond its limits, if there are any."""
+    parts = zip(module.inputs, map(float, run.saturated.mean(axis=0)), strict=True)
     return {name: part for name, part in parts if part}
 
 
 def _print_summary(
-    module: Any, done: Run, balance: Balance | None, summary: Mapping[str, Any]
+    module: Any, run: Run, balance: Balance | None, summary: Mapping[str, Any]
 ) -> None:
     say(
-        f"{shown(module.title)}: {done.steps} steps of {summary['method']}, {done.told}, "
-        f"to t = {done.t[-1]:g} s"
+        f"{shown(module.title)}: {run.steps} steps of {summary['method']}, {run.told}, "
+        f"to t = {run.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
     ends = zip(module.coordinates, summary["q"].values(), summary["qd"].values(), strict=True)
@@ -350,7 +355,7 @@ def _print_summary(
         rate = f"{unit}/s" if unit else ""
         going = "" if name in module._model.still else f"   {name}_dot {qd: .9g} {rate}"
         say(f"  {name:{wide}} {q: .9g} {unit}{going}".rstrip())
-    _print_energy(done, balance, summary)
+    _print_energy(run, balance, summary)
     for name, times in summary["events"].items():
         last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""
         over = ", which ends the run" if name == summary["stopped_by"] else ""
@@ -360,16 +365,16 @@ def _print_summary(
     for words in (summary["beyond_stability"], summary["beyond_duration"], summary["remark"]):
         if words:
             say(f"  {words}")
-    if done.error is not None:
-        _print_error(module, done.error, done)
+    if run.error is not None:
+        _print_error(module, run.error, run)
     speed = summary["steps_per_second"] or 0.0
     say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
         say(f"  wrote {shown(file)}")
 
 
-def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:
-    """What is conserved, or what was put in and lost of it; K + P apart where it is another."""
+def _print_energy(run: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:
+    """Print the conserved quantity or the energy balance, and K + P if it differs."""
     energy, jacobi = summary["energy"], summary["jacobi_change"]
     if energy["largest_change"] is None:
         say("  the energy is not finite")
@@ -377,20 +382,20 @@ def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]
     end, change = energy["end"], energy["largest_change"]
     if jacobi is not None:
         say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J; it is not conserved")
-        end, change = float(done.jacobi[-1]), jacobi
+        end, change = float(run.jacobi[-1]), jacobi
     name = "energy K + P" if jacobi is None else "Jacobi's integral"
     how = f": {balance.words}" if balance else f", changed by at most {change:.2g} J"
     say(f"  {name} {end:.9g} J{how}")
 
 
-def _print_error(module: Any, error: Estimate, done: Run) -> None:
+def _print_error(module: Any, error: Estimate, run: Run) -> None:
     import math
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
-    seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
-    how = f"in shorter steps; order {error.order}, {seen}"
-    if hasattr(done, "tol"):
-        how = "with a hundredth of the tolerance" if done.tol else "in steps a quarter as long"
+    observed = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
+    how = f"in shorter steps; order {error.order}, {observed}"
+    if hasattr(run, "tol"):
+        how = "with a hundredth of the tolerance" if run.tol else "in steps a quarter as long"
     size = f"about {q:.1g} in q, {qd:.1g} in qd" if max(q, qd) < math.inf else "unknown"
     say(f"  error at the end {size} (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
@@ -402,7 +407,7 @@ def _print_error(module: Any, error: Estimate, done: Run) -> None:
         say(f"  {error.warning}")
 
 
-def _write(path: Path, done: Run) -> None:
-    """The rows as CSV (17 digits, so that they read back as they were) or the run as NPZ."""
+def _write(path: Path, run: Run) -> None:
+    """Write the rows as CSV with 17 digits, or the run as NPZ."""
     with writing(shown(path)):
-        done.save(path)
+        run.save(path)

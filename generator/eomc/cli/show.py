@@ -36,7 +36,7 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         return
     name, digest = pipeline.name_and_digest(scene)
 
-    def made() -> dict[str, str]:
+    def make() -> dict[str, str]:
         from eomc.report import equations, equations_text
 
         system = pipeline.read(scene)
@@ -47,14 +47,14 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):
-        found = disk_cache.cached_texts(root, name, form or "text", digest, made)
-    if found["warnings"]:
-        say(found["warnings"], err=True)
-    say(found["text"])
+        texts = disk_cache.cached_texts(root, name, form or "text", digest, make)
+    if texts["warnings"]:
+        say(texts["warnings"], err=True)
+    say(texts["text"])
 
 
 def _sizes(scene: Path) -> str:
-    """What a compiler makes of the plain C, as a table."""
+    """Return a table of the sizes of the compiled portable C."""
     import shlex
 
     from eomc.toolchain import sizes
@@ -62,21 +62,22 @@ def _sizes(scene: Path) -> str:
 
     compiler = find_compiler()
     with status_line("deriving", False):
-        made = pipeline.sources(pipeline.read(scene), warn=warn)
-        found = sizes.measure(made.files, made.name, compiler)
+        sources = pipeline.sources(pipeline.read(scene), warn=warn)
+        measured = sizes.measure(sources.files, sources.name, compiler)
     rows: list[tuple[str, ...]] = [("function", "code", "stack", "with calls")]
-    for f in found.functions:
-        told = (f.code, f.stack, f.total_stack)
-        rows.append((f.name, *("-" if n is None else str(n) for n in told)))
-    wide = max(len(row[0]) for row in rows)
+    for f in measured.functions:
+        numbers = (f.code, f.stack, f.total_stack)
+        rows.append((f.name, *("-" if n is None else str(n) for n in numbers)))
+    width = max(len(row[0]) for row in rows)
     library = sorted(
-        {x for f in found.functions for x in f.calls} - {f.name for f in found.functions}
+        {x for f in measured.functions for x in f.calls} - {f.name for f in measured.functions}
     )
     lines = [
-        f"{made.name}.c: bytes of code and stack, by {shlex.join(found.command)}", "",
-        *(f"{name:{wide}}  {code:>6}  {stack:>6}  {deep:>10}" for name, code, stack, deep in rows),
+        f"{sources.name}.c: bytes of code and stack, by {shlex.join(measured.command)}", "",
+        *(f"{name:{width}}  {code:>6}  {stack:>6}  {deep:>10}" for name, code, stack, deep in rows),
         "",
-        f"in all {found.code} of code, {found.constants} of constants, {found.writable} writable",
+        f"in all {measured.code} of code, {measured.constants} of constants, "
+        f"{measured.writable} writable",
     ]  # fmt: skip
     lines += [f"stack of libraries left out: {', '.join(library)}"] if library else []
-    return "\n".join((*lines, *found.faults))
+    return "\n".join((*lines, *measured.faults))

@@ -1,4 +1,4 @@
-"""What the command prints: cleaned text, progress, and what happens where it can't be written."""
+"""Terminal output: escaped text, progress, and errors of writing."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class Group(click.Group):
-    """Commands whose output may be closed, full, or of fewer letters than are printed."""
+    """A group of commands that handles closed or full output streams and missing encodings."""
 
     def main(self, *args: Any, **how: Any) -> Any:
-        """As click has it; status 2 where output can't be written, after `| head` status 1."""
+        """Run as click does; exit with status 2 if output can't be written, 1 after `| head`."""
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
             if stream is None:  # closed by the caller
@@ -33,34 +33,34 @@ class Group(click.Group):
             return super().main(*args, **how)
         except OSError as fault:
             # a full stdout keeps what it could not write, and would fail once more at the end
-            _closed("stdout")
+            _close("stdout")
             try:
                 where = fault.filename or "the output"
                 click.echo(f"eomc: {where}: can't be written ({fault.strerror})", err=True)
             except OSError:
-                _closed("stderr")
+                _close("stderr")
             sys.exit(2)
 
 
-def _closed(name: str) -> None:
+def _close(name: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         getattr(sys, name).close()
     setattr(sys, name, None)
 
 
 def fail(message: str) -> NoReturn:
-    """End with status 2, for bad input."""
+    """Exit with status 2, for bad input."""
     say(message, err=True)
     sys.exit(2)
 
 
 def say(words: str = "", err: bool = False) -> None:
-    """Print; what a terminal would take for a command is shown escaped."""
+    """Print text; control characters are escaped."""
     click.echo(texts.lines(words), err=err)
 
 
 def shown(path: object) -> str:
-    """The name of a file in one line."""
+    """Return the name of a file on one line."""
     return texts.line(str(path))
 
 
@@ -69,7 +69,7 @@ def warn(problem: Problem) -> None:
     say(str(problem), err=True)
 
 
-def _watched(silent: bool) -> bool:
+def _is_interactive(silent: bool) -> bool:
     return not silent and sys.stderr.isatty()
 
 
@@ -77,25 +77,25 @@ def _watched(silent: bool) -> bool:
 def progress_bar(
     what: str, silent: bool, after: float = 1.0
 ) -> Iterator[Callable[[int, int], None]]:
-    """A bar for what takes longer than `after`, s, where a person is watching."""
-    if not _watched(silent):
-        yield lambda done, total: None
+    """Show a progress bar after `after` seconds, if stderr is a terminal."""
+    if not _is_interactive(silent):
+        yield lambda completed, total: None
         return
-    begun = time.monotonic()
+    started_at = time.monotonic()
     bar: list[Any] = []
 
-    def update(done: int, total: int) -> None:
-        if not bar and time.monotonic() - begun >= after and done < total:
+    def update(completed: int, total: int) -> None:
+        if not bar and time.monotonic() - started_at >= after and completed < total:
             from rich.console import Console
             from rich.progress import Progress, TextColumn
 
-            said = TextColumn("{task.description}", markup=False)
-            columns = (said, *Progress.get_default_columns()[1:])
+            description = TextColumn("{task.description}", markup=False)
+            columns = (description, *Progress.get_default_columns()[1:])
             progress = Progress(*columns, console=Console(stderr=True), transient=True)
             progress.start()
             bar.extend([progress, progress.add_task(shown(what), total=total)])
         if bar:
-            bar[0].update(bar[1], completed=done)
+            bar[0].update(bar[1], completed=completed)
 
     try:
         yield update
@@ -106,8 +106,8 @@ def progress_bar(
 
 @contextmanager
 def status_line(what: str, silent: bool) -> Iterator[None]:
-    """A line that says what is going on, where a person is watching."""
-    if not _watched(silent):
+    """Show a status line with a spinner, if stderr is a terminal."""
+    if not _is_interactive(silent):
         yield
         return
     from rich.console import Console
