@@ -266,7 +266,9 @@ class _List:
         """An operation on others."""
         args = tuple(args)
         of = [self.ops[i] for i in args]
-        moves, rate, given = (max(getattr(a, n) for a in of) for n in ("moves", "rate", "given"))
+        moves, rate, given = (
+            max(getattr(a, n) for a in of) for n in ("moves", "rate", "has_inputs")
+        )
         return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", given))
 
     def node(self, e: Any) -> int:
