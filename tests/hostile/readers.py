@@ -100,7 +100,7 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
 
     def made() -> None:
         robot = reader(path)
-        for change in (lambda r: r, edit.repaired, stopped):
+        for change in (lambda r: r, edit.mended, stopped):
             text = scene_text.scene_text(scene_text.finished(change(robot)))
             read_back = parse(text, "fuzz.xml.toml")
             if len(robot.bodies) < SYMPY_FROM:

@@ -22,7 +22,7 @@ from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.verify import one_step
 from eomc.verify.advice import Advice
 from eomc.verify.comparison import Comparison
-from eomc.verify.convergence import Convergence, Finding
+from eomc.verify.convergence import Convergence, Measurement
 
 SCENES = Path(__file__).parents[2] / "scenes"
 MODULES = Path("build/tests/modules")
@@ -138,7 +138,7 @@ def test_a_wrong_coefficient_is_found_by_check(
         (Convergence, "compare_methods"),
     ):
         # which say nothing of it
-        monkeypatch.setattr(of, row, lambda *_: Finding(math.nan, "not looked at"))
+        monkeypatch.setattr(of, row, lambda *_: Measurement(math.nan, "not looked at"))
     made = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)
     made.convergence_rows()
     assert [row.name for row in made.rows if not row.passed] == ["order of dp8"]

@@ -187,7 +187,7 @@ def test_names_of_parameters_and_irrational_numbers_do_not_matter(tmp_path: Path
         "named", {x: 0.1}, e * x_dot**2 / 2, sympy.E * x**2 / 2 + mpf * sympy.cos(sympy.pi * x),
         parameters={e: 2, mpf: 0.7}, inputs={size: sympy.exp(1) * e}, forces={x: size},
     )  # fmt: skip
-    made = reference_solution.of(system, 0.5, 16, tmp_path)
+    made = reference_solution.solve(system, 0.5, 16, tmp_path)
     assert made.plain is not None and min(made.plain[:2]) > 30
 
 

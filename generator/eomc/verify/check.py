@@ -50,7 +50,7 @@ def check(
     plain: the same compiled from plain C, which is compared with the reference and with `module`.
     states: how many, by default as many as take seconds. Always the same states for the same
     seed. A module that raises fails the row, which shows its words. Raises EomcError where
-    `symbolic.of` does.
+    `symbolic.reference_for` does.
     """
     comparison = Comparison(system, module, np.random.default_rng(seed), states, plain)
     models = [form._model for form, _ in comparison.forms if hasattr(form, "_model")]
