@@ -150,6 +150,12 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         (("a", [x], x_dot**2), {"forces": {x: sympy.Heaviside(x, 1)}}, "Heaviside.x. is 1/2 at 0"),
         (("a", [x], x_dot**2), {"forces": {"y": 1}}, "forces: y not among the coordinates"),
         (("a", [x], x_dot**2), {"units": {"X": "m"}}, "units: X is no coord.*did you mean 'x'"),
+        (("a", [x], x_dot**2), {"units": {"x": "deg"}}, "units: x: 'deg': angles are in radians"),
+        (
+            ("a", [x], x_dot**2),
+            {"outputs": {"o": x}, "units": {"o": "deg"}},
+            r"outputs: o: angles are in radians, .* give x\*180/pi",
+        ),
         (("a", [x], x_dot**2), {"h": -0.1}, "h: must be greater than zero"),
         (("a", [x], x_dot**2), {"methods": ["ode45"]}, "methods: known are rk4"),
         (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),

@@ -87,3 +87,10 @@ def test_a_mark_of_byte_order_is_read_over(tmp_path: Path) -> None:
 def test_a_robot_file_is_told_from_a_scene() -> None:
     with pytest.raises(EomcError, match=r"'eomc import arm\.urdf' writes"):
         parse(b'\n<robot name="arm"/>', "arm.urdf")
+
+
+def test_units_of_degrees_are_recognised_in_products() -> None:
+    for unit in ("deg", "Deg/s", "deg/s^2", "N m/deg", "°", "degrees"):
+        assert messages.is_in_degrees(unit), unit
+    for unit in ("rad", "°C", "degC", ""):
+        assert not messages.is_in_degrees(unit), unit

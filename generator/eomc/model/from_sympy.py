@@ -34,6 +34,7 @@ from eomc.model.symbols import (
     symbol,
     t,
 )
+from eomc.scene.messages import is_in_degrees
 from eomc.scene.scene import Run
 from eomc.scene.schema import ACTIONS, DIRECTIONS
 
@@ -149,7 +150,7 @@ class Maker:
         made = self._held(made, [*starts], guess, bool(rows))
         pending = given.symbols(inputs, "inputs", 0)
         named = map(given.name_of, (*starts, *parameters, *pending, *definitions))
-        given.check_units(units, (*named, *map(str, (*rows, *outputs))))
+        given.check_units(units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)])
         given_inputs = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
@@ -426,11 +427,17 @@ class Maker:
                 self.known |= {name, multiplier}
         if not isinstance(outputs, Mapping):
             raise given.fault("outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}')
+        moving = {x for c in made for x in (c.q, c.qd)}
         for name, formula in outputs.items():
             called = given.called(name, "outputs")
             expr = self._expression(formula, f"output {name}")
             if called in rows:
                 raise given.fault("outputs", f"'{name}' is a constraint already: rename one")
+            if expr in moving and is_in_degrees(units.get(name, "")):
+                raise given.fault(
+                    "outputs",
+                    f"{name}: angles are in radians, nothing is converted: give {formula}*180/pi",
+                )
             yield Output(called, expr, units.get(name, ""))
 
     def _declare(self, one: Any, role: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import sympy
@@ -18,6 +18,7 @@ from eomc.model.mechanics import in_words_of_python
 from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
+from eomc.scene.messages import is_in_degrees
 from eomc.scene.scene import Run
 from eomc.scene.schema import (
     DEFAULT_TOLERANCE,
@@ -83,15 +84,21 @@ def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
         )
 
 
-def check_units(units: Iterable[str], known: Iterable[str]) -> None:
-    """An EomcError where a unit is of nothing that there is."""
+def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collection[str]) -> None:
+    """An EomcError where a unit is of nothing that there is, or in degrees but of no output."""
     known = [*known]
-    for name in units:
+    for name, unit in units.items():
         if name not in known:
             raise fault(
                 "units",
                 f"{name} is no coordinate, parameter, input, constraint or output"
                 f"{formulas.suggest(name, known)}",
+            )
+        if name not in outputs and is_in_degrees(unit):
+            raise fault(
+                "units",
+                f"{name}: '{unit}': angles are in radians, nothing is converted: give values "
+                "in radians and the unit in rad",
             )
 
 

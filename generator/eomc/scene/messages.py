@@ -111,6 +111,14 @@ def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
     return f"a number stands without quotes and without its unit, {unit} in SI: write {number}"
 
 
+_UNIT_OF_DEGREES = re.compile(r"(?<![a-z])(?:deg|degs|degree|degrees)(?![a-z])|°(?![CF])", re.I)
+
+
+def is_in_degrees(unit: str) -> bool:
+    """Whether a unit is of degrees, as `deg/s` and `N m/deg` are; of temperatures none is."""
+    return bool(_UNIT_OF_DEGREES.search(unit))
+
+
 def degrees_formula(number: str) -> str:
     """Return an angle in degrees as a formula in quotes."""
     return f'"{number}*pi/180"'

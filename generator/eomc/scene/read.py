@@ -294,7 +294,7 @@ class _SceneChecker(Checker):
         `formula` is the coordinate or velocity that an output consists of.
         """
         plain = unit.strip().lower()
-        if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
+        if messages.is_in_degrees(unit):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
             remedy = (
                 f'write {number} degrees as {messages.degrees_formula(number)}, with unit = "rad"'
