@@ -152,7 +152,7 @@ def many(text: str) -> str:
 def test_parts_are_the_whole() -> None:
     """What stands in the first part hangs on neither time, inputs nor velocities."""
     accelerations = Accelerations(odd_target())
-    function, parts = accelerations.whole, accelerations.parts
+    function, parts = accelerations.function, accelerations.parts
     assert parts is not None and len(accelerations.angles) >= two_point.MIN_ANGLES
     sines = {name for a in accelerations.angles for name in (a.sine, a.cosine)}
     early = {"phase", "m", *(a.name for a in function.early)}
