@@ -145,7 +145,7 @@ def measure(
     *,
     longest: float = MAX_RUN_SECONDS,
     methods: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> Report:
     """Measure the cost of accuracy for one scene, from its initial state over its duration.
 

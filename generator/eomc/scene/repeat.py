@@ -92,16 +92,16 @@ class _Expansion:
             path = (table, key)
             if not (isinstance(value, dict) and "repeat" in value):
                 name = self._expanded_once(path, key, bare=False)
-                entries_made = [(name, self._expanded_once(path, value))]
+                new_entries = [(name, self._expanded_once(path, value))]
             else:
                 if table in _PLAIN and "value" not in value:
                     self._fault(path, 'missing: add value = "..." to repeat')
                     continue
-                entries_made = self._repeat_entry(path, key, value)
+                new_entries = self._repeat_entry(path, key, value)
                 if table in _PLAIN:
-                    entries_made = [(name, entry["value"]) for name, entry in entries_made]
-            self.check.places.repeat(path, [(table, name) for name, _ in entries_made])
-            for name, entry in entries_made:
+                    new_entries = [(name, entry["value"]) for name, entry in new_entries]
+            self.check.places.repeat(path, [(table, name) for name, _ in new_entries])
+            for name, entry in new_entries:
                 if name in out:
                     self._fault(path, f"'{name}' stands here a second time: remove one of the two")
                 out[name] = entry
@@ -131,11 +131,11 @@ class _Expansion:
             shown = (array, name if isinstance(name, str) and name else str(len(out) + 1))
             places.repeat(written, [shown])
             if "repeat" in entry:
-                entries_made = [e for _, e in self._repeat_entry(shown, name, entry)]
+                new_entries = [e for _, e in self._repeat_entry(shown, name, entry)]
             else:
-                entries_made = [self._expanded_once(shown, entry)]
+                new_entries = [self._expanded_once(shown, entry)]
             labels = []
-            for each in entries_made:
+            for each in new_entries:
                 label = each.get("name") if array in _NAMED else None
                 if not isinstance(label, str) or not label or label in out:
                     label = str(len(out) + 1)

@@ -1,7 +1,7 @@
-"""What a module's runs say of the step sizes that it advises.
+"""Compare the step sizes that a module advises with its runs.
 
-An advised h is compared with runs; where these leave the place that it is about, as stiff friction
-near rest, with the eigenvalues of differences of the accelerations.
+If runs leave the state that the advice is for, as with stiff friction near rest, the advised step
+is compared with the eigenvalues of the linearised motion, by differences of the accelerations.
 """
 
 from __future__ import annotations
@@ -34,14 +34,11 @@ MAX_EIGENVALUE_RATIO = 2.0  # times the limit of the eigenvalues: an advised h f
 DIFFERENCE_STEP = 1e-5  # of the motion: differences of rates of rows, which are smooth
 ZERO_TOLERANCE = 1e-9  # of the largest singular value of a constraint's slopes: none
 MAX_PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
-MAX_STEPS_AHEAD = 2000  # steps of the scene's h in which these lie
+MAX_PREDICTION_STEPS = 2000  # steps of the scene's h in which these lie
 
 
 class Advice:
-    """The rows about h. runs: of the module, with the scale and start of its motion.
-
-    holonomic: whether each constraint is.
-    """
+    """Checks of advised step sizes. `holonomic`: for each constraint, whether it is holonomic."""
 
     def __init__(self, runs: Convergence, holonomic: Sequence[bool] = ()) -> None:
         self.holonomic = np.array(holonomic, bool)
@@ -93,7 +90,7 @@ class Advice:
         """
         start = self.start
         method = next(m for m in self.runs.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(MAX_STEPS_AHEAD, math.ceil(self.duration / self.h))
+        steps = min(MAX_PREDICTION_STEPS, math.ceil(self.duration / self.h))
         every = max(1, steps * max(1, len(start.q) // 8) // MAX_PLACES)
         stiffest, longest = start, 1e3 * self.duration
         run = self.runs.run(start, method, steps=steps, every=every)
@@ -105,7 +102,7 @@ class Advice:
         return stiffest
 
     def _longest_advised(self, method: str, s: State, most: float) -> float:
-        """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
+        """Return the longest h without a warning of the module, to 5 %; inf if `most` has none."""
         low = most
         while self._warns(method, s, low):
             low /= 2
@@ -118,14 +115,14 @@ class Advice:
         return high
 
     def _velocities_matter(self) -> bool:
-        """Whether accelerations hang on velocities."""
+        """True if accelerations depend on velocities."""
         s = self.runs.places[-1].state
         at_rest = replace(s, qd=0 * s.qd)
         one, other = (self.runs.ask("acceleration", x) for x in (s, at_rest))
         return not np.array_equal(one, other)
 
     def _warns(self, method: str, s: State, h: float) -> bool:
-        """Whether the module advises against h at a state."""
+        """True if the module advises against h at a state."""
         message = self.runs.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
         return message is not None
 
@@ -167,7 +164,7 @@ class Advice:
         return max(self._eigenvalue_limit(method, directions) for directions in candidates)
 
     def _eigenvalue_limit(self, method: str, directions: Vector) -> float:
-        """The same, for changes of [q; qd] in units of the scale, the columns of `directions`."""
+        """Return the longest stable h for perturbations of [q; q̇] in the span of `along`, s."""
         s = self.stiffest_state
         n, x = len(s.q), np.array([s.q, s.qd])
         rates = np.zeros_like(directions)
@@ -189,9 +186,10 @@ class Advice:
         return 1 / fastest if fastest > 0 else math.inf
 
     def _constrained_directions(self, s: State) -> Vector:
-        """Changes of [q; qd], in units of the scale, along the constraints: (2 nq, k), orthonormal.
+        """Return directions of [q; q̇] tangent to the constraints in units of the scale, (2 nq, k).
 
-        All without constraints. Velocities follow positions so that rates of rows stay zero.
+        The columns are orthonormal. Velocities change with positions so that rates of constraints
+        stay zero.
         """
         n, (far, fast) = len(s.q), self.scale
         if not self.holonomic.size:
@@ -213,6 +211,6 @@ class Advice:
 
 
 def _null_space(A: Vector) -> Vector:
-    """What A makes zero, (n, k), orthonormal."""
+    """Return an orthonormal basis of the null space of A, (n, k)."""
     _, sizes, rows = np.linalg.svd(A)
     return np.asarray(rows[np.sum(sizes > ZERO_TOLERANCE * np.max(sizes, initial=0)) :].T)

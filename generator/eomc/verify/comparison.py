@@ -42,7 +42,7 @@ STEP_FRACTIONS = tuple(4.0**-k for k in range(7))  # parts of it, until stages a
 
 
 def _corrected(e: Expected) -> Vector | float:
-    """What rounding of constraints makes of a state that is put onto them: (2, nq), 0 without."""
+    """Return the effect of rounding in constraints on a projected state, (2, nq), or 0."""
     return e.size.get("place", 0.0)
 
 
@@ -190,7 +190,7 @@ class Comparison:
         return float(sum(theirs != ours for theirs, ours in pairs))
 
     def value(self, name: str) -> float:
-        """One of VALUES or the acceleration."""
+        """Return the largest error of one of VALUES or of the acceleration."""
         # energies in units of what they usually are: k - k cos(q) may be 0 at a state
         typical = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
 
@@ -369,13 +369,13 @@ class Comparison:
         return True
 
     def few(self, count: int) -> list[Expected]:
-        """Some of the states: the first ones and the last ones."""
+        """Return the first and last states, `count` in all."""
         half = count // 2
         return self.expected[:half] + self.expected[half:][-half:]
 
-    def units(self, found: Any, expected: Any, size: Any) -> float:
+    def units(self, values: Any, expected: Any, size: Any) -> float:
         """The largest difference in units of the module's rounding."""
-        return units(found, expected, size, self.eps)
+        return units(values, expected, size, self.eps)
 
     # properties of the module alone
 

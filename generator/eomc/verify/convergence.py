@@ -73,9 +73,9 @@ class _Ladder:
 
     @property
     def orders(self) -> Iterator[tuple[float, bool]]:
-        """Of each halving of a small difference clear of rounding; whether its rest is clear too.
+        """Yield the order of each halving above rounding, and whether the finer difference is too.
 
-        Where it is not, that is the least that the order may be.
+        If it is not, the order is a lower bound.
         """
         for a, b in pairwise(self.differences):
             if NOISE_FACTOR * self.noise < a < MAX_DIFFERENCE:
@@ -134,7 +134,7 @@ class Convergence:
         return np.array([run.q[-1], run.qd[-1]]) / self.scale
 
     def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
-        """What rounding does to the end: that of the sums on the way, and of the start, grown."""
+        """Return the effect of rounding on the end of a run: in its sums and in its start."""
         s = at.state
         size = np.abs(np.array([s.q, s.qd])) + np.abs(there) * self.scale
         least = EPS * float(np.max(size / self.scale))
@@ -149,9 +149,9 @@ class Convergence:
     # --- orders -----------------------------------------------------------------------------------
 
     def order(self, method: str) -> Measurement:
-        """Of convergence of the state: the best found from any place; inf where runs are exact.
+        """Return the best order of convergence from any place; inf if runs are exact.
 
-        Raises RuntimeError where no run from any place gets to its end.
+        Raises RuntimeError if no run from any place reaches its end.
         """
         least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
         orders = []
@@ -320,7 +320,7 @@ class Convergence:
         return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in gaps)
 
     def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
-        """What is left of the balance with 16, 32 and 64 steps; whether one of them closes it."""
+        """Return the residual of the balance for 16, 32 and 64 steps, and whether one closes."""
         s, gaps = at.state, []
         for n in (16, 32, 64):
             run = self.run(s, self._best_method, h=span / n, steps=n)

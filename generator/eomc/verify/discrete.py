@@ -1,6 +1,6 @@
-"""The independent answer where jumps set parameters: that of the system in which they are constant.
+"""The reference for systems with parameters that jumps set: that of the system without them.
 
-Discrete variables s have D = 1 and nothing else in their rows, and K has s_dot**2/2 of each.
+Discrete variables s have D = 1 and nothing else in their rows, and K contains s_dot**2/2 of each.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ KINETIC = ("kinetic", "energy", "jacobi")
 
 
 class DiscreteReference(Reference):
-    """The equations of `system`, from an answer for `discrete.constant` of it."""
+    """Reference of `system`, given one in which discrete variables are parameters."""
 
     def __init__(self, system: System, core: Reference) -> None:
         self.system, self.core = system, core
@@ -28,7 +28,7 @@ class DiscreteReference(Reference):
         self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """As `Answer.terms`."""
+        """Return the sum of the sizes of terms, as `Reference.terms`."""
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
         values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
         params = {**(s.get("params") or {}), **values}
@@ -62,7 +62,7 @@ class DiscreteReference(Reference):
     def _core_arguments(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector, Any, ArrayLike | None, Values]:
-        """The same arguments, discrete variables among the parameters."""
+        """Return the arguments of the core reference, discrete variables among the parameters."""
         discrete = (q[..., k] for k in self.discrete_indices)
         return (
             q[..., self.continuous_indices],
@@ -73,7 +73,7 @@ class DiscreteReference(Reference):
         )
 
     def _with_discrete_columns(self, columns: Vector) -> Vector:
-        """(..., nq) with zeros for the discrete variables."""
+        """Return the values with zeros for the discrete variables, (..., nq)."""
         result = np.zeros(
             (*columns.shape[:-1], len(self.continuous_indices) + len(self.discrete_indices))
         )
@@ -81,7 +81,7 @@ class DiscreteReference(Reference):
         return result
 
     def _with_discrete_block(self, matrix: Vector, diagonal: float) -> Vector:
-        """(..., nq, nq), likewise, with these numbers on their diagonal."""
+        """Return the matrix (..., nq, nq) with `diagonal` on the discrete variables' diagonal."""
         result = np.swapaxes(
             self._with_discrete_columns(np.swapaxes(self._with_discrete_columns(matrix), -1, -2)),
             -1,

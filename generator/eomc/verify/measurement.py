@@ -1,4 +1,4 @@
-"""What a row of `check` finds: a number, or the reason why none can be had."""
+"""The result of one measurement of `check`: a number, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was found; inf where there is nothing to measure. why: nothing is judged, and why.
+    """A measured value; inf if there is nothing to measure, with the reason in `why`.
 
-    unit, limit: of another measure than the row's own, at most the limit.
+    unit, limit: replace those of the row, if another quantity was measured.
     """
 
     value: float
@@ -24,13 +24,13 @@ class Measurement:
 
 
 def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
-    """The largest of those that there are, nan before all; with none, not judged and why."""
+    """Return the largest known error, nan if any is; not judged, with `why`, if none is known."""
     known = [x for x in errors if x is not None]
     return float(np.max(known)) if known else Measurement(math.nan, why)
 
 
 def units(values: Any, expected: Any, size: Any, eps: float) -> float:
-    """The largest difference in units of rounding, nan where something is not a number."""
+    """Return the largest difference in units of rounding; nan if a value is not a number."""
     difference = np.abs(np.asarray(values, float) - expected)
     if difference.shape != np.shape(expected):
         raise ValueError(f"shape {np.shape(values)} where {np.shape(expected)} is meant")

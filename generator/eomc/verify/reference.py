@@ -1,8 +1,8 @@
-"""What an independent answer can be asked, and RK4 in plain Python on top of it.
+"""The interface of independent references, with RK4 in plain Python.
 
-`symbolic.Reference` answers from expressions written out, `taylor.Jets` by Taylor arithmetic along
-the definitions. Both take many states at once, as leading rows of their arguments. Constraints are
-solved for by `kkt`.
+`symbolic.SymbolicReference` evaluates expressions written out, `taylor.TaylorReference` uses Taylor
+arithmetic along the definitions. Both take many states at once, as leading rows of their arguments.
+Constraints are solved by `kkt`.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", 
 
 
 class Reference(ABC):
-    """D qdd + bias = tau of a system, and what belongs to it, at given states.
+    """D q̈ + bias = τ of a system and related quantities, at given states.
 
-    Where q is (b, nq), there are b states: qd is (b, nq) and u (b, nu) too, t and every value in
-    params one number or (b,), and each answer has one row more in front.
+    If q is (b, nq), there are b states: qd is (b, nq) and u (b, nu), t and every value in params
+    one number or (b,), and each result has a leading dimension b.
     """
 
     system: System
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """The sizes of the terms of "energy" or "power" multiplied out, added up, at `s`.
+        """Return the sum of the sizes of all terms of "energy" or "power", multiplied out.
 
-        0 where they are not written out.
+        0 if the expressions are not written out.
         """
         return 0.0
 
@@ -56,7 +56,7 @@ class Reference(ABC):
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        """What `evaluate` returns, of arguments that are complete."""
+        """Return the value of `name`, given all arguments."""
 
     def evaluate(
         self,
@@ -103,7 +103,7 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Vector:
-        """Those of the m constraints, (m,); 0 of rows that are redundant."""
+        """Return the Lagrange multipliers of the m constraints, (m,); 0 for redundant ones."""
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         _, solved = self._constrained(q, qd, t, u, self._values(params))
         return np.asarray(solved @ self.solved)
@@ -192,9 +192,9 @@ class Reference(ABC):
 
     @cached_property
     def solved(self) -> Vector:
-        """What accelerations are solved for, (r, m): sums of the m constraints, by their weights.
+        """Weights (r, m): the accelerations are solved with r weighted sums of the m constraints.
 
-        Of most systems one constraint each.
+        In most systems, each is one constraint.
         """
         rows = self.system.solved
         sums = np.zeros((len(rows), len(self.system.constraints)))
@@ -244,7 +244,7 @@ class Reference(ABC):
         self, function: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
         values: Values,
     ) -> tuple[Vector, Vector]:  # fmt: skip
-        """What `function` makes of each state."""
+        """Apply `function` to each state and return the stacked results."""
         if q.ndim == 1:
             return function(q, qd, t, values)
         times, *each = (by_rows(x, len(q)) for x in (t, *values))
@@ -310,7 +310,7 @@ class Reference(ABC):
         return ends[0], ends[1]
 
     def _correction(self, q: Vector, qd: Vector, t: Vector, values: Values) -> Vector:
-        """One of Newton's method, of q and of qd, (2, b, nq)."""
+        """Return one Newton correction of q and of q̇, (2, b, nq)."""
         rest = np.zeros_like(q)
         D, A, off = (self._constraint_values(name, q, qd, t, values) for name in ROWS)
         dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)

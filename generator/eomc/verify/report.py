@@ -1,4 +1,4 @@
-"""What `check` has found: rows, and their report."""
+"""The rows that `check` produces, and the report of them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ LIMIT = 1e3
 
 @dataclass(frozen=True)
 class Row:
-    """One thing that was tested: how far it was off, in what unit, and how far it may be.
+    """One check: its error, unit and limit.
 
-    Where nothing could be judged, `judged` is false and `unit` says why; such a row counts as
+    If nothing could be judged, `judged` is False and `unit` gives the reason; such a row counts as
     passed.
     """
 
@@ -30,9 +30,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of `check`. `states` were used, `rejected` ones had no regular D.
+    """The outcome of `check`: `states` were used, `rejected` ones had no regular D.
 
-    reference: what they were compared with: "equations written out" or "Taylor arithmetic".
+    reference: "equations written out" or "Taylor arithmetic".
     """
 
     scene: str
@@ -43,11 +43,11 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether every row has passed."""
+        """True if every row has passed."""
         return all(row.passed for row in self.rows)
 
     def table(self) -> str:
-        """The rows as text, for a terminal."""
+        """Return the rows as text for a terminal."""
         from rich.box import SIMPLE_HEAD
         from rich.console import Console
         from rich.table import Table
@@ -68,7 +68,7 @@ class Report:
         return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; numbers that are not finite are None."""
+        """Return the report for JSON, with None for numbers that are not finite."""
         rows = [asdict(row) for row in self.rows]
         for row in rows:
             row["error"] = row["error"] if math.isfinite(row["error"]) else None

@@ -33,7 +33,7 @@ ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 @dataclass
 class BatchResult:
-    """What calls of C left in place: states (n, 2 nq), times, rows, counts, statuses."""
+    """Results of calls of the C function: states (n, 2 nq), times, rows, counts and statuses."""
 
     x: Vector
     t: Vector
@@ -58,7 +58,7 @@ def report(check: Comparison, singular: list[State]) -> None:
 
 
 class EventRecorder:
-    """Room for the events of each in a call of C, and the number and digest of all of each."""
+    """Buffers for the events of each instance, and the number and digest of all events of each."""
 
     def __init__(self, model: Any, count: int) -> None:
         self.digests: list[list[int]] = [[0, 0] for _ in range(count)]
@@ -73,7 +73,7 @@ class EventRecorder:
         self.room = (each, *places, model._pointer(self.rows))
 
     def record(self) -> None:
-        """Those of the last call."""
+        """Add the events of the last call."""
         for k, n in enumerate(self.counts if self.room else ()):
             number, digest = self.digests[k]
             for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
@@ -82,7 +82,7 @@ class EventRecorder:
 
 
 class BatchRows:
-    """Instances beside a sampled state whose time tells steps, under its inputs, at its time."""
+    """Instances near a sampled state, with its inputs and time."""
 
     def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
         self.check, self.module, self.singular = check, module or check.module, singular
@@ -100,20 +100,20 @@ class BatchRows:
         ]  # fmt: skip
 
     def single_run(self, s: State, **span: Any) -> Any:
-        """A run of one from there."""
+        """Return the run of one instance from a state."""
         return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
     def span(self, s: State) -> float:
-        """How long some steps take; 0 where there is none."""
+        """Return the duration of some steps; 0 if there is none."""
         run = self.single_run(s, duration=self.check.system.run.duration)
         return float(run.t[min(STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
 
     def resolves_steps(self, s: State) -> bool:
-        """Whether times there tell steps."""
+        """True if times near the state are precise enough to resolve steps."""
         return resolves_steps(self.check, s, self.span(s) / STEPS)
 
     def compare_with_single_runs(self) -> float | Measurement:
-        """The ends and rows of some steps of each, beside those of its run alone."""
+        """Return the largest difference of ends and rows from those of single runs."""
         s, T = self.state, self.span(self.state)
         if not self.resolves_steps(s):
             return Measurement(math.nan, "times tell no steps")
@@ -129,7 +129,7 @@ class BatchRows:
         )
 
     def end_error(self, many: Any, k: int, times: Vector) -> float | None:
-        """How far an instance is from its run alone; None where that stops."""
+        """Return how far an instance is from its single run; None if that stops."""
         one = self.single_run(self.starts[k], times=times)
         if one.status != "ok" or len(one) < len(times):
             return None
@@ -156,27 +156,27 @@ class BatchRows:
         u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
         p = np.array([parameters(model, x) for x in starts], model.dtype)
         address, (long, integer) = model._c[0], model._whole
-        events_found = EventRecorder(model, n)
+        recorder = EventRecorder(model, n)
         for _ in range(100_000):
             remaining = model._lib.adaptive_batch(
                 n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
                 model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
-                model._pointer(rows[1]), *events_found.room, model._pointer(p), 1, memory,
+                model._pointer(rows[1]), *recorder.room, model._pointer(p), 1, memory,
                 address(long, row_counts), address(integer, status),
             )  # fmt: skip
-            events_found.record()
+            recorder.record()
             if not remaining:
                 break
         counts = [
             [m.steps, m.rejected, m.evaluations, m.stiff_steps, *digest_entry]
-            for m, digest_entry in zip(memory, events_found.digests, strict=True)
+            for m, digest_entry in zip(memory, recorder.digests, strict=True)
         ]
         return BatchResult(
             np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status
         )
 
     def differing_instances(self) -> float:
-        """How many differ in other places, in calls of one step each, or where some begin stiff."""
+        """Return the number of instances that differ in other places, calls or neighbours."""
         wrong, T = 0, self.span(self.state)
         for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
             how: Any = {"stiff": stiff, "longest": longest}
@@ -189,7 +189,7 @@ class BatchRows:
         return float(wrong)
 
     def wrong_refusals(self) -> float:
-        """How many do not say that they can't begin, or disturb those who can."""
+        """Return the number of instances that do not refuse, or that disturb others."""
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
         known = self.singular[:: max(1, len(self.singular) // FEW)]

@@ -19,13 +19,13 @@ from eomc.verify.sampling import State
 
 FEW, MAX_STEPS = 8, 40  # states; steps of a run
 PARTS = 7  # steps of a span in which one would do
-LOOSE_TOLERANCE = 1e-3  # tolerance
+COARSE_TOLERANCE = 1e-3  # tolerance
 TURNS = 1e7  # rad: sines of several angles at once come to their limit before
 
 
 @dataclass(frozen=True)
 class _RunResult:
-    """What a run of the C function left: rows (n, 2 nq), their times (n,), its place (2 nq,)."""
+    """Results of a run of the C function: rows (n, 2 nq), their times (n,), its state (2 nq,)."""
 
     status: int
     rows: Vector
@@ -34,7 +34,7 @@ class _RunResult:
 
     @property
     def refuses_cleanly(self) -> bool:
-        """Whether it refuses, and leaves only finite states."""
+        """True if the run refuses and leaves only finite states."""
         return self.status != OK and not len(self.rows)
 
 
@@ -78,7 +78,7 @@ class _Adaptive:
 
     def wrong_refusals(self) -> float:
         """From where D is singular, or numbers are none, or too large for a step."""
-        h, tol = self.check.system.run.h, LOOSE_TOLERANCE
+        h, tol = self.check.system.run.h, COARSE_TOLERANCE
         wrong = 0
         for s in self.refusals.singular[:: max(1, len(self.refusals.singular) // FEW)]:
             for stiff in (False, True):
@@ -97,7 +97,7 @@ class _Adaptive:
             for size in (TURNS, huge):
                 for stiff in (False, True):
                     far = replace(self.state, q=size * unit, qd=1.01 * size * unit)
-                    run = self.drive(far, 1.0, LOOSE_TOLERANCE, stiff=stiff)
+                    run = self.drive(far, 1.0, COARSE_TOLERANCE, stiff=stiff)
                     wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
         return wrong
 
@@ -107,14 +107,14 @@ class _Adaptive:
         return largest(errors, "time tells no parts of a first step")
 
     def step_limit_errors(self, s: State) -> float | None:
-        """What is wrong with the first step in PARTS; None where there are none."""
-        first = self.drive(s, self.check.system.run.duration, LOOSE_TOLERANCE)
+        """Return the number of errors in steps of limited length; None if not resolved."""
+        first = self.drive(s, self.check.system.run.duration, COARSE_TOLERANCE)
         later = first.times[first.times > s.t]  # the state may jump at once
         span = float(later[0]) - s.t if len(later) else 0.0
         if not resolves_steps(self.check, s, span / PARTS):
             return None
         run, cut = (
-            self.drive(s, span, LOOSE_TOLERANCE, h_most=span / PARTS, each=n)
+            self.drive(s, span, COARSE_TOLERANCE, h_most=span / PARTS, each=n)
             for n in (MAX_STEPS, 1)
         )
         sizes = np.diff(np.concatenate([[s.t], run.times]))

@@ -30,7 +30,7 @@ DRAWS = 2  # of starts that are a rounding off
 
 
 class Batches:
-    """The rows."""
+    """Rows on batches."""
 
     def __init__(self, runs: Runs, singular: list[State]) -> None:
         self.check, self.model, self.h = runs.check, runs.model, runs.h
@@ -43,7 +43,7 @@ class Batches:
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
     def report(self) -> None:
-        """Add them."""
+        """Append the rows on batches."""
         row = self.check.row
         for method in self.check.methods:
             row(f"batch of {method}", ALIKE, "units of rounding, from single runs",

@@ -49,10 +49,11 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
 
 
 def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[float]:
-    """Of lines at such rates, s: the best of them counts, as no width makes what is wrong right.
+    """Yield widths of lines for such velocities, s. The best of them counts.
 
-    First parts of the time in which a coordinate goes as far as in a motion. Where that is little,
-    as of a stiff spring, differences are rounding: so wider ones too, until one goes a unit.
+    First come fractions of the time in which a coordinate moves as far as in a motion. If that is
+    short, as with a stiff spring, differences are rounding, so wider lines follow, up to one that
+    moves by a unit. No width makes an error vanish.
     """
 
     def rate(far: Vector) -> float:
@@ -67,14 +68,14 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
 
 
 class Bodies:
-    """The rows."""
+    """Rows on bodies."""
 
     def __init__(self, check: Comparison, scene: Scene) -> None:
         self.check, self.scene = check, scene
         self.lines: dict[tuple[int, float], Line] = {}
 
     def report(self) -> None:
-        """Add them."""
+        """Append the rows on bodies."""
         limit = max(LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
@@ -199,7 +200,7 @@ class Line:
 
     @cached_property
     def formulas(self) -> Mapping[str, Formula]:
-        """Those of definitions and signals, each of which may hold the other."""
+        """Formulas of definitions and signals, which may refer to one another."""
         return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
 
     def value_of_name(self, name: str) -> Any:
@@ -209,7 +210,7 @@ class Line:
         return self.known[name]
 
     def limited(self, name: str, value: Any) -> Any:
-        """What acts of an input; all else as it is."""
+        """Return the value of a name, limited if it is an input with limits."""
         for ends in (i.limits for i in self.scene.inputs if i.name == name):
             for end, within in zip(ends, (np.maximum, np.minimum), strict=True):
                 value = value if end is None else within(value, self.evaluate(end))
@@ -247,7 +248,7 @@ class Line:
     # --- energies --------------------------------------------------------------------------------
 
     def value(self, name: str) -> float:
-        """What is compared, at the state itself."""
+        """Return the compared quantity at the state itself."""
         if name == "kinetic_energy":
             return self.at_middle(
                 self.evaluate(self.scene.kinetic) + sum(map(self.kinetic, self.bodies))
@@ -260,7 +261,7 @@ class Line:
 
     @property
     def bodies(self) -> Sequence[Body]:
-        """Those that move."""
+        """Bodies with at least one coordinate between them and the world."""
         return [b for b in self.assembly.bodies if b.name not in self.immovable_bodies()]
 
     def immovable_bodies(self) -> set[str]:
@@ -291,7 +292,7 @@ class Line:
         return masses
 
     def kinetic(self, body: Body) -> Vector:
-        """Of a body's point masses, and of the rotors at its joint."""
+        """Return the kinetic energy of a body's point masses and of the rotors at its joint."""
         frame, energy = self.frames[body.name], 0 * self.nodes
         for m, x in self.points(body):
             velocity = self.rate @ frame.point(x)
@@ -301,7 +302,7 @@ class Line:
         return energy
 
     def rates(self, body: Body) -> Iterator[Vector]:
-        """Those of the motions of a body's joint."""
+        """Yield the rates of the motions of a body's joint."""
         for formula in body.coordinates:
             yield self.rate @ (self.evaluate(formula) + 0 * self.nodes)
 
@@ -312,7 +313,7 @@ class Line:
         return energy
 
     def length(self, line: Spring | Damper) -> Vector:
-        """What a spring is stretched to, or turned."""
+        """Return the length of a spring or damper, or its angle."""
         if line.coordinate:
             return np.asarray(self.known[line.coordinate])
         assert line.bodies is not None
@@ -359,7 +360,7 @@ class Line:
         return power
 
     def unit_friction_power(self, name: str, rate: Vector, width: Formula | None) -> Vector:
-        """What friction of 1 takes, as it is smoothed, or as what may stick slides."""
+        """Return the power of unit Coulomb friction, smoothed over `width`, or sliding."""
         if name in self.slides:
             return self.slides[name] * rate
         return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate

@@ -80,7 +80,7 @@ def _values(check: Comparison, module: Any) -> float:
 
 
 class FormRows:
-    """What is measured of one form's module."""
+    """Measurements on the module of one form of C."""
 
     def __init__(self, check: Comparison, module: Any) -> None:
         self.check, self.module, self.system = check, module, check.system
@@ -102,20 +102,20 @@ class FormRows:
             )
 
             def off(width: float) -> float:
-                slopes_found = np.zeros_like(A)
+                differences = np.zeros_like(A)
                 for i in moving:
                     step = width * spread[i]
                     for field, rows in (("q", self.holonomic), ("qd", ~self.holonomic)):
                         if np.any(rows):
-                            slopes_found[rows, i] = self._slope(s, field, i, step)[rows]
-                return float(np.max(np.abs(slopes_found - A) / size))
+                            differences[rows, i] = self._slope(s, field, i, step)[rows]
+                return float(np.max(np.abs(differences - A) / size))
 
             return min(off(width) for width in (0.1, 0.03, 0.01, 0.003, 1e-3))
 
         return check.largest(error)
 
     def tangent(self) -> float:
-        """What rows and their rates change by along changes that keep them, by differences: 0."""
+        """Return the change of constraints and their rates along tangent directions, which is 0."""
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
         steps = {"q": self.check.sampler.spread, "qd": self.check.sampler.speed}
 
@@ -222,7 +222,7 @@ class FormRows:
         return float(total / np.sum(moving))
 
     def residual_along_run(self, method: str) -> float | Measurement:
-        """What rows and their rates are along a run, in units of their terms there."""
+        """Return the largest residual of constraints and their rates along a run, in units."""
         check = self.check
         errors: list[float | None] = []
         for e in check.few(3):
@@ -260,7 +260,7 @@ class FormRows:
         return residual
 
     def _reference_residual(self, name: str, s: State) -> Vector:
-        """What the reference leaves of rows near a state, in units."""
+        """Return the residual that the reference leaves near a state, in units."""
         q, qd = self.check.sampler.rounded(s)
         with np.errstate(all="ignore"):
             q, qd = self.check.reference.corrected(q, qd, s.t, s.params)
@@ -271,9 +271,9 @@ class FormRows:
         return np.asarray(np.nan_to_num(np.max(np.abs(residuals), axis=0)) / EPS)
 
     def _rate_sensitivity(self, s: State) -> Vector:
-        """What rates of rows change by with each coordinate, times how large that is.
+        """Return how rates of constraints change with each coordinate, times the coordinate's size.
 
-        A sine that is predicted is as exact as its angle, which may have gone far.
+        A predicted sine is as precise as its angle, which may be large.
         """
         total = np.zeros(len(self.system.constraints))
         for i, q in enumerate(s.q):

@@ -1,4 +1,4 @@
-"""Rows of `check` about what a module has of derivatives of its accelerations."""
+"""Rows of `check` about derivatives of the accelerations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 
 
 def report(check: Comparison) -> None:
-    """Add those that the module has: what implicit methods need, or the scene asks for."""
+    """Append the rows on derivatives that implicit methods or the scene require."""
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)
     for name in ("linearize", "sensitivity"):
         if _has(check, name):
@@ -63,7 +63,7 @@ def slopes(check: Comparison, name: str) -> float | Measurement:
 
 
 def module_derivatives(check: Comparison, name: str, s: State) -> Vector | None:
-    """What the module has of a state; None where dq/dt is not qd."""
+    """Return the module's derivatives at a state; None if dq/dt is not q̇."""
     n, arguments = len(check.system.q), {"u": s.u, "t": s.t, "params": s.params}
     if name == "sensitivity":
         return np.asarray(check.module.sensitivity(s.q, s.qd, **arguments))
@@ -85,6 +85,8 @@ def _growth(check: Comparison, name: str, e: Expected, derivatives_: Vector) -> 
     ]
     moved = sum(np.abs(x - derivatives_) for x in near if x is not None)
     sure = e.value["acceleration"]
-    lost_digits = np.abs(evaluate_module(check.module, "acceleration", e.state) - sure) / check.eps
-    parts = (moved / NUDGE, derivatives_), (lost_digits, sure)
+    cancelled_digits = (
+        np.abs(evaluate_module(check.module, "acceleration", e.state) - sure) / check.eps
+    )
+    parts = (moved / NUDGE, derivatives_), (cancelled_digits, sure)
     return float(max(np.max(x, initial=0) / (np.max(np.abs(y)) + 1e-300) for x, y in parts))

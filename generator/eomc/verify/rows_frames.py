@@ -62,7 +62,7 @@ def _inverse(check: Comparison, module: Any, e: Expected) -> float:
 
 
 class _Frames:
-    """What a module says of frames, and what the scene's tables do."""
+    """Compares frames of a module with those computed from the scene's tables."""
 
     def __init__(self, check: Comparison, module: Any, scene: Scene) -> None:
         self.check, self.module, self.scene = check, module, scene
@@ -70,7 +70,7 @@ class _Frames:
         self.plane = check.system.plane
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:
-        """Of several widths: the best counts."""
+        """Yield lines of several widths, of which the best counts."""
         for width in widths(self.check.sampler.spread, s.qd, bend):
             with np.errstate(all="ignore"):
                 yield Line(
@@ -97,7 +97,7 @@ class _Frames:
         return {"t": s.t, "params": s.params}
 
     def relevant_components(self, linear: Vector, angular: Vector) -> Vector:
-        """What counts of both in the plane, or in space."""
+        """Return the components that exist in the plane, or all in space."""
         return np.array([*linear[:2], angular[2]] if self.plane else [*linear, *angular])
 
     def poses(self, e: Expected) -> float:
@@ -123,7 +123,7 @@ class _Frames:
         return np.array([np.hstack(motion).T for motion in motions])
 
     def relevant_twists(self, twists: Vector) -> Vector:
-        """What counts of them."""
+        """Return the relevant components of twists."""
         return np.array([self.relevant_components(x[:3], x[3:]) for x in twists])
 
     def velocities(self, e: Expected) -> float:
@@ -143,7 +143,7 @@ class _Frames:
         return float(np.max(J @ rates, initial=0))
 
     def accelerations(self, e: Expected) -> float:
-        """Their rates, at the accelerations of the motion."""
+        """Return the error of accelerations of frames, at the accelerations of the motion."""
         s, qdd = e.state, e.value["acceleration"]
         rates = self.module.frame_acceleration(s.q, s.qd, qdd, **self.arguments(s))
 
@@ -182,7 +182,7 @@ class _Frames:
         return float(np.max(off) / (np.max(size) or 1.0))
 
     def momentum(self, e: Expected) -> float:
-        """Of point masses: their sum, its centre, momentum and that about the centre."""
+        """Return the error of mass, centre, momentum and angular momentum, from point masses."""
         s = e.state
         m = self.module.momentum(s.q, s.qd, **self.arguments(s))
         momentum = np.hstack([m.mass, m.center, m.linear, m.angular])

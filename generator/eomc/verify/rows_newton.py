@@ -75,7 +75,7 @@ def report(check: Comparison) -> None:
 
 
 class Newton:
-    """What the rows compare."""
+    """Compares Newton's method of the module with that of the reference."""
 
     def __init__(self, check: Comparison) -> None:
         self.check = check
@@ -91,9 +91,10 @@ class Newton:
         return float(np.max(known)) if known else Measurement(math.nan, "no stiff motion is linear")
 
     def sweeps(self, method: str, place: _Equilibrium, h: float) -> float | None:
-        """The same for one step size; None where the reference's motion is not linear.
+        """Return the additional sweeps for one step size; None if the motion is not linear.
 
-        And where plain sweeps get there, if slowly: the module may leave it at these.
+        None also if plain fixed-point iteration converges, however slowly, since the module may use
+        it.
         """
         m, s = METHODS[method], place.start
         if one_step.contraction_factor(m, place.slopes, h) < MAX_PLAIN_CONTRACTION:

@@ -63,7 +63,7 @@ def _values(check: Comparison, module: Any, formulas: Formulas) -> float:
 def compare_outputs(
     check: Comparison, module: Any, formulas: Formulas, function: Callable[[State], Vector]
 ) -> float:
-    """What a function of the module's finds at some states beside formulas, in units."""
+    """Return the largest error of a function of the module relative to formulas, in units."""
 
     def error(e: Expected) -> float:
         s = _with_fixed_inputs(check, module, e.state)
@@ -157,7 +157,7 @@ class Formulas:
 
     @cached_property
     def multipliers(self) -> tuple[Symbol, ...]:
-        """Those of all constraints, where an output reads one."""
+        """Multipliers of all constraints, if an output uses one."""
         read = {x for o in self.system.outputs for x in o.formula.free_symbols}
         multipliers = tuple(c.multiplier for c in self.system.constraints)
         return multipliers if read & {*multipliers} else ()
@@ -229,7 +229,7 @@ def _real(motion: _Motion, formula: Expr) -> Any:
 
 
 class _Motion:
-    """What formulas are near one state, as functions of the time since then."""
+    """Values of formulas near one state, as functions of time."""
 
     def __init__(self, formulas: Formulas, symbol_values: Mapping[Symbol, Any]) -> None:
         self.formulas, self.symbol_values, system = formulas, symbol_values, formulas.system
@@ -238,14 +238,14 @@ class _Motion:
         self.known: dict[tuple[Symbol, Any], Any] = {}
 
     def value(self, e: Expr, time: Any) -> Any:
-        """Of a formula."""
+        """Return the value of a formula."""
         f, symbols, rates = self.formulas.compiled(e)
         ends = [[self.value(x, time + h) for h in (WIDTH, -WIDTH)] for x in rates]
         slopes = ((a - b) / (2 * WIDTH) for a, b in ends)
         return f(*(self.symbol(x, time) for x in symbols), *slopes)
 
     def symbol(self, x: Symbol, time: Any) -> Any:
-        """Of a name."""
+        """Return the value of a name."""
         if (x, time) not in self.known:
             if x in self.definitions:
                 value = self.value(self.definitions[x], time)

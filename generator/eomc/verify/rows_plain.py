@@ -143,9 +143,9 @@ def _least_off(check: Comparison, plain: Any, method: str, e: Expected) -> float
 
 
 def _run_off(check: Comparison, plain: Any, method: str, e: Expected, h: float) -> float | None:
-    """The same in steps of h.
+    """Return the difference of runs of both forms in steps of h.
 
-    Raises RuntimeError where one form ends before the other though the step can be made.
+    Raises RuntimeError if one form ends before the other although the step can be made.
     """
     s, spread = e.state, check.sampler.scale
 

@@ -29,7 +29,7 @@ MIXED = 60  # changes of all parameters at random
 SINGLE_SIGN_CHANGES = 8  # changes of all at random, of which one alone is negative
 SPREAD = 3.0  # of their logarithms
 MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
-LOST_DIGITS = (
+PRECISION_LOSS = (
     1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
 )
 ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
@@ -50,7 +50,7 @@ def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
 
 
 class Refusals:
-    """The rows."""
+    """Rows on refusals."""
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.module, self.model = check, check.module, check.module._model
@@ -60,7 +60,7 @@ class Refusals:
         self.regular: list[State] = []
 
     def report(self) -> None:
-        """Add them."""
+        """Append the rows on refusals."""
         row = self.check.row
         if self.check.system.constraints:
             self.report_constrained()
@@ -105,7 +105,7 @@ class Refusals:
                 if self.accelerate(s)[0] == SINGULAR:
                     self.singular.append(s)
                 else:
-                    wrong += not self.digits_lost(s, D)
+                    wrong += not self.lacks_precision(s, D)
         return float(wrong)
 
     def definite(self) -> float:
@@ -131,7 +131,7 @@ class Refusals:
             if (self.accelerate(s)[0] == SINGULAR) == singular:
                 (self.singular if singular else self.regular).append(s)
             elif singular or (self.natural(s) and self.exact(s)):
-                wrong += not self.digits_lost(s, D)
+                wrong += not self.lacks_precision(s, D)
         return float(wrong)
 
     def exact(self, s: State) -> bool:
@@ -150,11 +150,11 @@ class Refusals:
         pairs = [(x, self.defaults[name]) for name, x in (s.params or {}).items()]
         return all(x * default > 0 or default == 0 for x, default in pairs)
 
-    def digits_lost(self, s: State, D: Vector) -> bool:
+    def lacks_precision(self, s: State, D: Vector) -> bool:
         """Whether the module's own D has lost the digits that decide, as where lengths are huge."""
         size = np.sqrt(np.abs(np.diag(D)))
         off = np.abs(self.check.ask("D", s) - D)
-        return bool(np.any(off > LOST_DIGITS * np.outer(size, size)))
+        return bool(np.any(off > PRECISION_LOSS * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
         """The start and some other states with parameters changed in every way."""
@@ -205,7 +205,7 @@ class Refusals:
         return status, clean
 
     def refuse(self) -> float:
-        """How many calls at singular states do not refuse, or write all the same."""
+        """Return the number of calls that return OK at a singular state, or write to outputs."""
         wrong, run = 0, self.check.system.run
         solved = ("acceleration", "multipliers")[: 1 + bool(self.check.system.constraints)]
         for s in self.singular[:: max(1, len(self.singular) // 24)]:

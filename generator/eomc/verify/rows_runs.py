@@ -53,14 +53,14 @@ ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run by the C function gave: rows (2, n, nq), how many steps, and the status."""
+    """Result of a run of the C function: rows (2, n, nq), number of steps, status."""
 
     rows: Vector
     steps: int
     status: int
 
     def is_identical(self, other: RunResult) -> bool:
-        """To the last bit; a number that is not one is the same as another."""
+        """True if all bits agree; nan equals nan."""
         return (
             self.steps == other.steps
             and self.status == other.status
@@ -120,7 +120,7 @@ def _reads_time(system: System) -> bool:
 
 
 class Runs:
-    """The rows."""
+    """Rows on runs."""
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.model = check, check.module._model
@@ -141,7 +141,7 @@ class Runs:
             return self.sampler.expected(s)
 
     def report(self) -> None:
-        """Add them."""
+        """Append the rows on runs."""
         row, rounding = self.check.row, "units of rounding"
         if self.check.methods[0] == "rk4":
             unit = rounding + ", times steps and growth"
@@ -236,9 +236,11 @@ class Runs:
         """The reference's D, g and bias at states that differ in q alone."""
         s, ask = states[0], self.sampler.reference.evaluate
         q, qd = (np.array([getattr(at, x) for at in states]) for x in ("q", "qd"))
-        values_found = {name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")}
+        values_by_name = {
+            name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")
+        }
         return [
-            {name: values[k] for name, values in values_found.items()} for k in range(len(states))
+            {name: values[k] for name, values in values_by_name.items()} for k in range(len(states))
         ]
 
     def far(self) -> float:
@@ -420,7 +422,7 @@ class Runs:
         return min(errors)
 
     def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
-        """The same with h in so many parts."""
+        """Return the median difference of runs with h divided by two numbers of parts, in units."""
         errors, T = [], 2 * self.h
         for e in states:
             s, gain = replace(e.state, u=None), T * e.size["acceleration"]

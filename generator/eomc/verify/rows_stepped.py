@@ -45,7 +45,7 @@ def _worst(check: Comparison, module: Any, method: str) -> float | Measurement:
 
 
 def _error(check: Comparison, module: Any, method: str, s: State) -> float | None:
-    """Of a run from one state; inf where an event is missing."""
+    """Return the largest error of a run from one state; inf if an event is missing."""
     run = simulate(module, s, t0=s.t, h=check.system.run.h, steps=STEPS, method=method)
     if len(run) < 2:
         return None
@@ -70,9 +70,9 @@ def _error(check: Comparison, module: Any, method: str, s: State) -> float | Non
 
 
 def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
-    """Of each row and each event the row before it, its time and state.
+    """Yield for each row and event the index of the previous row, its time and its state.
 
-    The state behind a jump at the start is in no row, nor that between jumps at one time.
+    The states at the start before a jump, and between jumps at one time, are in no row.
     """
     _, recorded = run._happened
     first = int(len(recorded) > 0 and recorded[0, 0] <= run.t[0])

@@ -248,7 +248,7 @@ class Sampler:
         return [e for state in states if (e := self.regular_expected(self.project(state)))]
 
     def far_states(self) -> list[Expected]:
-        """A state FARTHER times as far from the start as the others; none where it is no state."""
+        """Return a state FAR_FACTOR times as far from the start, or none if it is invalid."""
         drawn = [self.draw(FAR_FACTOR, True, False) for _ in range(4)]
         state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
         expected = self.regular_expected(state)
@@ -281,7 +281,7 @@ class Sampler:
         return state
 
     def with_discrete_parameters(self, s: State) -> State:
-        """The state with parameters that jumps set among the others, as the scene has them."""
+        """Return the state with discrete variables among the parameters, as in the scene."""
         if not self.discrete:
             return s
         values = {self.system.coordinates[k].name: float(s.q[k]) for k in self.discrete}
@@ -293,9 +293,9 @@ class Sampler:
         return value * math.exp(by) if value else math.exp(by) - 0.5
 
     def _choose_modes(self, q: Vector, qd: Vector) -> None:
-        """Of friction that sticks, modes as velocities say; in some states some are made 0.
+        """Set the modes of stick-slip friction by the velocities; in some states, some stick.
 
-        Some freedom is left.
+        At least one freedom remains.
         """
         if self.system.modes and self.system.closure:
             freedoms_left = self.system.closure.freedoms - 1
@@ -333,7 +333,7 @@ class Sampler:
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
     def rows(self, name: str, s: State) -> Vector:
-        """Of the constraints that are solved for."""
+        """Return values of the constraints that are solved for."""
         values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
         return np.asarray(self.reference.solved @ values)
 
@@ -416,7 +416,7 @@ class Sampler:
         scale = kkt.scales(value["D"], value["constraint_jacobian"])
 
         def row_size(x: Vector) -> Vector:
-            """Of each row what x makes, were its largest part along that row."""
+            """Return the effect on each constraint of x as if its largest part were along it."""
             return np.asarray(A @ np.abs(x) + np.max(np.abs(x) / scale[:n]) / scale[n:])
 
         # an entry may be a sum that cancels, of terms that others of its row have whole

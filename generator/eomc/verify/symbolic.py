@@ -104,7 +104,7 @@ def derive(system: System) -> SymbolicReference:
 def _constraint_expressions(
     system: System, expand: Callable[[Expr], Expr]
 ) -> tuple[ImmutableMatrix, ImmutableMatrix, ImmutableMatrix, ImmutableMatrix]:
-    """Of the constraints: what is zero, A, its rates without qdd, and gamma."""
+    """Return zero, A, the rates without q̈, and gamma of the constraints."""
     q, qd, m = system.q, ImmutableMatrix(system.qd), len(system.constraints)
     zero = ImmutableMatrix(m, 1, [expand(c.formula) for c in system.constraints])
     n = sum(c.holonomic for c in system.constraints)
@@ -121,7 +121,7 @@ def _constraint_expressions(
 
 
 def without_definitions(system: System) -> System:
-    """The same system without definitions, its energies in short forms: quick to derive from."""
+    """Return the system with definitions substituted and energies simplified."""
     expand = _expander(system)
     names = ("kinetic", "potential", "linear_potential", "dissipation")
     energies = {name: simplify_by_rates(expand(getattr(system, name)), system.qd) for name in names}
@@ -135,9 +135,9 @@ def without_definitions(system: System) -> System:
 
 
 def reference_for(system: System) -> Reference:
-    """The independent answer: written out where that is small, else by Taylor arithmetic.
+    """Return the reference: symbolic if that is small, else by Taylor arithmetic.
 
-    Raises EomcError as `derive` and `Jets` do.
+    Raises EomcError as `derive` and `TaylorReference` do.
     """
     if system.discrete:
         return DiscreteReference(system, reference_for(constant(system)))

@@ -186,7 +186,7 @@ class TaylorReference(Reference):
         return np.array(result[:, 0] if name in SCALARS else result)
 
     def _rows_of(self, name: str, jets: Mapping[int, Jet], state: Point) -> Vector:
-        """What is asked of the constraints: (b, m), or (b, m, nq) the Jacobian A."""
+        """Return values of the constraints: (b, m), or (b, m, nq) for the Jacobian A."""
         b, nq = state.q.shape
 
         def part(index: int, field: str, *shape: int) -> Vector:

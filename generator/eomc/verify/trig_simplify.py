@@ -1,8 +1,8 @@
-"""Shorter forms of expressions, for people to read: polynomials in sines, cosines and rates.
+"""Shorten expressions for reading: polynomials in sines, cosines and velocities.
 
-SymPy's `trigsimp` takes minutes where expressions are long. Those of mechanics are polynomials in
-velocities, whose coefficients are polynomials in sines and cosines: each coefficient is written in
-a few forms, and the shortest is taken.
+SymPy's `trigsimp` takes minutes for long expressions. Expressions of mechanics are polynomials in
+velocities whose coefficients are polynomials in sines and cosines: each coefficient is written in a
+few forms, and the shortest is taken.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the gene
 
 
 def simplify_trig(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
-    """An equal form of `e` of as few operations, coefficients of the rates by themselves.
+    """Return an equal form of `e` with few operations, by coefficients of the velocities.
 
-    Exact. What is no polynomial in its parts stays as it is.
+    Exact. Parts that are not polynomial stay unchanged.
     """
     e = sympy.sympify(e)
     return min((e, simplify_by_rates(e, rates)), key=lambda form: form.count_ops())
@@ -47,10 +47,10 @@ def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | 
         polynomial = sympy.Poly(e, *rates)
     except PolynomialError:
         return None
-    terms_found = [(m, _coefficient(c)) for m, c in polynomial.terms()]
+    pairs = [(m, _coefficient(c)) for m, c in polynomial.terms()]
     return [
         (sympy.Mul(*(r**k for r, k in zip(rates, powers, strict=True))), c)
-        for powers, c in terms_found
+        for powers, c in pairs
         if c != 0
     ]
 
@@ -140,7 +140,7 @@ def _reduced(polynomial: PolyElement, angles: _Angles) -> list[PolyElement]:
 
 
 def _grouped(polynomial: PolyElement) -> Expr:
-    """Its terms gathered by their sines and cosines."""
+    """Return the polynomial grouped by its sines and cosines."""
     ring = polynomial.ring
     groups: dict[Expr, list[Expr]] = {}
     for powers, c in polynomial.terms():
@@ -220,7 +220,7 @@ def _times(wave: Expr, f: Expr) -> list[tuple[Expr, Expr]]:
 
 
 def _double_angles_as_squares(e: Expr) -> list[Expr]:
-    """Of a sum of waves: those of double angles as squares, by cos 2a = 1 - 2 sin^2 a."""
+    """Return forms of a sum of waves with cos 2a written as 1 - 2 sin² a or 2 cos² a - 1."""
     doubled = {f: f.args[0] / 2 for f in e.atoms(sin, cos) if f.args[0].as_coeff_Mul()[0] == 2}
     if not doubled:
         return []
