@@ -55,6 +55,7 @@ def test_columns_have_the_names_of_the_scene(driven: ModuleType, run: Any) -> No
         assert np.array_equal(column, run[name]) and column.shape == (5,), name
     assert np.array_equal(run["t"], run.t) and np.array_equal(run["energy"], run.energy)
     assert {"theta", "force", "q"} <= set(dir(run))
+    assert len(dir(run)) == len({*dir(run)})  # a property and a column may share a name
 
 
 def test_a_member_hides_a_coordinate_but_not_its_column(everything: ModuleType) -> None:

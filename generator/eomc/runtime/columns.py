@@ -75,7 +75,7 @@ class Columns:
         return named[name]()
 
     def __dir__(self) -> Iterable[str]:
-        return [*super().__dir__(), *self._named()]
+        return {*super().__dir__(), *self._named()}
 
     @property
     def params(self) -> dict[str, Any]:
