@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from sympy import Expr, Integer, Symbol, cosh, log, sinh, sqrt, tanh
+from sympy import Expr, Integer, Max, S, Symbol, cosh, log, sinh, sqrt, symbols, tanh
 
-from eomc.derive.tape import Stage, Tape
+from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 
 x, a = Symbol("x", real=True), Symbol("a", real=True)
 
@@ -49,3 +49,13 @@ def test_sums_of_leaves_are_written_out_where_terms_cancel() -> None:
     assert tape.total([2 * b1, tape.scaled(Integer(2), apart)]) == 2 * b2
     assert set(tape.rhs(tape.total([b1, both])).args) == {b1, both}
     assert tape.define(3 + b1 + apart - b2) == 3
+
+
+def test_derivatives_along_names_that_do_not_vary_are_not_needed() -> None:
+    """The slope of max(a, b) jumps, which does not matter where a and b are held constant."""
+    a, b, v = symbols("a b v", real=True)
+    tape = Tape(dict.fromkeys((a, b), Stage.POSITION) | {v: Stage.VELOCITY})
+    slope = tape.forward([tape.define(Max(a, b) * v**2)], {a: S.One})[0]
+    assert tape.forward([slope], {v: S.One})[0] != 0
+    with pytest.raises(NotDifferentiableError):
+        tape.forward([slope], {a: S.One})

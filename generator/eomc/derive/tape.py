@@ -8,7 +8,7 @@ Derivatives*, 2nd ed., ch. 3). Equal expressions get the same name, so nothing i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -444,7 +444,7 @@ class Tape:
         for symbol in self.live(outputs):
             terms = [
                 self.times(slope, tangent[part])
-                for slope, part in self._slopes(symbol, least)
+                for slope, part in self._slopes(symbol, least, tangent.__contains__)
                 if part in tangent
             ]
             if terms and (sum_ := self.total(terms)) != 0:
@@ -476,18 +476,29 @@ class Tape:
             if symbol in stop or symbol not in terms:
                 continue
             adjoint = self.total(terms[symbol])
-            for slope, part in self._slopes(symbol, least):
-                if part not in self.constant_leaves:
+            for slope, part in self._slopes(symbol, least, self._varies):
+                if self._varies(part):
                     terms.setdefault(part, []).append(self.times(slope, adjoint))
         gradient = (self.total(() if x in self.constant_leaves else terms.get(x, ())) for x in wrt)
         return [self._overflowing(x, least) for x in gradient]
 
-    def _slopes(self, symbol: Symbol, least: Expr | None) -> Iterator[tuple[Expr, Symbol]]:
-        """Yield the partial derivatives of a definition, each with the name that it belongs to."""
+    def _varies(self, name: Symbol) -> bool:
+        """Return True if derivatives are taken along the name."""
+        return name not in self.constant_leaves
+
+    def _slopes(
+        self, symbol: Symbol, least: Expr | None, varies: Callable[[Symbol], bool]
+    ) -> Iterator[tuple[Expr, Symbol]]:
+        """Yield the partial derivatives of a definition, each with the name that it belongs to.
+
+        Those along names that do not vary are not computed: they may not exist, as where a function
+        jumps.
+        """
         for part in self.parts[symbol]:
             root = None if least is None else self._root_slope(symbol, part, least)
             if root is None:
-                yield self.partial(symbol, part), part
+                if varies(part):
+                    yield self.partial(symbol, part), part
                 continue
             yield root.slope, root.along
             for leaf in root.leaves:
