@@ -1,14 +1,24 @@
-"""Which angles a self-test takes: those in which reduction by pi/2 shows."""
+"""The self-test in C: every function and method is tested, and seeded faults are found."""
 
 from __future__ import annotations
 
 import math
+import re
+import subprocess
 from fractions import Fraction
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from compilers import compiled
+from conftest import needs, tiers
 
+import eomc
 from eomc.emit.selftest import _lost
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
+from eomc.toolchain.running import lay_out
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
@@ -24,3 +34,137 @@ def test_what_a_multiple_of_half_pi_loses(real: type) -> None:
         assert _lost(n * math.pi / 2 - 0.3, double) == float(lost)
         found.append(lost / Fraction(float(np.spacing(product))))
     assert 0.4 < max(found) <= 0.5
+
+
+BALL = """eomc = 1
+name = "ball"
+[coordinates]
+y = { start = 1.0 }
+z = { start = 0.2 }
+[parameters]
+e = 0.8
+k = 1.5
+[inputs]
+force = { signal = "0.5*sin(2*t)", limits = [-2, 3] }
+[energy]
+kinetic = "y_dot**2/2 + (2 + cos(z))*z_dot**2/2"
+potential = "9.81*y + k*z**2/2 + y*z"
+[forces]
+y = "-0.2*y_dot - z_dot*y_dot/9"
+z = "force - 0.3*z_dot"
+[outputs]
+height = "2*y + z_dot"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot"
+[[event]]
+name = "turn"
+when = "z_dot - 0.3*z"
+direction = "rising"
+[run]
+REAL
+h = 0.01
+method = ["rk4", "dp8", "gauss4", "gauss16", "euler"]
+linearize = true
+discretize = true
+"""
+
+
+@cache
+def sources(real: str) -> dict[str, str]:
+    """The C of the ball by file."""
+    text = BALL.replace("REAL", f'real = "{real}"')
+    return dict(eomc.sources(system.from_scene(scene.parse(text, "ball.toml"))).files)
+
+
+def outcome(folder: Path, form: str, *flags: str) -> tuple[int, str]:
+    """Status and words of the self-test of the C in a folder."""
+    at = "." if form == "plain" else "fast"
+    files = ["selftest.c", f"{at}/ball.c", "-lm", "-o", "selftest"]
+    compiled(needs("cc"), "-std=gnu99", *flags, f"-I{at}", *files, cwd=folder)
+    done = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
+    return done.returncode, done.stdout
+
+
+def write(folder: Path, real: str = "double") -> None:
+    """The C of the ball in a folder."""
+    lay_out({n: x for n, x in sources(real).items() if n.endswith((".c", ".h"))}, folder)
+
+
+EVERY = """D C g bias tau kinetic_energy potential_energy energy power outputs output_slopes events
+jumps applied signal acceleration linearization adaptive rk4_step rk4_run rk4_derivative dp8_step
+dp8_run dp8_derivative gauss4_step gauss4_run gauss4_derivative gauss16_step gauss16_run
+gauss16_derivative euler_step euler_run euler_derivative""".split()
+
+
+@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
+def test_every_function_of_the_header_has_cases(real: str) -> None:
+    """Several each; events are run over in both directions."""
+    rows = re.findall(r'^    \{ "(\w+)", test_(\w+),', sources(real)["selftest.c"], re.M)
+    counts = {name: sum(row[0] == name for row in rows) for name in EVERY}
+    assert {row[0] for row in rows} == {*EVERY} and min(counts.values()) >= 2, counts
+    header = set(re.findall(r"\bball_(\w+)\(", sources(real)["ball.h"]))
+    assert header - {*EVERY} == {"gauss16_adaptive", "fixed_step"}
+    assert counts["adaptive"] >= 6
+
+
+@pytest.mark.parametrize(
+    ("form", "real", "flags"),
+    tiers(
+        [(f, r, x) for f in ("plain", "fast") for r in ("double", "float")
+         for x in ("-O0", "-O3 -march=native")],
+        ("plain", "double", "-O0"),
+    ),
+)  # fmt: skip
+def test_it_passes(form: str, real: str, flags: str, tmp_path: Path) -> None:
+    write(tmp_path, real)
+    status, words = outcome(tmp_path, form, *flags.split())
+    assert status == 0 and re.fullmatch(r"ball: right in \d+ cases\n", words), words
+
+
+# of each a function of the C, a pattern in it and what stands in its place
+FAULTS = {
+    "a stage of rk4": ("rk4_step", r"h/2", "h/3"),
+    "a weight of rk4": ("rk4_step", r"2\*\(a2", "3*(a2"),
+    "a coefficient of dp8": ("dp8_step", r"0\.0197250569", "0.0198250569"),
+    "a coefficient of euler": ("euler_step", r"bA\[S\] = \{ 1\.0", "bA[S] = { 0.5"),
+    "the sign of an output": ("outputs", r"2\.0\*y", "-2.0*y"),
+    "a term of an energy": ("potential_energy", r"4\.9|9\.81", "9.9"),
+    "the frequency of a signal": ("signal", r"sin\(", "sin(1.1*"),
+    "a limit": ("applied", r"fmin\(3\.0", "fmin(2.9"),
+    "a jump": ("jumps", r"after\[2\] = ([^;]*);", r"after[2] = 0.9*(\1);"),
+    "a linearization": ("slopes", r"slopes\[2\] = -\(0\.2", "slopes[2] = -(0.3"),
+}
+TABLES = {
+    "a direction": (r"(directions|direction)\[[^]]*\] = \{ -1", r"\1[BALL_NE] = { 1"),
+    "a coefficient of gauss4": (r"0\.5386751345948129", "0.54"),
+    "a coefficient of gauss16": (r"(_A\[8\]\[8\] = \{\n    \{ )0\.0253071", r"\g<1>0.0263071"),
+}
+
+
+def seeded(name: str, source: str) -> str:
+    """The source with a fault."""
+    if name in TABLES:
+        changed = re.sub(TABLES[name][0], TABLES[name][1], source)
+    else:
+        function, pattern, instead = FAULTS[name]
+        body = re.search(
+            rf"^[^\n;]*\bball_{function}\([^;{{]*\)\n\{{\n.*?^\}}", source, re.M | re.S
+        )
+        assert body, name
+        changed = source.replace(body[0], re.sub(pattern, instead, body[0], count=1))
+    assert changed != source, name
+    return changed
+
+
+@pytest.mark.parametrize(
+    "name", tiers([*FAULTS, *TABLES], "a stage of rk4", "a jump", "a direction")
+)
+def test_a_fault_in_the_c_is_found(name: str, tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "ball.c").write_text(seeded(name, sources("double")["ball.c"]), encoding="utf-8")
+    status, words = outcome(tmp_path, "plain", "-O0")
+    assert status == 1 and re.search(r"is off by|has status", words), words

@@ -1,120 +1,754 @@
-"""The states of selftest.c, and what the program gives there, computed in Python."""
+"""The cases of selftest.c: what each function of the header gives, computed in Python.
+
+Functions are evaluated by `program.interpret`, steps by their tableaux on accelerations from there,
+jumps and events from states that lie on an event. Nothing of it runs the C or shares its text.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cache, cached_property, partial
 from itertools import chain, islice
+from typing import Any
 
 from eomc.base.texts import FreeText
+from eomc.emit import adaptive
 from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_function import CFunction, member
 from eomc.emit.c_names import Target
+from eomc.emit.evaluations import KINDS, refuses
 from eomc.emit.heading import stamp
 from eomc.emit.public import Public
-from eomc.emit.views import SelfTest, State
-from eomc.program.interpret import evaluate, nearby
-from eomc.program.program import matrix
+from eomc.emit.views import Case, SelfTest, State, Tested
+from eomc.integrators.tableaux import DP8, METHODS, Method
+from eomc.model.symbols import ALONG
+from eomc.program.interpret import evaluator, nearby
+from eomc.program.outline import weight
+from eomc.program.program import TIME
 from eomc.program.trig import apart
 
 # by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
 LIMIT = {True: 2.0**20, False: 2.0**13}
-USUAL = {True: 1e-9, False: 1e-3}  # what may be off, of the largest entry
-# the same where angles are large: sines are off by more where a multiply-add rounds twice
+# what is allowed beside what nudges of the arguments by an ulp bring, of the largest entry: some
+# thousand units of rounding, for libraries and orders of summation
+ROUNDING = {True: 1e-12, False: 1e-4}
+UNITS = 1000  # of a nudge by one ulp, as `eomc check` allows
+# a case that allows more than this says too little
+LOOSEST = {True: 1e-6, False: 1e-2}
+# where angles are large: sines are off by more where a multiply-add rounds twice
 LARGE = {True: 1e-12, False: 1e-5}
-STATES = 3  # near the start, and as many with large angles
+USUAL = {True: 1e-9, False: 1e-3}  # of accelerations where angles are large
+# what projections, differences and sums over steps may leave
+ITERATED = {True: 1e-11, False: 1e-3}
+# what the iteration of implicit methods may leave, and sweeps of a fixed number
+IMPLICIT = {True: 1e-9, False: 1e-3}
+SWEPT = {True: 1e-6, False: 1e-3}
+FAR = 3  # states with large angles
 GRID = 16  # large angles are multiples of 1/GRID: so are their sums and multiples, exactly
+STEPS = 3  # of a run
+GROWTH = 30  # of a state in them: beyond it steps are too long, and rounding grows as well
+SWEEPS = 60  # over the stages of an implicit method
+LONGEST = 4000  # operations of accelerations: of more there are few cases, explicit steps only
+START = 0.4  # s, the time of the first state: signals are not at their start
+# central differences of order 8: at which multiples of a width, and their weights
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+
+Vector = list[float]
+Values = dict[str, float]
+Happening = tuple[float, int]  # when, and which event
+
+
+class NoCaseError(Exception):
+    """There is no value to compare with: no accelerations, no convergence, nothing but rounding."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Arguments of a call: values by name, whether signals act, which parameters, a span in s."""
+
+    values: Mapping[str, float]
+    signals: bool = True
+    other: bool = False
+    span: float = 0.0
 
 
 def view(target: Target) -> SelfTest:
     """The view of selftest.c."""
-    double, public = target.real is DOUBLE, Public(target)
-    around = [nearby(target.system, k) for k in range(6)]
-    telling = [x for x in around if _telling(target, x)] or around
-    near = (_state(target, x, 0.0) for x in telling)
-    states = list(islice(filter(None, near), STATES))
-    far = (_state(target, x, LARGE[double]) for x in _large(target))
-    large = list(islice(filter(None, far), STATES))
-    now = {"t": target.zero, "u": "NULL", "p": f"&{target.prefix}_defaults"}
-    constrained = {
-        name: public.evaluation(name).call(**now)
-        for name in ("constraint_jacobian", "multipliers")
-        if name in target.program
-    }
+    made = _Made(target)
+    double = target.real is DOUBLE
+    tested = tuple(t for t in made.tested() if t.cases)
     return SelfTest(
         title=FreeText(target.system.title),
         stamp=tuple(stamp(target)),
         prefix=target.prefix,
         PREFIX=target.PREFIX,
         real=target.real.name,
-        states=(*states, *large),
-        tolerance=USUAL[double],
-        large_tolerance=LARGE[double] if large else 0,
+        states=tuple(made.state(p) for p in made.points),
+        other=tuple(target.literal(p.value) for p in made.other) if made.uses_other else (),
+        has_p=target.needs_p,
+        arrays=made.arrays,
+        tested=tested,
+        events=bool(target.system.events),
+        inputs=bool(target.system.inputs),
+        most=max(len(case.expected) for t in tested for case in t.cases),
         large_limit="2^20" if double else "2^13",
-        D=public.evaluation("D").call(**now),
-        bias=public.evaluation("bias").call(**now),
-        tau=public.evaluation("tau").call(**now) if "tau" in target.program else "",
-        acceleration=public.acceleration.call(**now),
-        jacobian=constrained.get("constraint_jacobian", ""),
-        multipliers=constrained.get("multipliers", ""),
+        large=made.has_large,
     )
 
 
-def _state(target: Target, x: Mapping[str, float], close: float) -> State | None:
-    """One state as literals; None where it has no accelerations, or where angles are large
-    (`close` > 0) and numbers are too short to judge D and bias as closely as that.
-    """
-    s, program = target.system, target.program
-    try:
-        known = _known(target, x)
-        unit = 2.0**-52 if target.real is DOUBLE else 2.0**-20  # eight times a float's
-        qdd, regular = evaluate(program["acceleration"], known, unit=unit)
-        if not regular or max(map(abs, qdd)) >= 1e8:
+class _Made:
+    """The cases of one program; states are numbered as cases need them."""
+
+    def __init__(self, target: Target) -> None:
+        self.target, self.public = target, Public(target)
+        self.program, self.system = target.program, target.system
+        self.double = target.real is DOUBLE
+        self.points: list[Point] = []
+        self.has_large = self.uses_other = False
+        self.known: dict[str, Callable[[Mapping[str, float]], tuple[Vector, bool]]] = {}
+
+    # values in Python
+
+    def evaluate(self, name: str, values: Mapping[str, float]) -> Vector:
+        """A function of the program. Raises NoCaseError where it has no finite, regular value."""
+        try:
+            found, regular = self.evaluator(name)(values)
+        except (ArithmeticError, ValueError):
+            raise NoCaseError from None
+        if not regular:
+            raise NoCaseError
+        return found
+
+    def evaluator(self, name: str) -> Callable[[Mapping[str, float]], tuple[Vector, bool]]:
+        """One of them, its numbers converted once."""
+        if name not in self.known:
+            unit = 2.0**-52 if self.double else 2.0**-20  # eight times a float's
+            self.known[name] = evaluator(self.program[name], unit=unit)
+        return self.known[name]
+
+    def value(self, name: str, point: Point) -> Vector:
+        """What a function of the header writes; inputs are the signals where these act."""
+        values = self.complete(point)
+        if name in self.program:
+            return self.ordered(name, self.evaluate(name, values))
+        if f"{name}_column" in self.program:
+            return self.by_columns(name, values)
+        if name == "energy":
+            parts = (self.evaluate(f"{n}_energy", values)[0] for n in ("kinetic", "potential"))
+            return [sum(parts)]
+        raise NoCaseError
+
+    def ordered(self, name: str, found: Vector) -> Vector:
+        """The matrices of the linearization one behind the other, as the header has them."""
+        if name != "linearization":
+            return found
+        return self.split([found[k : k + self.width] for k in range(0, len(found), self.width)])
+
+    def split(self, rows: Sequence[Sequence[float]]) -> Vector:
+        """Rows of A_q, A_qd and B behind one another."""
+        n = self.nq
+        parts = ((0, n), (n, 2 * n), (2 * n, self.width))
+        return [x for a, b in parts for row in rows for x in row[a:b]]
+
+    def by_columns(self, name: str, values: Mapping[str, float]) -> Vector:
+        """A matrix by its columns, the matrix times each unit vector."""
+        names = [x.name for x in (*self.system.q, *self.system.qd, *self.system.u)]
+        zero = {f"{n}{ALONG}": 0.0 for n in names}
+        own = names if name == "linearization" else names[: self.nq]
+        columns = [
+            self.evaluate(f"{name}_column", {**values, **zero, f"{n}{ALONG}": 1.0}) for n in own
+        ]
+        rows = [list(row) for row in zip(*columns, strict=True)]
+        return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
+
+    def complete(self, point: Point) -> Values:
+        """All values at a point, the signals' among them where these act."""
+        values = dict(point.values)
+        if point.signals and "signal" in self.program:
+            u = self.evaluate("signal", values)
+            values |= {i.name: x for i, x in zip(self.system.inputs, u, strict=True)}
+        return values
+
+    @property
+    def nq(self) -> int:
+        """The number of coordinates."""
+        return len(self.system.q)
+
+    @property
+    def width(self) -> int:
+        """Columns of the linearization."""
+        return 2 * self.nq + len(self.system.inputs)
+
+    # steps in Python
+
+    def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
+        """qdd at a state x = [q; qd] and a time; what else it reads is that of a point."""
+        return self.evaluate("acceleration", self.complete(self.at(point, x, t)))
+
+    def at(self, point: Point, x: Vector, t: float) -> Point:
+        """A point with another state and time."""
+        names = (s.name for s in (*self.system.q, *self.system.qd))
+        values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
+        return Point(values, point.signals, point.other, point.span)
+
+    def states(self, point: Point) -> Vector:
+        """[q; qd] of a point."""
+        return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
+
+    def step(self, m: Method, point: Point, x: Vector, t: float, h: float) -> Vector:
+        """[q; qd] behind a step of a method, by its tableau."""
+        n, a = self.nq, [[0.0] * self.nq for _ in m.b]
+        A, AA, (c, b, b_a) = _floats(m.a), _floats(m.a_squared), _floats((m.c, m.b, m.b_a))
+
+        def stage(i: int) -> Vector:
+            moved = list(x)
+            for k in range(n):
+                of_q = sum(w * s[k] for w, s in zip(AA[i], a, strict=False))
+                of_qd = sum(w * s[k] for w, s in zip(A[i], a, strict=False))
+                moved[k] += h * (c[i] * x[n + k] + h * of_q)
+                moved[n + k] += h * of_qd
+            return self.acceleration(point, moved, t + c[i] * h)
+
+        if not m.implicit:
+            for i in range(m.stages):
+                a[i] = stage(i)
+        else:
+            first, last = self.acceleration(point, x, t), math.inf
+            a[:] = [first] * m.stages
+            for _ in range(SWEEPS):
+                new = [stage(i) for i in range(m.stages)]
+                change = max(
+                    abs(p - q)
+                    for u, v in zip(new, a, strict=True)
+                    for p, q in zip(u, v, strict=True)
+                )
+                size = max(abs(p) for u in new for p in u) + max(map(abs, x[n:])) / abs(h)
+                a[:] = new
+                if change <= 1e-15 * size or last <= change <= 1e-13 * size:
+                    break
+                last = change
+            else:
+                raise NoCaseError
+        end = list(x)
+        for k in range(n):
+            of_q = sum(w * s[k] for w, s in zip(b_a, a, strict=True))
+            of_qd = sum(w * s[k] for w, s in zip(b, a, strict=True))
+            end[k] += h * (x[n + k] + h * of_q)
+            end[n + k] += h * of_qd
+        return self.projected(point, end, t + h)
+
+    def projected(self, point: Point, x: Vector, t: float) -> Vector:
+        """A state behind a step moved onto the constraints, where there are."""
+        if not self.system.constraints:
+            return x
+        for _ in range(12):
+            d = self.evaluate("projection", self.complete(self.at(point, x, t)))
+            x = [a + b for a, b in zip(x, d, strict=False)]
+            if max(map(abs, d[: self.nq])) <= 1e-12 * max(1e-3, *map(abs, x)):
+                return x
+        raise NoCaseError
+
+    def flow(self, point: Point, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
+        """[q; qd] a span later, by steps of order 8."""
+        for k in range(steps):
+            x = self.step(DP8, point, x, t + span * k / steps, span / steps)
+        return x
+
+    # states
+
+    @cached_property
+    def other(self) -> tuple[Any, ...]:
+        """The parameters of the second set: a percent and more off, so that each is seen."""
+        return tuple(
+            replace(p, value=self.short(p.value * (1 + 0.01 * (k % 7 + 1))))
+            for k, p in enumerate(self.system.parameters)
+        )
+
+    def short(self, x: float) -> float:
+        """A number as the element type has it, printed short."""
+        x = float(f"{x:.6g}")
+        return x if self.double else _single(x)
+
+    @cached_property
+    def near(self) -> tuple[Point, ...]:
+        """States near the start, by signals and by given inputs, one with other parameters."""
+        found = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
+        if self.other:
+            found[1] = replace(
+                found[1], other=True,
+                values={**found[1].values, **{p.name: p.value for p in self.other}},
+            )  # fmt: skip
+        if self.system.inputs:
+            found[2] = self.driven(found[2], 0.0)
+        if "applied" in self.program:
+            found += [self.driven(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))]
+        return tuple(found) if self.is_short else (found[1], found[2])
+
+    def point(self, k: int, t: float) -> Point:
+        """The k-th state around the start, with values for whatever else a function may read."""
+        values = {**nearby(self.system, k), TIME: t}
+        more = [x.name for x in (*self.system.qdd, *self.target.wrenches)]
+        more += self.target.multipliers
+        values |= {name: 0.4 + 0.3 * math.sin(1.7 * k + 2.1 * i) for i, name in enumerate(more)}
+        return Point({name: self.short(x) if name in self.moving else x if self.double
+                      else _single(x) for name, x in values.items()})  # fmt: skip
+
+    @cached_property
+    def moving(self) -> frozenset[str]:
+        """Names whose values are chosen here: all but parameters."""
+        return (
+            frozenset(nearby(self.system, 0)) - {p.name for p in self.system.parameters}
+            | {x.name for x in (*self.system.qdd, *self.target.wrenches)}
+            | {*self.target.multipliers}
+        )
+
+    def driven(self, point: Point, beyond: float) -> Point:
+        """A point with given inputs: within their limits, or beyond the upper or lower ones."""
+        names = self.target.input_names
+        u = [0.6 + 0.25 * math.cos(1.3 * i) for i in range(len(names))]
+        if "applied" in self.program:
+            ends = []
+            for huge in (-1e9, 1e9):
+                values = {**point.values, **dict.fromkeys(names, huge)}
+                ends.append(self.evaluate("applied", values))
+            for i, (least, most) in enumerate(zip(*ends, strict=True)):
+                if beyond:
+                    end = most if beyond > 0 else least
+                    u[i] = end + beyond * (0.5 + 0.5 * abs(end)) if abs(end) < 1e9 else u[i]
+                elif abs(least) < 1e9 or abs(most) < 1e9:
+                    low, high = max(least, most - 2), min(most, least + 2)
+                    low, high = (low, high) if low <= high else (least, most)
+                    u[i] = low + 0.7 * (high - low)
+        values = {n: self.short(x) for n, x in zip(names, u, strict=True)}
+        return replace(point, values={**point.values, **values}, signals=False)
+
+    def index(self, point: Point) -> int:
+        """The number of a point in the file."""
+        if point not in self.points:
+            self.points.append(point)
+        self.uses_other |= point.other
+        return self.points.index(point)
+
+    @property
+    def arrays(self) -> tuple[tuple[str, str], ...]:
+        """What a state has besides q and qd, and how many numbers that is."""
+        found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
+        return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
+
+    def state(self, point: Point) -> State:
+        """A point as literals."""
+        s, literal = self.system, self.target.literal
+        names = {"qdd": [x.name for x in s.qdd], "lambda": self.target.multipliers}
+        names["wrenches"] = [x.name for x in self.target.wrenches]
+        arrays = [[x.name for x in s.q], [x.name for x in s.qd]]
+        arrays += [names[name] for name, _ in self.arrays]
+        return State(
+            arrays=tuple(tuple(literal(point.values[n]) for n in row) for row in arrays),
+            t=literal(point.values[TIME]),
+            span=literal(point.span),
+            u=tuple(literal(point.values[n]) for n in self.given(point)),
+            other=point.other,
+        )
+
+    def given(self, point: Point) -> list[str]:
+        """The inputs that a point gives: all, or none where the signals act."""
+        return [] if point.signals else self.target.input_names
+
+    # cases
+
+    def case(
+        self, point: Point, compute: Callable[[Point], Vector], allowed: float = 0.0,
+        sharp: bool = False,
+    ) -> Case | None:  # fmt: skip
+        """What a computation gives at a point and how far C may be off, None where it says nothing.
+
+        The limit: what nudges of the state by an ulp bring, a thousandfold, at least rounding and
+        what is `allowed`; where that is `sharp`, no more.
+        """
+        try:
+            expected = compute(point)
+            limit = allowed if sharp else max(allowed, ROUNDING[self.double])
+            scale = max(map(abs, expected), default=0.0)
+            for turn in () if sharp else range(2 if self.is_short else 1):
+                limit = max(limit, UNITS * _off(compute(self.nudged(point, turn)), expected))
+        except (NoCaseError, ArithmeticError, ValueError, IndexError):
             return None
-        bias, _ = evaluate(program["bias"], known)
-        if close:
-            exact, _ = evaluate(program["bias"], known, exact=True)
-            exact_qdd, _ = evaluate(program["acceleration"], known, exact=True)
-            # a float's rounding is 2^29 times a double's
-            room = 64 if target.real is DOUBLE else 4 * 2**29
-            usual = USUAL[target.real is DOUBLE]
-            if room * _off(bias, exact) > close or room * _off(qdd, exact_qdd) > usual:
-                return None
-        D = [x for row in matrix(program, "D", known) for x in row]
-    except (ArithmeticError, ValueError):
+        if not scale < 1e12 or limit > max(LOOSEST[self.double], allowed):
+            return None
+        literal = self.target.literal
+        return Case(self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}"))
+
+    def nudged(self, point: Point, turn: int) -> Point:
+        """A point moved by about an ulp, coordinate by coordinate to and fro."""
+        ulp = self.target.real.epsilon
+        names = [x.name for x in (*self.system.q, *self.system.qd)]
+        moved = {}
+        for i, name in enumerate(names):
+            x, sign = point.values[name], (-1) ** (i * (turn + 1) + turn)
+            moved[name] = x + sign * ulp * max(abs(x), 0.1)
+        return replace(point, values={**point.values, **moved})
+
+    def tested(self) -> Iterator[Tested]:
+        """All that is tested, in the header's order."""
+        for function in self.public.evaluations():
+            name = function.name.removeprefix(f"{self.target.prefix}_")
+            cases = [self.case(p, partial(self.value, name)) for p in self.near]
+            if name in ("D", "bias"):
+                cases += self.far(name)
+            out = KINDS[name].out
+            kind = "status" if refuses(self.target, name) else "values" if out else "number"
+            call = self.call(function, **({out: "out"} if out else {}))
+            yield self.written(name, kind, call, cases)
+        cases = [self.case(p, partial(self.value, "acceleration")) for p in self.near]
+        cases += self.far("acceleration")
+        call = self.call(self.public.acceleration, qdd="out")
+        yield self.written("acceleration", "status", call, cases)
+        if {"linearization", "linearization_column"} & {*self.program.functions}:
+            f = self.public.linearization
+            at = {"A_q": "out", "A_qd": "out + NQ*NQ", "B": "out + 2*NQ*NQ"}
+            cases = [self.case(p, partial(self.value, "linearization")) for p in self.near]
+            yield self.written("linearization", "status", self.call(f, **at), cases)
+        yield from self.moves()
+
+    def written(
+        self, name: str, kind: str, call: str, cases: Sequence[Case | None], type: str = ""
+    ) -> Tested:
+        """A function of the self-test that makes a call; the template has its statements."""
+        return Tested(name, kind, call, type, tuple(filter(None, cases)))
+
+    def call(self, f: CFunction, **passed: str) -> str:
+        """A call at the state s."""
+        fields = ("q", "qd", "qdd", "wrenches", "lambda", "t", "u", "p")
+        at = {n: member("s", n) for n in fields}
+        at |= {"t0": member("s", "t"), "h": member("s", "span")}
+        return f.call(**at | passed)
+
+    def far(self, name: str) -> list[Case | None]:
+        """Cases where angles are large, and numbers long enough to judge sines by there."""
+        found: list[Case | None] = []
+        for values in islice(self.large, FAR):
+            allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
+            point = Point({n: x if self.double else _single(x) for n, x in values.items()})
+            point = replace(point, values={**self.point(1, 0.0).values, **point.values})
+            made = self.case(point, partial(self.value, name), allowed, sharp=True)
+            self.has_large |= made is not None
+            found.append(made)
+        return found
+
+    @cached_property
+    def large(self) -> list[dict[str, float]]:
+        """States with large angles at which bias and accelerations are right to enough digits."""
+        return [x for x in _large(self.target) if self.is_sharp(x)]
+
+    def is_sharp(self, x: Mapping[str, float]) -> bool:
+        """Whether doubles, or floats, have D, bias and accelerations as 40 digits have them."""
+        known = self.complete(Point({n: v if self.double else _single(v) for n, v in x.items()}))
+        room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
+        for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
+            try:
+                found = self.evaluate(name, known)
+                exact, _ = evaluator(self.program[name], exact=True)(known)
+            except (NoCaseError, ArithmeticError, ValueError):
+                return False
+            if room * _off(found, exact) > limit:
+                return False
+        return True
+
+    # steps, runs, events
+
+    def moves(self) -> Iterator[Tested]:
+        """Steps, their derivatives and runs of each method, projections, adaptive runs, events."""
+        run = self.system.run
+        if self.system.constraints:
+            f = self.public.project
+            call = self.call(f, q="out", qd="out + NQ", held="NULL")
+            cases = [self.case(p, self.projection, ITERATED[self.double]) for p in self.starts]
+            yield self.written("project", "moved", call, cases)
+        short = self.is_short
+        for name in run.methods:
+            m = METHODS[name]
+            if m.implicit and not short:
+                continue
+            starts = self.starts if short else self.starts[:1]
+            points = [p for x in starts if (p := self.spanned(m, x))]
+            allowed = ITERATED[self.double] if self.system.constraints else 0.0
+            allowed = IMPLICIT[self.double] if m.implicit else allowed
+            call = self.call(self.public.step(name), q="out", qd="out + NQ")
+            cases = [self.case(p, partial(self.stepped, m, 1), allowed) for p in points]
+            yield self.written(f"{name}_step", "moved", call, cases)
+            allowed = SWEPT[self.double] if m.sweeps else allowed
+            # and of the scene's own steps, which the fast form may take in other ways
+            own = [replace(p, span=self.short(self.system.run.h)) for p in points[:1] if short]
+            more = [*points, *own]
+            cases = [self.case(p, partial(self.rows, m), allowed) for p in more]
+            yield self.written(f"{name}_run", "run", self.run_call(name), cases)
+            if run.batch:
+                cases = [self.case(p, partial(self.twice, m), allowed) for p in more]
+                yield self.written(f"{name}_batch", "batch", self.batch_call(name), cases)
+            if run.discretize:
+                cases = [self.derivative(m, p) for p in points]
+                call = self.call(self.public.derivative(name), Phi="Phi", Gamma="Gamma")
+                yield self.written(f"{name}_derivative", "derivative", call, cases)
+        if run.tolerance is not None and short:
+            yield from self.adaptive_runs()
+
+    @cached_property
+    def is_short(self) -> bool:
+        """Whether many evaluations in Python take no long time."""
+        return weight(self.program["acceleration"]) <= LONGEST
+
+    @cached_property
+    def starts(self) -> tuple[Point, ...]:
+        """Where steps begin: states near the start; under constraints on them."""
+        if not self.system.constraints:
+            return tuple(replace(p, span=1.0) for p in self.near if not p.other)
+        point = self.point(0, START)
+        point = replace(point, values={**point.values, **nearby(self.system, 0), TIME: START})
+        return (replace(point, span=1.0),)
+
+    def spanned(self, m: Method, point: Point) -> Point | None:
+        """A point with a step size: as long as the method can take it, so that errors show."""
+        h = self.system.run.h
+        most = 1 if m.sweeps else 2 if m.implicit else 4
+        for factor in (4.0**k for k in range(most, -5, -1)):
+            tried = replace(point, span=self.short(factor * h))
+            if self.case(tried, partial(self.stepped, m, STEPS), ITERATED[self.double]):
+                end, start = self.stepped(m, STEPS, tried), self.states(tried)
+                if max(map(abs, end)) <= GROWTH * max(1.0, *map(abs, start)):
+                    return tried
         return None
-    return State(
-        x=tuple(target.literal(known[name.name]) for name in (*s.q, *s.qd)),
-        expected=tuple(target.literal(value) for value in (*D, *bias, *qdd)),
-        tolerance=close or USUAL[target.real is DOUBLE],
-    )
+
+    def stepped(self, m: Method, steps: int, point: Point) -> Vector:
+        """[q; qd] behind each of some steps."""
+        x, found, t, h = self.states(point), Vector(), point.values[TIME], point.span
+        for n in range(steps):
+            x = self.step(m, point, x, t + n * h, h)
+            found += x
+        return found
+
+    def rows(self, m: Method, point: Point) -> Vector:
+        """What a run writes: its end, and the rows of q and of qd."""
+        n, found = self.nq, self.stepped(m, STEPS, point)
+        states = [found[k : k + 2 * n] for k in range(0, len(found), 2 * n)]
+        q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
+        return [*states[-1], *q, *qd]
+
+    def twice(self, m: Method, point: Point) -> Vector:
+        """The ends of two instances that begin alike."""
+        end = self.stepped(m, STEPS, point)[-2 * self.nq :]
+        return [*end[: self.nq] * 2, *end[self.nq :] * 2]
+
+    def projection(self, point: Point) -> Vector:
+        """[q; qd] moved onto the constraints; where that is the state itself, from beside it."""
+        return self.projected(point, self.states(point), point.values[TIME])
+
+    def run_call(self, name: str) -> str:
+        """A run of some steps: its end, and the rows of q and of qd."""
+        return self.call(
+            self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(STEPS),
+            u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + STEPS}*NQ",
+            memory="NULL", status="&status",
+        )  # fmt: skip
+
+    def batch_call(self, name: str) -> str:
+        """The same of two instances that begin alike: their ends."""
+        return self.call(
+            self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
+            steps=str(STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
+            qd_rows="NULL", row_count="0", p_instance="0", done="done", status="status",
+        )  # fmt: skip
+
+    def adaptive_call(self) -> str:
+        """A run by a tolerance, to t + span."""
+        return self.call(
+            self.public.adaptive(adaptive.METHOD.name), q="out", qd="out + NQ", t="&t",
+            t_end=f"t + {member('s', 'span')}", h_most="0",
+            tol=self.target.literal(1e-12 if self.double else 1e-6), steps="1000", times="NULL",
+            count="0", t_rows="NULL", q_rows="NULL", qd_rows="NULL",
+            room=f"{self.target.PREFIX}_NE_ROOM", events="&events", which="which",
+            event_rows="rows", memory="&memory", status="&status",
+        )  # fmt: skip
+
+    def derivative(self, m: Method, point: Point) -> Case | None:
+        """The derivative of a step along 1, 2, 3, 1, 2, ..., by differences of steps."""
+        names = [x.name for x in (*self.system.q, *self.system.qd)]
+        names += self.given(point)
+
+        def along(x: Point, width: float) -> Vector:
+            found = [0.0] * (2 * self.nq)
+            for k, w in STENCIL:
+                for sign in (-1, 1):
+                    moved = {n: x.values[n] + sign * k * width * (1 + i % 3)
+                             for i, n in enumerate(names)}  # fmt: skip
+                    end = self.stepped(m, 1, replace(x, values={**x.values, **moved}))
+                    found = [f + sign * w / width * e for f, e in zip(found, end, strict=True)]
+            return found
+
+        try:
+            wide, close = along(point, 0.01), along(point, 0.0025)
+        except NoCaseError:
+            return None
+        allowed = 10 * _off(wide, close) + ITERATED[self.double]
+        if not allowed < LOOSEST[self.double]:
+            return None
+        return self.case(point, lambda _: close, allowed)
+
+    # adaptive runs and events
+
+    def adaptive_runs(self) -> Iterator[Tested]:
+        """Runs by a tolerance without an event, and over each event in both directions."""
+        cases = [self.quiet(p) for p in self.starts]
+        if not (self.system.constraints or self.system.modes):
+            for k in range(len(self.system.own_events)):
+                cases += self.crossings(k)
+        memory = f"{self.public.adaptive(adaptive.METHOD.name).name}_memory"
+        yield self.written("adaptive", "adaptive", self.adaptive_call(), cases, memory)
+
+    def spans(self) -> tuple[float, ...]:
+        """Lengths of adaptive runs that are tried."""
+        return tuple(self.short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
+
+    def quiet(self, point: Point) -> Case | None:
+        """A run in which nothing happens."""
+        for span in self.spans():
+            tried = replace(point, span=span)
+            try:
+                x, t = self.states(tried), tried.values[TIME]
+                self.refuse_events(tried, x, t, span)
+            except NoCaseError:
+                continue
+            made = self.case(tried, partial(self.ended, None), self.of_runs)
+            if made:
+                return made
+        return None
+
+    @property
+    def of_runs(self) -> float:
+        """What adaptive runs may be off."""
+        return 1e-8 if self.double else 2e-3
+
+    def ended(self, event: Happening | None, point: Point) -> Vector:
+        """[q; qd] and t at the end of an adaptive run, the number of events, the first of them."""
+        x, t, span = self.states(point), point.values[TIME], point.span
+        none = [0.0] * (3 + 2 * self.nq) if self.system.events else []
+        if event is None:
+            return [*self.sure(point, x, t, span), t + span, *none]
+        at, first = event
+        x = self.sure(point, x, t, at - t)
+        found = [1.0, first + 1.0, at, *x]
+        e = self.system.own_events[first]
+        if e.action == "stop":
+            return [*x, at, *found]
+        if e.action == "jump":
+            after = self.value("jumps", self.at(point, x, at))
+            x = after[2 * self.nq * first : 2 * self.nq * (first + 1)]
+        return [*self.sure(point, x, at, t + span - at), t + span, *found]
+
+    def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
+        """`flow`, as far as shorter steps agree."""
+        found, finer = (self.flow(point, x, t, span, n) for n in (4, 6))
+        if _off(found, finer) > self.of_runs / 10:
+            raise NoCaseError
+        return finer
+
+    def events(self, point: Point, x: Vector, t: float) -> Vector:
+        """What is zero at events."""
+        return self.value("events", self.at(point, x, t))
+
+    def refuse_events(self, point: Point, x: Vector, t: float, span: float) -> None:
+        """Raise NoCaseError where an event changes its sign on the way, or comes near to that."""
+        first = self.events(point, x, t) if self.system.events else []
+        for k in range(8) if first else ():
+            x = self.flow(point, x, t + span * k / 8, span / 8, 1)
+            found = self.events(point, x, t + span * (k + 1) / 8)
+            for a, b in zip(first, found, strict=True):
+                if a * b <= 0 or abs(b) < 0.02 * abs(a):
+                    raise NoCaseError
+
+    def crossings(self, k: int) -> list[Case | None]:
+        """Runs over event k, upwards and downwards, where such are found."""
+        found: dict[bool, Case] = {}
+        for point in self.candidates(k):
+            for span in self.spans():
+                try:
+                    rising, case = self.crossing(k, point, span)
+                except NoCaseError:
+                    continue
+                if case is not None:
+                    found.setdefault(rising, case)
+                    break
+            if len(found) == 2:
+                break
+        return [*found.values()]
+
+    def candidates(self, k: int) -> Iterator[Point]:
+        """States on event k: near the start, one coordinate or velocity moved until it is zero."""
+        names = [x.name for x in (*self.system.q, *self.system.qd)]
+        for number in range(1, 5):
+            for back in (1, -1):
+                point = self.point(number, 1.0)
+                moved = {x.name: back * point.values[x.name] for x in self.system.qd}
+                point = replace(point, values={**point.values, **moved})
+                for name in (TIME, *names):
+                    try:
+                        yield self.solved(k, point, name)
+                    except NoCaseError:
+                        continue
+
+    def solved(self, k: int, point: Point, name: str) -> Point:
+        """A point whose value `name` is so that event k is zero, by secants."""
+
+        def g(x: float) -> float:
+            return self.value("events", replace(point, values={**point.values, name: x}))[k]
+
+        a, b = point.values[name], point.values[name] + 0.05
+        at_a, at_b = g(a), g(b)
+        for _ in range(40):
+            if at_b == at_a:
+                raise NoCaseError
+            a, b, at_a = b, b - at_b * (b - a) / (at_b - at_a), at_b
+            at_b = g(b)
+            if abs(b - a) <= 1e-14 * max(abs(b), 1e-3):
+                break
+        else:
+            raise NoCaseError
+        if abs(b) > 20 or (name == TIME and b <= START):
+            raise NoCaseError
+        return replace(point, values={**point.values, name: b})
+
+    def crossing(self, k: int, on: Point, span: float) -> tuple[bool, Case | None]:
+        """A run from half a span before a state on event k to half a span behind it."""
+        x, t, half = self.states(on), on.values[TIME], span / 2
+        others = [i for i in range(len(self.system.events)) if i != k]
+        begin = self.flow(on, x, t, -half)
+        sides = []
+        for part in (-1.0, -0.5, 0.5, 1.0):
+            values = self.events(on, self.flow(on, x, t, part * half), t + part * half)
+            sides.append([v > 0 for v in values])
+        if any(len({s[i] for s in sides}) > 1 for i in others):
+            raise NoCaseError
+        rising = sides[3][k]
+        if [s[k] for s in sides] != [not rising, not rising, rising, rising]:
+            raise NoCaseError
+        e = self.system.own_events[k]
+        seen = e.direction in ("both", "rising" if rising else "falling")
+        start = self.at(on, [self.short(v) if not self.double else v for v in begin], t - half)
+        start = replace(start, span=span)
+        if seen and e.action == "jump":
+            after = self.value("jumps", on)[2 * self.nq * k : 2 * self.nq * (k + 1)]
+            near = self.flow(on, after, t, half / 8, 1)
+            self.refuse_events(on, near, t + half / 8, half * 7 / 8)
+        event = (t, k) if seen else None
+        return rising, self.case(start, partial(self.ended, event), self.of_runs)
 
 
-def _telling(target: Target, x: Mapping[str, float]) -> bool:
-    """Whether bias is not what rounding leaves of an angle, as sin(pi) is.
-
-    Few libraries have that to many digits; one that misses it computes well all the same.
-    """
-    double, program = target.real is DOUBLE, target.program
-    step = 1 + 2.0 ** (-52 if double else -23)
-    try:
-        known = _known(target, x)
-        moved = known | {q.name: step * known[q.name] for q in target.system.q}
-        bias, other = (evaluate(program["bias"], at)[0] for at in (known, moved))
-        return _off(bias, other) <= USUAL[double]
-    except (ArithmeticError, ValueError):
-        return False
-
-
-def _known(target: Target, x: Mapping[str, float]) -> dict[str, float]:
-    """A state with its inputs, as they are in C: sin(pi) is not that of the float next to pi."""
-    program = target.program
-    known = dict(x) if target.real is DOUBLE else {name: _single(x[name]) for name in x}
-    if "signal" in program:
-        u, _ = evaluate(program["signal"], known)
-        known |= {i.name: value for i, value in zip(target.system.inputs, u, strict=True)}
-    return known
+@cache
+def _floats(rows: tuple[tuple[Fraction, ...], ...]) -> list[Vector]:
+    return [[float(x) for x in row] for row in rows]
 
 
 def _single(x: float) -> float:

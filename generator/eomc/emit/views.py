@@ -44,16 +44,49 @@ class Main:
 
 @dataclass(frozen=True)
 class State:
-    """A state of selftest.c and what is expected there: literals; the limit for D and bias."""
+    """A state of selftest.c as literals.
 
-    x: tuple[str, ...]
+    arrays: q, qd and what else functions read. span: the length of a step or a run. u: empty where
+    the signals act. other: whether the second set of parameters is taken.
+    """
+
+    arrays: tuple[tuple[str, ...], ...]
+    t: str
+    span: str
+    u: tuple[str, ...]
+    other: bool
+
+
+@dataclass(frozen=True)
+class Case:
+    """The number of a state, what is expected there, the limit relative to its largest entry."""
+
+    state: int
     expected: tuple[str, ...]
-    tolerance: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A function of selftest.c that makes a call to one of the header, and its cases.
+
+    kind: which of the forms of the template it has. memory: the type of what a run hands on.
+    """
+
+    name: str
+    kind: str
+    call: str
+    memory: str
+    cases: tuple[Case, ...]
 
 
 @dataclass(frozen=True)
 class SelfTest:
-    """c/selftest.c.jinja. large_tolerance: 0 without large angles. The last six: calls."""
+    """c/selftest.c.jinja. other: the second set of parameters. arrays: of a state, and extents.
+
+    events, inputs: whether there are any. most: numbers of the largest result. large: whether there
+    are states with large angles.
+    """
 
     TEMPLATE: ClassVar[str] = "c/selftest.c"
     title: FreeText
@@ -62,15 +95,15 @@ class SelfTest:
     PREFIX: str
     real: str
     states: tuple[State, ...]
-    tolerance: float
-    large_tolerance: float
+    other: tuple[str, ...]
+    has_p: bool
+    arrays: tuple[tuple[str, str], ...]
+    tested: tuple[Tested, ...]
+    events: bool
+    inputs: bool
+    most: int
     large_limit: str
-    D: str
-    bias: str
-    tau: str
-    acceleration: str
-    jacobian: str
-    multipliers: str
+    large: bool
 
 
 @dataclass(frozen=True)
