@@ -85,8 +85,10 @@ class Equations(Derived):
         s = self.system
         names = [x.name for x in (*s.q, *s.qd, *s.qdd, *s.u, *(p.symbol for p in s.parameters))]
         names += [*(x.name for x in self.multipliers), *(x.name for x, _ in self.named), "t"]
-        plain = {name: sympy.Symbol(name) for name in names}
-        symbols = {name: s.own_symbols.get(name, plain[name]) for name in names}
+        if self.named:  # entries of D stand for themselves in the scalar equations
+            inside = {x.name for terms in self.left for _, c in terms for x in c.free_symbols}
+            names += sorted(inside.difference(names))
+        symbols = {name: s.own_symbols.get(name, sympy.Symbol(name)) for name in names}
         changed = self.substitute({symbol(n): new for n, new in symbols.items()}, lambda e: e)
         return replace(changed, symbols=symbols, _internal=self)
 
