@@ -140,7 +140,7 @@ def is_nonnegative(D: Vector, A: Vector) -> bool:
     return not least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE
 
 
-def project(
+def project_to_nearest(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
     """The x nearest to q on the rows, in the metric of D, and its last correction, in its sizes.
@@ -150,7 +150,7 @@ def project(
     part where that does not converge. The last correction is more than rounding where none is
     found.
     """
-    x, last = _onto(q, rows)
+    x, last = project(q, rows)
     part, before = 1.0, np.inf
     if not last < 1e-10:
         return x, last
@@ -163,13 +163,13 @@ def project(
             return x, np.inf
         x = x + part * correction
         if size <= CONVERGENCE_TOLERANCE or (size < 1e-12 and size > before / 2):
-            return x, size
+            return project(x, rows)
         part /= 1 + (size > before / 2)
         before = size
     return x, np.inf
 
 
-def _onto(
+def project(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
     """A q by Newton's method in the metric of D, and its last correction, in sizes of q.

@@ -115,14 +115,15 @@ class Reference(ABC):
         t: ArrayLike = 0.0,
         params: Params = None,
         held: tuple[int, ...] = (),
+        nearest: bool = True,
     ) -> tuple[Vector, Vector]:
         """q and qd put onto the constraints, by Newton's method in the metric of D, to rounding.
 
-        Each correction is the least. held: coordinates that stay, with their rates. nan where none
-        is found.
+        held: coordinates that stay, with their rates. nearest: q is the nearest one in that metric;
+        otherwise each correction is the least. nan where none is found.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        project_one = partial(self._project_state, fixed=held)
+        project_one = partial(self._project_state, fixed=held, nearest=nearest)
         return self._map_states(project_one, q, qd, np.asarray(t, float), self._values(params))
 
     def corrected(
@@ -264,7 +265,13 @@ class Reference(ABC):
         return np.asarray(self.solved @ value if matrix else value @ self.solved.T)
 
     def _project_state(
-        self, q: Vector, qd: Vector, t: Any, values: Values, fixed: tuple[int, ...] = ()
+        self,
+        q: Vector,
+        qd: Vector,
+        t: Any,
+        values: Values,
+        fixed: tuple[int, ...],
+        nearest: bool,
     ) -> tuple[Vector, Vector]:
         """`project` of one state: rows of rates alone say nothing of where q may be."""
         positions = self._holonomic > 0
@@ -274,7 +281,8 @@ class Reference(ABC):
             return *kkt.with_fixed_coordinates(D, A[positions], fixed), off[positions]
 
         if np.any(positions):
-            q, last_correction = kkt.project(q, rows)
+            project = kkt.project_to_nearest if nearest else kkt.project
+            q, last_correction = project(q, rows)
             if not last_correction < 1e-10:
                 return np.full_like(q, np.nan), np.full_like(q, np.nan)
         D, A = (self._constraint_values(name, q, qd, t, values) for name in ROWS[:2])

@@ -93,7 +93,7 @@ class Projection:
         """Where the reference puts a state."""
         with np.errstate(all="ignore"):
             if not held:
-                return self.of.sampler.project(s)
+                return self.of.sampler.project(s, nearest=True)
             q, qd = self.of.reference.project(s.q, s.qd, s.t, s.params, held)
         return replace(s, q=q, qd=qd)
 

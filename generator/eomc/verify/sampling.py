@@ -306,12 +306,15 @@ class Sampler:
                 qd[mode.of] *= not sticks
                 q[mode.at], qd[mode.at] = np.sign(qd[mode.of]), 0.0
 
-    def project(self, s: State) -> State:
-        """The state put onto the constraints; nan where that leads nowhere, or some row is off."""
+    def project(self, s: State, nearest: bool = False) -> State:
+        """The state put onto the constraints; nan where that leads nowhere, or some row is off.
+
+        nearest: the positions are the nearest ones, as those of a module's `project` are.
+        """
         if not self.system.constraints:
             return s
         with np.errstate(all="ignore"):
-            q, qd = self.reference.project(s.q, s.qd, s.t, s.params)
+            q, qd = self.reference.project(s.q, s.qd, s.t, s.params, nearest=nearest)
         projected = replace(s, q=q, qd=qd)
         rows = [
             self.value_and_size(partial(self.reference.evaluate, name), projected)
