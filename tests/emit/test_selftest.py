@@ -18,7 +18,7 @@ import eomc
 from eomc.emit.selftest import _lost
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
-from eomc.toolchain.running import lay_out
+from eomc.toolchain.subprocesses import lay_out
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])

@@ -56,7 +56,7 @@ def test_references_do_not_depend_on_names() -> None:
     state = {"params": dict.fromkeys(NAMES, 2.0)}
     found = symbolic.derive(system).acceleration([0.3], [0.0], **state)
     assert found == pytest.approx([expected(0.3)])
-    (output,) = Formulas(system).at(State([0.3], [0.5], 0.0, None, None), [0.0])  # type: ignore[arg-type]
+    (output,) = Formulas(system).evaluate(State([0.3], [0.5], 0.0, None, None), [0.0])  # type: ignore[arg-type]
     assert output == pytest.approx(math.e * 2 + 1 + 2 + 2 * 0.5)
 
 

@@ -111,7 +111,9 @@ def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
     return f"a number stands without quotes and without its unit, {unit} in SI: write {number}"
 
 
-_UNIT_OF_DEGREES = re.compile(r"(?<![a-z])(?:deg|degs|degree|degrees)(?![a-z])|°(?![CF])", re.I)
+_UNIT_OF_DEGREES = re.compile(
+    r"(?<![a-z])(?:deg|degs|degree|degrees)(?![a-z])|(?<!\d)°(?![CF])", re.I
+)
 
 
 def is_in_degrees(unit: str) -> bool:
