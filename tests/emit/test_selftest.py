@@ -18,7 +18,7 @@ import eomc
 from eomc.emit.selftest import _lost
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import lay_out
+from eomc.toolchain.subprocesses import write_files
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
@@ -91,7 +91,7 @@ def outcome(folder: Path, form: str, *flags: str) -> tuple[int, str]:
 
 def write(folder: Path, real: str = "double") -> None:
     """The C of the ball in a folder."""
-    lay_out({n: x for n, x in sources(real).items() if n.endswith((".c", ".h"))}, folder)
+    write_files({n: x for n, x in sources(real).items() if n.endswith((".c", ".h"))}, folder)
 
 
 EVERY = """D C g bias tau kinetic_energy potential_energy energy power outputs output_slopes events
