@@ -312,9 +312,10 @@ class Reference(ABC):
             size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
             small = np.all(np.abs(dq) <= CORRECTION_TOLERANCE * size, axis=-1)
             ends[:, remaining[small]] = q[small], qd[small]
-            if np.all(small):
+            going_on = ~small & np.all(np.isfinite(q), axis=-1)
+            if not np.any(going_on):
                 break
-            remaining, q, qd, t, *each = (x[~small] for x in (remaining, q, qd, t, *each))
+            remaining, q, qd, t, *each = (x[going_on] for x in (remaining, q, qd, t, *each))
         return ends[0], ends[1]
 
     def _correction(self, q: Vector, qd: Vector, t: Vector, values: Values) -> Vector:

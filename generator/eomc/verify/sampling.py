@@ -202,7 +202,7 @@ class Sampler:
         qd = np.array([start.qd, start.qd])
         if self.system.constraints:  # off these a step's correction throws it
             with np.errstate(all="ignore"):
-                q[1], qd[1] = self.reference.project(q[1], qd[1])
+                q[1], qd[1] = self.reference.project(q[1], qd[1], nearest=False)
         ranges = np.full((2, *q.shape), math.inf)
         for part in (2**k for k in range(MAX_HALVINGS + 1)):
             before = ranges
