@@ -83,8 +83,13 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     empty = {n + 1 for n, line in enumerate(source.splitlines(), 1) if "if (count <= 0)" in line}
     left = [(n, line) for n, line in left if n not in empty]
     # steps towards a singular place, and too long for sweeps: tests/runtime/test_adaptive*.py
-    ends = ("if (!cut && 16*h <=", "fifth*fifth*change >")
-    refused = {n + 1 for n, x in enumerate(source.splitlines(), 1) if any(e in x for e in ends)}
+    ends = ("if (!cut && 16*h <=", "fifth*fifth*change >", "if (memory->max_evaluations &&")
+    # the nearest position, at a position where the same matrix has been regular before
+    ends += (f"if (!{name}_least_change(d, D, A, lack, held, HOLONOMIC))\n",)
+    text = source.splitlines(keepends=True)
+    refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
+    # behind the status of a limit of evaluations: tests/runtime/test_max_evaluations.py
+    refused |= {n + 1 for n in refused if "TOO_LONG" in text[n - 1]}
     left = [(n, line) for n, line in left if n not in refused]
     if "_adaptive_state;" in source:
         left = [(n, line) for n, line in left if not ADAPTIVE.fullmatch(line)]

@@ -247,7 +247,8 @@ class Runs:
         """Values, accelerations and steps at angles and times that sines are too small for.
 
         An angle is as exact as its last digit, so that a unit is that of the angle. Times are
-        earlier where formulas contain larger angles, such as t**3; states where angles are still
+        earlier where formulas contain larger angles, such as t**3, or where single precision does
+        not resolve a step; states where angles are still
         larger than the numbers that a double counts are left out.
         """
         errors, angle = [], largest_angle(self.check.system)
@@ -257,7 +258,7 @@ class Runs:
             constrained = bool(self.check.system.constraints)  # which do not hold at another time
             t = LATE if _reads_time(self.check.system) and not constrained else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
-            while t > 1 and angle(at) > FARTHEST_ANGLE:
+            while t > 1 and (angle(at) > FARTHEST_ANGLE or not self.resolves_steps(at.t)):
                 t /= 2
                 at = replace(at, t=s.t + t)
             if angle(at) > 2 / EPS:
@@ -307,6 +308,10 @@ class Runs:
             slopes = np.fmax.reduce([np.abs(J[:, n : 2 * n]) for J, _ in by])
         gain = e.size["acceleration"] + rounded / self.h + slopes @ rounded
         return replace(e, size={**e.size, "acceleration": gain})
+
+    def resolves_steps(self, t: float) -> bool:
+        """Return whether the module's numbers resolve a step's 64th part at the time t."""
+        return bool(64 * np.spacing(self.check.dtype(t)) <= self.h)
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
