@@ -63,6 +63,7 @@ UNREACHABLE = {
 ADAPTIVE = re.compile(
     r"x->(hindered|stiff) .*|memory->evaluations \+= 2\*NQ \+ 1;|newton = .*|if \(newton\)"
     r"|continue;|return 1;|return \w+_NOT_FINITE;|row\[k\] = k;|memset\(&own.*|memory = &own;"
+    r"|.*>= memory\[k\]\.max_evaluations;|.*_TOO_LONG;"  # tests/runtime/test_batch_adaptive.py
 )
 
 
@@ -88,7 +89,7 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     ends += (f"if (!{name}_least_change(d, D, A, lack, held, HOLONOMIC))\n",)
     text = source.splitlines(keepends=True)
     refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
-    # behind the status of a limit of evaluations: tests/runtime/test_max_evaluations.py
+    # behind the status of a limit of evaluations: tests/runtime/test_batch_adaptive.py
     refused |= {n + 1 for n in refused if "TOO_LONG" in text[n - 1]}
     left = [(n, line) for n, line in left if n not in refused]
     if "_adaptive_state;" in source:

@@ -311,7 +311,7 @@ class Runs:
 
     def resolves_steps(self, t: float) -> bool:
         """Return whether the module's numbers resolve a step's 64th part at the time t."""
-        return bool(64 * np.spacing(self.check.dtype(t)) <= self.h)
+        return bool(64 * np.spacing(np.asarray(t, self.check.dtype)) <= self.h)
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
