@@ -162,7 +162,7 @@ def look_at(text: str) -> None:
     try:
         assert_every_route_agrees(made, answer, some=False)
     except EomcError as fault:  # rightly so where D is singular everywhere
-        assert "has no inertia" in str(fault)
+        assert "inertia" in str(fault)
         for state in states(made):
             assert not np.linalg.cond(Asked(answer, state)["D"]) < 1e12
 
