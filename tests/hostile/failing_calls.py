@@ -117,8 +117,9 @@ def calls(log: Path, folder: Path) -> Iterator[Call]:
 
 
 def files(folder: Path) -> list[Path]:
-    """All below but bytecode."""
-    return [f for f in folder.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    """All below but bytecode and the builds of other versions that are kept."""
+    found = (f for f in folder.rglob("*") if ".builds" not in f.relative_to(folder).parts)
+    return [f for f in found if f.is_file() and f.suffix != ".pyc"]
 
 
 class Failing:
