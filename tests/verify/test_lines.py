@@ -87,7 +87,7 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     ends = ("if (!cut && 16*h <=", "fifth*fifth*change >", "if (memory->max_evaluations &&")
     # the nearest position, at a position where the same matrix has been regular before
     ends += (f"if (!{name}_least_change(d, D, A, lack, held, HOLONOMIC))\n",)
-    # that position's iteration diverges, and the first projection stands: tests/runtime/test_projection.py
+    # the iteration for it diverges, and the projection stands: tests/emit/test_projection.py
     ends += ("if (64*part < 1)",)
     text = source.splitlines(keepends=True)
     refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
