@@ -11,7 +11,7 @@ from pathlib import Path
 
 from conftest import ROOT
 from packaging.requirements import Requirement
-from test_house import modules, nodes
+from test_architecture import modules, nodes
 
 PAGE = (ROOT / "docs" / "SECURITY.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| ([\w-]+) \| (>=[\d.]+) \| (MIT|BSD|PSF) \| (.+) \|$", PAGE, re.M)
