@@ -277,7 +277,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
     """
     from eomc.base.errors import SceneError, writing
-    from eomc.runtime.written import replacing
+    from eomc.runtime.atomic_write import atomic_write
     from eomc.scene import read as scenes
     from eomc.scene import toml_text
 
@@ -305,7 +305,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
             raise _by_name(wrong, len(model.events), events) from None
         with writing(f"{what}: {file}"):
             root.mkdir(parents=True, exist_ok=True)
-            with replacing(file) as new:
+            with atomic_write(file) as new:
                 new.write_text(text, encoding="utf-8")
     return load(file, root)
 

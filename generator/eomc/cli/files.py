@@ -7,7 +7,7 @@ from pathlib import Path
 
 from eomc.base.errors import EomcError, writing
 from eomc.cli.terminal import shown
-from eomc.runtime.written import check_replaceable, replacing
+from eomc.runtime.atomic_write import atomic_write, check_replaceable
 
 
 def scene_path(name: str) -> Path:
@@ -44,5 +44,5 @@ def check_target(path: Path | None, endings: Sequence[str], option: str) -> None
 
 def write_text(path: Path, text: str) -> None:
     """Write a file, replacing an existing one once the new one is complete."""
-    with writing(shown(path)), replacing(path) as new:
+    with writing(shown(path)), atomic_write(path) as new:
         new.write_text(text, encoding="utf-8")

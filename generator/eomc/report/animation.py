@@ -23,7 +23,7 @@ from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
 from eomc.report.reel import Instances, Panel, Reel
 from eomc.report.system_of_run import Source, system_of
-from eomc.runtime.written import replacing
+from eomc.runtime.atomic_write import atomic_write
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class Animation:
 
     def save(self, file: str | os.PathLike[str]) -> None:
         """Write the page. Raises EomcError where it can't be written."""
-        with writing(texts.line(str(file))), replacing(file) as new:
+        with writing(texts.line(str(file))), atomic_write(file) as new:
             new.write_text(self.page, encoding="utf-8")
 
     def _repr_html_(self) -> str:

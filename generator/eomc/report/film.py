@@ -19,8 +19,8 @@ from eomc.report.picture import draw_marks, frame, project_points, shapes
 from eomc.report.reel import Reel
 from eomc.report.style import COLOURS, INK, colours
 from eomc.report.system_of_run import Source, system_of
+from eomc.runtime.atomic_write import atomic_write
 from eomc.runtime.columns import imported
-from eomc.runtime.written import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,7 +67,7 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
     with matplotlib.rc_context({"text.usetex": False}):
         pictures = Pictures(reels, made, times, title)
         try:
-            with replacing(file) as new:
+            with atomic_write(file) as new:
                 if suffix == ".gif":
                     _gif(pictures, new)
                 else:

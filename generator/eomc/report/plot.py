@@ -21,8 +21,8 @@ from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
 from eomc.report.labels import mathtext, rate_unit, with_unit
 from eomc.report.style import COLOURS, INK, plain
+from eomc.runtime.atomic_write import atomic_write
 from eomc.runtime.plot import Curve, against, grouped, wrapped
-from eomc.runtime.written import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +75,7 @@ def draw(
     drawn = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
         result.savefig(drawn, format=suffix[1:], dpi=150, metadata=undated)
-    with writing(path), replacing(path) as new:
+    with writing(path), atomic_write(path) as new:
         new.write_bytes(drawn.getvalue())
 
 

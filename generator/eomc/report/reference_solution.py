@@ -43,7 +43,7 @@ from eomc.model.numeric import compiled
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
-from eomc.runtime.written import replacing
+from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain import cache as builds
 from eomc.verify import symbolic
 from eomc.verify.reference import Vector
@@ -149,7 +149,7 @@ def solve(
     stored["key"] = key
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file, cached=True) as new:
+        with atomic_write(file, cached=True) as new:
             new.write_text(json.dumps(stored) + "\n", encoding="utf-8")
     except OSError as fault:
         raise FolderError(f"{file}: can't be written ({fault.strerror})") from None

@@ -20,11 +20,11 @@ from .arguments import Array, as_number, check_time
 from .balance import with_jumps
 from .dense import within
 from .estimate import Estimate
+from .events import EventBuffer
 from .fitted import Fitted
-from .happened import Found
-from .periods import Acting, Periods, as_acting
+from .input_schedule import InputSchedule, ZeroOrderHold, input_schedule
 from .section import crossings
-from .slices import longer
+from .slices import next_chunk
 from .status import FULL, STATUS
 from .stepping import Stepping
 from .trajectory import Run
@@ -66,9 +66,10 @@ class AdaptiveRun(Fitted):
     def _made(self, times: Array | None, end: float) -> AdaptiveRun:
         """The same run with rows at times, or after each step and on both sides of each jump."""
         q, qd = self._begin
+        held = self._held
         return run(
             self._model, q, qd, self.t0, end, self.tol, times,
-            self._u if self._held is None else Periods(self._held, self._period, self._periods),
+            self._u if held is None else ZeroOrderHold(held, self._period, self._periods),
             self._params, self._h_most, None, self._stiff, method=self._by,
         )  # fmt: skip
 
@@ -171,7 +172,7 @@ def simulate(
         rows = as_times(times, t0, model.dtype, duration)
         first, end = int(rows[0] == t0), float(rows[-1])
         check_time(model.dtype, t0, end - t0)
-    held = as_acting(model, u, control_period, end - t0, params, duration)
+    held = input_schedule(model, u, control_period, end - t0, params, duration)
     asked = None if rows is None else rows[first:]
     found = run(model, q, qd, t0, end, tol, asked, held, p, most, progress, stiff)
     if first:
@@ -226,7 +227,7 @@ def plain(
 
 def run(
     model: Stepping, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
-    u: Array | Periods | None, p: Array, h_most: float,
+    u: Array | ZeroOrderHold | None, p: Array, h_most: float,
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
     method: str = "",
 ) -> AdaptiveRun:  # fmt: skip
@@ -238,9 +239,9 @@ def run(
         work.stiff = 1
     if method:
         work.fixed = 1 + model.methods.index(method)
-    acting = Acting(model, u, t0, t_end, q, qd)
+    acting = InputSchedule(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
-    events = Found(model) if model.events else None
+    events = EventBuffer(model) if model.events else None
     each = 2 if events else 1  # rows of a step, beside a jump
     room = max(_ROOM, min(model._room, _AT_ONCE // nq))
     rows = Rows(model, times, 1 + each * room)
@@ -263,7 +264,7 @@ def run(
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
-            room = min(longer(room, perf_counter() - begun), _MOST) if cut else room
+            room = min(next_chunk(room, perf_counter() - begun), _MOST) if cut else room
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
             if not (room := kept.at_most(room, each)):
                 said = FULL
@@ -304,7 +305,7 @@ def run(
     return made
 
 
-def _kept(work: Any, events: Found | None) -> int:
+def _kept(work: Any, events: EventBuffer | None) -> int:
     """The rows of the last call, whose events are kept."""
     rows, work.rows = work.rows, 0
     if events:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, as_flag, as_number, as_step_size, check_time, unmasked
-from .facts import Facts
+from .metadata import ModelInfo
 from .package import option
 
 LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
@@ -20,7 +20,9 @@ FIXED = {  # what belongs to fixed steps, where nothing is said of it
 }  # fmt: skip
 
 
-def fits(model: Facts, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any) -> bool:
+def fits(
+    model: ModelInfo, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any
+) -> bool:
     """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
     if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
@@ -28,7 +30,7 @@ def fits(model: Facts, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, s
 
 
 def as_limits(
-    model: Facts, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
+    model: ModelInfo, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
     """(tolerance, longest step or 0); fixed: the values of FIXED, which belongs to fixed steps."""
     as_flag(stiff, "stiff")
@@ -46,7 +48,7 @@ def as_limits(
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
 
 
-def _why_not(model: Facts, name: str, asked: bool) -> str:
+def _why_not(model: ModelInfo, name: str, asked: bool) -> str:
     """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
     if asked:
         return (
@@ -65,7 +67,7 @@ def as_progress(progress: Any) -> Any:
     return progress
 
 
-def as_end(model: Facts, t0: float, duration: float | None) -> float:
+def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
     """The time at which a run ends, as the module's numbers hold it."""
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:

@@ -13,7 +13,7 @@ from .arguments import Array
 from .estimate import Estimate, growth_of, moving, rounding_words, scales
 from .fitted import Fitted
 from .growth import mean_mass_matrix
-from .periods import Periods
+from .input_schedule import ZeroOrderHold
 from .status import FULL, REMEDY
 
 ORDER = 16
@@ -109,7 +109,7 @@ class _Again:
         self, own: Fitted, run: Callable[..., Fitted], progress: Callable[[int, int], None] | None
     ) -> None:
         self.own, self.run, self.progress = own, run, progress
-        self.u: Any = Periods(own._u, own._period, own._periods) if own._period else own._u
+        self.u: Any = ZeroOrderHold(own._u, own._period, own._periods) if own._period else own._u
         self.x = own.x.astype(float)
         # rows beside a jump may be on either side of it in another run
         jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])

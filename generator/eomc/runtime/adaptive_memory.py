@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, machine_memory
-from .facts import Facts
+from .metadata import ModelInfo
 from .status import PART
 
 
 class Kept:
     """How many rows and events a run keeps, and how many more there is room for."""
 
-    def __init__(self, model: Facts) -> None:
+    def __init__(self, model: ModelInfo) -> None:
         self.rows, self.most = 0, room_for(model)
 
     def count(self, work: Any, events: bool) -> None:
@@ -29,7 +29,7 @@ class Kept:
 class Rows:
     """Times and rows as C fills them, in pieces: one after each step, or at `times` (n,)."""
 
-    def __init__(self, model: Facts, times: Array | None, count: int) -> None:
+    def __init__(self, model: ModelInfo, times: Array | None, count: int) -> None:
         self.model, self.own = model, times is None
         self.times = None if times is None else np.ascontiguousarray(times, model.dtype)
         self.pieces: list[tuple[Array, Array]] = []
@@ -71,12 +71,12 @@ class Rows:
         return times[: self.filled], rows[:, : self.filled]
 
 
-def room_for(model: Facts) -> float:
+def room_for(model: ModelInfo) -> float:
     """How many rows and events a run may keep."""
     return PART * machine_memory() / _row(model)
 
 
-def rows_for(model: Facts, count: int) -> Array:
+def rows_for(model: ModelInfo, count: int) -> Array:
     """Room for so many times, q and qd. Raises MemoryError where there is none."""
     try:
         if count * _row(model) > machine_memory():
@@ -88,6 +88,6 @@ def rows_for(model: Facts, count: int) -> Array:
         ) from None
 
 
-def _row(model: Facts) -> int:
+def _row(model: ModelInfo) -> int:
     """The bytes of a time, q and qd."""
     return (1 + 2 * model.nq) * model.dtype.itemsize

@@ -12,8 +12,8 @@ import numpy as np
 
 from .arguments import Array
 from .package import reduced
-from .recorded import Recorded
 from .stepping import Stepping
+from .trajectory_data import Trajectory
 
 _ROWS = 8  # of an interpolating polynomial, and so the order of an integral, at most
 _FEWEST = 2 * _ROWS + 1  # from which on every fourth shows something; below all may be wrong
@@ -82,7 +82,7 @@ class _Rows:
         return np.asarray(found, float)
 
 
-def balance(run: Recorded) -> Balance | None:
+def balance(run: Trajectory) -> Balance | None:
     """The balance of a run; None where its rows don't tell its inputs, or something is infinite.
 
     That may be an energy or a force, at a start from which no step is made.
@@ -128,7 +128,7 @@ def _turned_back(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array
     return lambda q, qd: (signs * q, -qd)
 
 
-def _rows(run: Recorded) -> _Rows | None:
+def _rows(run: Trajectory) -> _Rows | None:
     """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
@@ -202,7 +202,7 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     return np.insert(t[rows], places, at), q, qd
 
 
-def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
+def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     """t, q, qd equally far apart, in each piece between jumps, which stand on two rows each."""
     run = with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
@@ -219,7 +219,7 @@ def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
     bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    made: Recorded = bare._with(np.concatenate(times)) if times else bare
+    made: Trajectory = bare._with(np.concatenate(times)) if times else bare
     return made.t, made.q, made.qd
 
 

@@ -27,12 +27,12 @@ from .arguments import (
 from .batch_instances import Instances
 from .batch_run import BatchRun
 from .batch_work import WORTH, Work
-from .facts import SOME
+from .metadata import SOME
 from .model import RARELY
+from .output_times import as_asked
 from .package import warn
-from .shown import with_events
+from .plugins import with_events
 from .status import Interrupted
-from .timed import as_asked
 
 
 class BatchModel(Instances):

@@ -18,13 +18,13 @@ from .batch_instances import Instances
 from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
 from .by_name import ByName
-from .facts import SOME
+from .events import BatchEventBuffer, BatchEventLog
 from .fitted import said
-from .happened import FoundInBatch, HappenedInBatch
-from .periods import end_of, held_at, periods_in
-from .slices import longer
+from .fixed_step_events import as_hold, as_rows
+from .input_schedule import count_periods, period_end, sample_zero_order_hold
+from .metadata import SOME
+from .slices import next_chunk
 from .status import FULL, STATUS
-from .stepped import as_hold, as_rows
 
 _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
@@ -78,7 +78,7 @@ class AdaptiveBatchRun(BatchRun):
         return np.asarray(_ENDS[self._codes])
 
     @cached_property
-    def events(self) -> dict[str, HappenedInBatch]:
+    def events(self) -> dict[str, BatchEventLog]:
         """Where and when each of the scene's events happened, and in which instances."""
         if self._happened is None:
             return ByName("events", (), ())
@@ -87,7 +87,7 @@ class AdaptiveBatchRun(BatchRun):
         for k in range(len(self._model.events)):
             own = which == k
             t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
-            found.append(HappenedInBatch(t[:, 0], q, qd, instances[own], len(self)))
+            found.append(BatchEventLog(t[:, 0], q, qd, instances[own], len(self)))
         return ByName("events", self._model.events, found)
 
     def _states(self, times: Array) -> Array:
@@ -193,7 +193,7 @@ def simulate(
     span = float(rows[-1]) - t0
     check_time(model.dtype, t0, span)
     if period and length is not None:
-        u = cut_table(u, model.nu, periods_in(length, period), periods_in(span, period), 1)
+        u = cut_table(u, model.nu, count_periods(length, period), count_periods(span, period), 1)
     return _run(
         model,
         q0,
@@ -226,7 +226,7 @@ def stepped(
     rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
     period = as_hold(u, control_period, h) or 0.0
     if period and duration is not None:
-        u = cut_table(u, model.nu, periods_in(duration, period), periods_in(span, period), 1)
+        u = cut_table(u, model.nu, count_periods(duration, period), count_periods(span, period), 1)
     return _run(
         model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, span, method
     )
@@ -243,7 +243,7 @@ def _run(
     method: of fixed steps of the size `most`. limit: of the evaluations of an instance; 0: none.
     """
     no_signals(model, u, period or None)
-    count = periods_in(span, period) if period else None
+    count = count_periods(span, period) if period else None
     starts, table, held, codes = model._instances(q0, qd0, params, u, count, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
@@ -258,7 +258,9 @@ def _run(
     counts = work.counts
     cut = len(STATUS) if work.full else STATUS.index("interrupted")
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
-    given = None if held is None else held_at(rows, t0, period, held) if over else held.copy()
+    given = None if held is None else held.copy()
+    if held is not None and over:
+        given = sample_zero_order_hold(rows, t0, period, held)
     h, called = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
     if method:
         h, called = most, model._called(method, counts["steps"], called)
@@ -308,7 +310,7 @@ class _Work:
         if method:
             model._lib.adaptive_fixed(count, self.memory, 1 + model.methods.index(method))
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
-        self.events = FoundInBatch(model, room_for(model) - count * n) if model.events else None
+        self.events = BatchEventBuffer(model, room_for(model) - count * n) if model.events else None
         if times[0] == t0:
             self.kept[:] = 1
             self.rows[:, :, 0] = begin
@@ -364,7 +366,7 @@ class _Work:
         for k in range(periods):
             end = self.limits[0]
             if k + 1 < periods:
-                end = end_of(k, self.t0, self.period, model.dtype)
+                end = period_end(k, self.t0, self.period, model.dtype)
             if self._on(at, count, end, u + k * model.nu if k else u, each, look):
                 return  # it was stopped
         self.open[at : at + count] = False
@@ -396,6 +398,6 @@ class _Work:
             )  # fmt: skip
             if self.events and events:
                 self.events.keep(events, at)
-            many = min(longer(many, perf_counter() - begun), 2**40)
+            many = min(next_chunk(many, perf_counter() - begun), 2**40)
             look()
         return bool(more)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, unmasked
 from .model import LARGE, Model
-from .starts import is_by_name, started
+from .starts import initial_state_for_parameters, is_by_name
 
 
 class Instances(Model):
@@ -41,7 +41,7 @@ class Instances(Model):
         """
         start, table = self._start, self._parameter_rows(params)
         if (params is not None and self._follows) or is_by_name(q0, qd0):
-            q0, qd0 = started(self, q0, qd0, table, many_values=True)
+            q0, qd0 = initial_state_for_parameters(self, q0, qd0, table, many_values=True)
         q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
         qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
         held = self._input_rows(u, steps)

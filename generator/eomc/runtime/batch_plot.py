@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, not_one_of
+from .atomic_write import File
 from .labels import mathtext, with_unit
 from .plot import Curve, Source, against, finished, given_axes, new_axes, no_files
-from .shown import by_eomc
-from .written import File
+from .plugins import require_eomc
 
 _OF_ONE = {"phase", "section", "other", "labels"}
 
@@ -51,7 +51,7 @@ class Fans:
         instances: how many, spread evenly, or which, at most 24. One that has stopped stands where
         it did. Raises KeyError for unknown names, EomcError for instances that there are not.
         """
-        page = by_eomc("report.animation")
+        page = require_eomc("report.animation")
         return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
 
 

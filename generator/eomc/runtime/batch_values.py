@@ -10,7 +10,7 @@ import numpy as np
 
 from .arguments import Array
 from .by_name import ByName
-from .facts import Facts
+from .metadata import ModelInfo
 
 _ROWS = 2**16  # of all instances in one call: they share the processor's cache
 
@@ -18,7 +18,7 @@ _ROWS = 2**16  # of all instances in one call: they share the processor's cache
 class Values:
     """A part of `batch_run.BatchRun`: as in a single run, with the instances before all else."""
 
-    _model: Facts
+    _model: ModelInfo
     q: Array
     qd: Array
     _params: Array  # (batch or 1, np)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .arguments import Array, as_count
 from .batch_instances import Instances
-from .slices import longer
+from .slices import next_chunk
 
 _GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
 _TILES = 64  # at most in a group: threads ask for the next one seldom
@@ -130,7 +130,7 @@ class Work:
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
             model._paces[kind] = max(1e-10, spent / (many * count))
-            many = longer(many, spent, _SECONDS)
+            many = next_chunk(many, spent, _SECONDS)
             look()
 
 

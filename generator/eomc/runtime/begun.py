@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from .recorded import Recorded
 from .status import MotionError
+from .trajectory_data import Trajectory
 
 
-def infinite_at_start(run: Recorded) -> str:
+def infinite_at_start(run: Trajectory) -> str:
     """Why no acceleration is finite there, in a sentence; "" where each is, or the run moved.
 
     An energy that alone overflows stops no motion.

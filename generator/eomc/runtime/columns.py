@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .arguments import Array, not_one_of
+from .atomic_write import File, atomic_write
 from .functions import Functions
-from .written import File, replacing
 
 
 class Columns:
@@ -110,7 +110,7 @@ class Columns:
 
     def _to_csv(self, path: Path) -> None:
         columns = self.to_dict()
-        with replacing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
+        with atomic_write(path) as new, new.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
             numbers = (c.astype(float) + 0.0 for c in columns.values())  # no -0, as of rest

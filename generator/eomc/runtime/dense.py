@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_numbers
 from .arguments import Array
-from .recorded import Recorded
+from .trajectory_data import Trajectory
 
 _AT = 1e-12  # of a step: so near a time is that of the step itself
 
@@ -24,7 +24,7 @@ def within(run: Any, t: ArrayLike) -> Array:
     return np.asarray(np.clip(times, begin, end))
 
 
-def states(run: Recorded, t: ArrayLike) -> tuple[Array, Array]:
+def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
     """(q, qd), each of the shape of t with nq behind, by the run's method from the row before.
 
     As exact as the run, where its forces are smooth: of the method's order. Inputs are held as in
@@ -47,7 +47,7 @@ def parts(times: Array, t0: float, h: float, most: int = 2**60) -> tuple[Array, 
     return whole, np.where(steps - whole < near, 0.0, times - (t0 + whole * h))
 
 
-def _state(run: Recorded, n: int, rest: float) -> Any:
+def _state(run: Trajectory, n: int, rest: float) -> Any:
     """The state `rest` behind the n-th step."""
     model, row = run._model, min(n // run.every, len(run) - 1)
     q, qd, first = run.q[row], run.qd[row], row * run.every
@@ -58,7 +58,7 @@ def _state(run: Recorded, n: int, rest: float) -> Any:
     return q, qd
 
 
-def _given(run: Recorded, n: int) -> tuple[float, Any]:
+def _given(run: Trajectory, n: int) -> tuple[float, Any]:
     """The time of the n-th step and the inputs over it."""
     t, u = run.t0 + n * run.h, run._u
     if u is None or (not callable(u) and not isinstance(u, str) and u.ndim == 1):

@@ -15,7 +15,7 @@ _DEPENDENT = {"float64": 1e-9, "float32": 1e-4}  # of the largest singular value
 _LEFT = {"float64": 1e-6, "float32": 1e-3}  # of the terms: what drives or rows may leave
 
 
-def driven(model: Constrained, drives: Sequence[str] | None) -> list[int]:
+def actuated_coordinates(model: Constrained, drives: Sequence[str] | None) -> list[int]:
     """Which coordinates have drives, all where None. Raises ValueError for unknown names."""
     if drives is None:
         return [*range(model.nq)]

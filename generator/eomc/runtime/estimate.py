@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .growth import growth, mean_mass_matrix, norm_root, other_directions
 from .package import reduced
-from .recorded import Recorded
 from .stepping import Stepping
+from .trajectory_data import Trajectory
 
 Array = NDArray[Any]
 
@@ -79,7 +79,7 @@ class Estimate:
         return reduced("estimate.Estimate", *self.__dict__.values())
 
 
-def estimate(run: Recorded, progress: Callable[[int, int], None] | None = None) -> Estimate:
+def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None) -> Estimate:
     """The error of a run, from the same run at h/2 and h/4, and finer ones where they differ.
 
     What the finest run leaves is taken from the last difference and the observed order, and
@@ -131,13 +131,13 @@ def estimate(run: Recorded, progress: Callable[[int, int], None] | None = None) 
 class _Again:
     """The same run in shorter steps or from a moved start, and how far all of them have come."""
 
-    def __init__(self, run: Recorded, progress: Callable[[int, int], None] | None) -> None:
+    def __init__(self, run: Trajectory, progress: Callable[[int, int], None] | None) -> None:
         self.run, self.progress, self.spent = run, progress, 0
 
-    def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Recorded:
+    def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Trajectory:
         """In steps of h/parts, keeping every so many of them."""
         progress = None if self.progress is None else self._report
-        made: Recorded = self.run._again(parts, every, nudge, progress)
+        made: Trajectory = self.run._again(parts, every, nudge, progress)
         self.spent += parts * self.run.steps
         if made.status == "interrupted":
             raise KeyboardInterrupt
@@ -149,7 +149,7 @@ class _Again:
             self.progress(min(self.spent + done, total), total)
 
 
-def _growth(run: Recorded, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
+def _growth(run: Trajectory, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
     """The scales (2 nq,), what a start moved by one scale would become at each row if that were
     little, (n, 2 nq), and the growth of a small difference until the end."""
     model, every, base, times = run._model, run.every, own, run.t
@@ -233,7 +233,7 @@ def growth_of(
         return max(*factors, growth(root, *(np.stack(x, axis=1) for x in ends)))
 
 
-def _leaps(run: Recorded, scale: Array, eps: float, again: _Again) -> bool:
+def _leaps(run: Trajectory, scale: Array, eps: float, again: _Again) -> bool:
     """Whether differences at the start are as large as they become however small they were.
 
     Forces jump there, as by -sign(qd) at rest: what is moved chatters by what a step brings. That
@@ -252,14 +252,14 @@ def _leaps(run: Recorded, scale: Array, eps: float, again: _Again) -> bool:
 
 
 def _finer(
-    run: Recorded, own: Array, scale: Array, one: float, eps: float, again: _Again
-) -> tuple[list[Array], float, Recorded | None]:
+    run: Trajectory, own: Array, scale: Array, one: float, eps: float, again: _Again
+) -> tuple[list[Array], float, Trajectory | None]:
     """The rows at h, h/2, h/4 and on until they converge; the order seen; a run that stopped.
 
     one: the rounding of one step relative to the scales.
     """
     found, order = [own], run._model.orders[run.method]
-    stopped: Recorded | None = None
+    stopped: Trajectory | None = None
     parts, last = 1, math.inf
     while True:
         parts *= 2
@@ -283,7 +283,7 @@ def _finer(
         last = now
 
 
-def _nothing(run: Recorded) -> Estimate:
+def _nothing(run: Trajectory) -> Estimate:
     """The start itself has no error."""
     names = [*run._model.coordinates, *(f"{c}_dot" for c in run._model.coordinates)]
     none = np.zeros_like(run.q, dtype=float)
@@ -293,7 +293,7 @@ def _nothing(run: Recorded) -> Estimate:
     return Estimate(none, none.copy(), zero, digits, order, math.nan, 1.0, "")
 
 
-def _counts(run: Recorded, every: int, rows: int) -> Array:
+def _counts(run: Trajectory, every: int, rows: int) -> Array:
     """The steps done at each row."""
     return np.minimum(np.arange(rows) * every, run.steps)
 
@@ -341,7 +341,7 @@ def _size(x: Array) -> float:
         return float(np.nan_to_num(np.sqrt(np.mean(np.square(x))), nan=np.inf))
 
 
-def _padded(run: Recorded, rows: int, every: int) -> Array:
+def _padded(run: Trajectory, rows: int, every: int) -> Array:
     """The states of a finer run at the run's own rows: nan from where it stopped."""
     out = np.full((rows, 2 * run._model.nq), np.nan)
     kept = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
@@ -363,8 +363,8 @@ def rounding_words(model: Stepping, amplification: float, lost: float) -> str:
 
 
 def _verdict(
-    run: Recorded, names: Sequence[str], relative: Array, walk: Array, observed: float, order: int,
-    amplification: float, stopped: Recorded | None,
+    run: Trajectory, names: Sequence[str], relative: Array, walk: Array, observed: float,
+    order: int, amplification: float, stopped: Trajectory | None,
 ) -> list[str]:  # fmt: skip
     """What speaks against the run, one reason a string."""
     words = []

@@ -13,13 +13,13 @@ import numpy as np
 from .arguments import Array
 from .begun import infinite_at_start
 from .by_name import ByName
-from .happened import Happened
+from .events import EventLog
+from .input_schedule import sample_zero_order_hold
 from .package import is_made_in_python, option
-from .periods import held_at
-from .recorded import LEFT_OUT
 from .status import SAID, state_text
 from .stepping import Stepping
 from .trajectory import Run
+from .trajectory_data import LEFT_OUT
 
 _NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
 STOPPED = (
@@ -97,12 +97,12 @@ class Fitted(Run):
         return f"stopped at t = {end:.9g} after {done}, {where}: {why}"
 
     @cached_property
-    def events(self) -> dict[str, Happened]:
+    def events(self) -> dict[str, EventLog]:
         """Where and when each of the scene's events happened."""
         which, rows = self._happened
         nq, names = self._model.nq, self._model.events
         each = (rows[which == k] for k in range(len(names)))
-        found = (Happened(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
+        found = (EventLog(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
         return ByName("events", names, found)
 
     @property
@@ -128,7 +128,7 @@ class Fitted(Run):
     def _told_inputs(self) -> None:
         """Find which of the values that are held over periods acts at each row."""
         if self._held is not None:
-            self._applied = held_at(self._times, self.t0, self._period, self._held)
+            self._applied = sample_zero_order_hold(self._times, self.t0, self._period, self._held)
 
     def _again(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
         raise ValueError("an adaptive run has no steps of one size")

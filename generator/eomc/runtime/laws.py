@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .facts import Facts
 from .functions import Functions
+from .metadata import ModelInfo
 from .package import warn
 
 
@@ -37,7 +37,7 @@ def asked(
     return np.array(found)
 
 
-def called_each_step(model: Facts) -> None:
+def warn_called_each_step(model: ModelInfo) -> None:
     """Warn, once, that a function as u is slow."""
     if "u" not in model._warned:
         model._warned.add("u")
@@ -47,7 +47,7 @@ def called_each_step(model: Facts) -> None:
         )
 
 
-class Law:
+class FeedbackLaw:
     """A function u(t, q, qd) that a run calls every so many steps; keeps what rows have of it."""
 
     def __init__(
@@ -71,7 +71,7 @@ class Law:
         return np.array([*self.kept, last][:count], last.dtype)
 
 
-class Sampled:
+class SampledSignal:
     """The scene's signals as a law, which is held over a control period."""
 
     def __init__(self, model: Functions, params: Any) -> None:

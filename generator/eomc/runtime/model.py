@@ -15,7 +15,7 @@ import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from . import adaptive, saved, stepped, timed
+from . import adaptive, fixed_step_events, output_times, saved
 from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
@@ -28,18 +28,18 @@ from .arguments import (
     as_step_size,
     machine_memory,
 )
+from .atomic_write import File
 from .discretize import discretize
-from .facts import CHUNK, SOME
-from .laws import Law, Sampled, called_each_step
+from .laws import FeedbackLaw, SampledSignal, warn_called_each_step
+from .metadata import CHUNK, SOME
 from .package import option, warn
-from .shown import with_events
-from .slices import longer
+from .plugins import with_events
+from .slices import next_chunk
 from .stability import advice
-from .starts import is_by_name, started
+from .starts import initial_state_for_parameters, is_by_name
 from .status import STATUS, Interrupted
 from .stepping import Stepping
 from .trajectory import Run
-from .written import File
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
@@ -67,7 +67,7 @@ class Model(Stepping):
     @property
     def _kinds(self) -> dict[str, Any]:
         """The classes of its runs by their names."""
-        kinds = (Run, timed.TimedRun, adaptive.AdaptiveRun, adaptive.SteppedRun)
+        kinds = (Run, output_times.TimedRun, adaptive.AdaptiveRun, adaptive.SteppedRun)
         return {x.__name__: x for x in kinds}
 
     def discretize(
@@ -114,7 +114,7 @@ class Model(Stepping):
             other, given = with_events(self.simulate, dict(locals()))
             return cast(Run, other.simulate(**given))
         if (params is not None and self._follows) or is_by_name(q0, qd0):
-            q0, qd0 = started(self, q0, qd0, self._parameters(params))
+            q0, qd0 = initial_state_for_parameters(self, q0, qd0, self._parameters(params))
         usual = (out is None and progress is None and control_period is None and not estimate
                  and times is None and type(t0) is float and isfinite(t0))  # fmt: skip
         if (
@@ -130,7 +130,9 @@ class Model(Stepping):
             given = q0, qd0, duration, u, params, t0, progress, times, control_period
             fixed = h, steps, method, every, out
             if not by_tol:
-                return self._finished(stepped.simulate(self, *given, fixed, self._look), estimate)
+                return self._finished(
+                    fixed_step_events.simulate(self, *given, fixed, self._look), estimate
+                )
             made = adaptive.simulate(self, *given, tol, h_most, stiff, fixed)
             return self._finished(made, estimate)
         method = self.methods[0] if method is None else self._method(method)
@@ -155,12 +157,12 @@ class Model(Stepping):
                 ):
                     return Run(self, t0, rows, h, steps, "ok", p, every, None, method, done)
         t0 = as_number(t0, "t0")
-        at, steps = timed.as_asked(self, times, t0, h, duration, steps, every, out)
+        at, steps = output_times.as_asked(self, times, t0, h, duration, steps, every, out)
         steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
         u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at)
         if u is None and control_period is not None and self.nu:
-            u = Sampled(self, params)
+            u = SampledSignal(self, params)
         if steps >= SOME and (method, h) not in self._warned:
             self._look(q, qd, h, t0, self._first(u, steps, hold), p, method)
         result = self._trajectory(
@@ -197,7 +199,7 @@ class Model(Stepping):
     ) -> str | None:  # fmt: skip
         """Where h is beyond the stability limit of the method at a start: that, in a sentence."""
         given, method = self._parameters(params), self._method(method)
-        q, qd = self._state(*started(self, q0, qd0, given))
+        q, qd = self._state(*initial_state_for_parameters(self, q0, qd0, given))
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
 
@@ -215,7 +217,7 @@ class Model(Stepping):
         law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every, hold)
         if at is not None:
             acts = law, held, stride, hold
-            return timed.run(self, q, qd, t0, h, steps, at, acts, p, method, progress)
+            return output_times.run(self, q, qd, t0, h, steps, at, acts, p, method, progress)
         rows = 1 - -steps // every
         both: Any = out
         try:
@@ -259,7 +261,7 @@ class Model(Stepping):
                 if done == steps:
                     break
                 if not law:
-                    chunk = longer(count, perf_counter() - begun)
+                    chunk = next_chunk(count, perf_counter() - begun)
         except KeyboardInterrupt:
             done, said = work.done if work else done, "interrupted"
             if not done:
@@ -283,7 +285,7 @@ class Model(Stepping):
 
     def _table(
         self, u: Any, steps: int, every: int, hold: int
-    ) -> tuple[Law | None, Array | None, int]:
+    ) -> tuple[FeedbackLaw | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
         if u is None:
             return None, None, 0
@@ -291,8 +293,8 @@ class Model(Stepping):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             if hold == 1:
-                called_each_step(self)
-            return Law(u, self._inputs, every, hold), None, 0
+                warn_called_each_step(self)
+            return FeedbackLaw(u, self._inputs, every, hold), None, 0
         if isinstance(u, Mapping):
             u = self._by_name(u)
         array = self._numbers(u, "u")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .labels import plain
-from .shown import by_eomc
+from .plugins import require_eomc
 
 SHOWN = 12  # coordinates in the table, at most
 
@@ -74,6 +74,6 @@ def _picture(run: Any) -> str:
 def _mechanism(run: Any) -> Any:
     """What draws the mechanism of a run; None where nothing says what it looks like."""
     try:
-        return by_eomc("report.picture").of_run(run)
+        return require_eomc("report.picture").of_run(run)
     except ImportError:
         return None

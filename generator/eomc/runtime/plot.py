@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
+from .atomic_write import File
 from .columns import imported
 from .labels import mathtext, plain, rate_unit, with_unit
-from .written import File
 
 TOGETHER = 6  # curves of one panel, about; of more coordinates than this a few panels are made
 ALIKE = 30.0  # how much larger the largest curve of a panel may be than its smallest

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .facts import Facts
+from .atomic_write import File, atomic_write
+from .metadata import ModelInfo
 from .package import warn
-from .shown import eventful
-from .written import File, replacing
+from .plugins import eventful
 
 KINDS = (
     "Run",
@@ -45,7 +45,7 @@ def write(run: Any, path: Path) -> None:
         arrays["jacobi"] = run.jacobi
     arrays |= {name: value for name, value in run._kept().items() if value is not None}
     made: Any = {name: np.asarray(value) for name, value in arrays.items()}
-    with replacing(path) as new, new.open("wb") as file:
+    with atomic_write(path) as new, new.open("wb") as file:
         np.savez(file, **made)
 
 
@@ -57,7 +57,7 @@ def _text(events: Any) -> str:
         return ""
 
 
-def read(model: Facts, file: File) -> tuple[Any, str, dict[str, Any]]:
+def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
     """The model of a saved run, its kind, one of KINDS, and what it kept.
 
     The model is another than was given where a call had asked for events.
@@ -91,7 +91,7 @@ def read(model: Facts, file: File) -> tuple[Any, str, dict[str, Any]]:
     return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
 
 
-def _asked(model: Facts, found: dict[str, Array], file: File) -> Any:
+def _asked(model: ModelInfo, found: dict[str, Array], file: File) -> Any:
     """The model with the events that a saved run's call asked for."""
     known = vars(model).get("_eventful", {}).values()
     if same := [other for other in known if other.digest == found["digest"]]:

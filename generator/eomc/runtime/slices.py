@@ -9,7 +9,7 @@ _SECONDS = 0.05  # a slice, as its predecessor suggests
 _FASTER = 16.0  # slices grow by this at most, since the first rows may be the cheap ones
 
 
-def longer(many: int, spent: float, seconds: float = _SECONDS) -> int:
+def next_chunk(many: int, spent: float, seconds: float = _SECONDS) -> int:
     """How many to do at once after so many took so many seconds."""
     return int(many * min(_FASTER, max(1 / _FASTER, seconds / (spent + 1e-9)))) + 1
 
@@ -21,4 +21,4 @@ def slices(count: int, first: int) -> Iterator[tuple[int, int]]:
         many = min(many, count - at)
         begun = perf_counter()
         yield at, many
-        at, many = at + many, longer(many, perf_counter() - begun)
+        at, many = at + many, next_chunk(many, perf_counter() - begun)

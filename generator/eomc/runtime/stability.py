@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .facts import Facts
+from .metadata import ModelInfo
 
 
 def beyond_end(h: float, duration: float) -> str | None:
@@ -22,7 +22,7 @@ def beyond_end(h: float, duration: float) -> str | None:
 
 
 def advice(
-    model: Facts, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
+    model: ModelInfo, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
 ) -> str | None:
     """A sentence where h is beyond the stability limit of the method at a state, else None.
 
@@ -55,7 +55,7 @@ def advice(
 
 
 def _modes(
-    model: Facts, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
+    model: ModelInfo, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
 ) -> tuple[float, float] | None:
     """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
 
@@ -88,7 +88,7 @@ def _modes(
     return min(found, key=max, default=None)
 
 
-def _allowed(model: Facts, x: Array, t: float, params: Any, near: Array) -> Array:
+def _allowed(model: ModelInfo, x: Array, t: float, params: Any, near: Array) -> Array:
     """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal."""
     n, holonomic = model.nq, model._rows.holonomic
     least = math.sqrt(float(np.finfo(model.dtype).eps))

@@ -32,7 +32,7 @@ def is_by_name(q0: Any, qd0: Any) -> bool:
     return hasattr(q0, "keys") or hasattr(qd0, "keys")
 
 
-def started(
+def initial_state_for_parameters(
     model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
 ) -> tuple[Any, Any]:
     """Complete a start: what is not given is where the scene starts at the parameters.

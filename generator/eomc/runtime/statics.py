@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, Start, as_number
 from .constrained import Constrained
-from .drives import Motion, drive_forces, driven
+from .drives import Motion, actuated_coordinates, drive_forces
 from .equilibrium import Equilibrium, equilibrium
-from .starts import started, values_by_name
+from .starts import initial_state_for_parameters, values_by_name
 
 
 class Statics(Constrained):
@@ -31,7 +31,7 @@ class Statics(Constrained):
         tau^T D^-1 tau. Raises ValueError where the drives can't give this motion, or constraints
         don't allow qdd.
         """
-        which = driven(self, drives)
+        which = actuated_coordinates(self, drives)
         force = self.inverse_dynamics(q, qd, qdd, f_ext, t=t, params=params)
         force = force - self.tau(q, qd, t, np.zeros(self.nu) if self.nu else None, params)
         at, moving = self._state(q, qd)
@@ -92,7 +92,9 @@ class Statics(Constrained):
         else:
             moving = self._completed(rates, 1)
         q = self._completed(q, 0)
-        at, moving = self._one(*started(self, q, moving, self._parameters(params)))
+        at, moving = self._one(
+            *initial_state_for_parameters(self, q, moving, self._parameters(params))
+        )
         moves = [name for name in self.coordinates if name not in self.still]
         names = moves if free is None else tuple(free)
         held = self._inputs(u)

@@ -18,7 +18,7 @@ from .arguments import (
     check_time,
     cut_table,
 )
-from .facts import Facts
+from .metadata import ModelInfo
 from .package import warn
 from .stability import beyond_end
 from .status import SAID, STATUS, MotionError, state_text
@@ -26,7 +26,7 @@ from .status import SAID, STATUS, MotionError, state_text
 _MOST = 2**60  # steps, so that C can return four times as many
 
 
-class Stepping(Facts):
+class Stepping(ModelInfo):
     """A compiled scene that makes steps."""
 
     def step(

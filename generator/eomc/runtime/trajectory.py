@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array
+from .atomic_write import File
 from .balance import Balance, balance
 from .begun import infinite_at_start
 from .by_name import ByName
@@ -19,11 +20,10 @@ from .laws import asked
 from .notebook import html
 from .package import warn
 from .plot import plot
-from .recorded import Recorded
+from .plugins import require_eomc
 from .section import as_section, crossings
-from .shown import by_eomc
 from .status import SAID, Interrupted, state_text
-from .written import File
+from .trajectory_data import Trajectory
 
 NOISE = (
     "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
@@ -32,7 +32,7 @@ NOISE = (
 
 
 @dataclass(eq=False, repr=False)
-class Run(Recorded):
+class Run(Trajectory):
     """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
 
     status: "ok", "singular", "not finite", "no convergence", under constraints "locked", or
@@ -129,7 +129,7 @@ class Run(Recorded):
         not loaded by eomc.load. Returns an Animation; see docs/pictures.md. Raises ImportError
         without eomc, EomcError where it can't be drawn or written.
         """
-        page = by_eomc("report.animation")
+        page = require_eomc("report.animation")
         return page.animate([self, *others], file, scene=scene, title=title)
 
     def render(self, t: ArrayLike | None = None, *, scene: Any = None) -> Array:
@@ -156,7 +156,7 @@ class Run(Recorded):
         ValueError
             If a time lies outside of the run.
         """
-        pixels: Array = by_eomc("report.film").render(self, t, scene)
+        pixels: Array = require_eomc("report.film").render(self, t, scene)
         return pixels
 
     def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:

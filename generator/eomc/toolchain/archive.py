@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from eomc.base.errors import writing
-from eomc.runtime.written import replacing
+from eomc.runtime.atomic_write import atomic_write
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all entries: the earliest date that zip allows
 
@@ -20,7 +20,7 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
     """
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as new, zipfile.ZipFile(new, "w") as archive:
+        with atomic_write(file) as new, zipfile.ZipFile(new, "w") as archive:
             for name, data in contents.items():
                 entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED

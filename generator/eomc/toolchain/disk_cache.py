@@ -9,7 +9,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from eomc.runtime.written import replacing
+from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain.cache import generator_digest
 
 
@@ -43,6 +43,6 @@ def cached_texts(
     if name:
         with contextlib.suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(file, cached=True) as new:
+            with atomic_write(file, cached=True) as new:
                 new.write_text(json.dumps({"key": key, "texts": results}), encoding="utf-8")
     return results

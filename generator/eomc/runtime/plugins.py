@@ -10,7 +10,7 @@ from typing import Any
 from .package import no_argument
 
 
-def by_eomc(room: str, what: str = "runs are drawn") -> Any:
+def require_eomc(room: str, what: str = "runs are drawn") -> Any:
     """The module `room` of eomc. Raises ImportError with the remedy where there is none.
 
     It is asked for by its name where a picture is wanted, or events that the scene has not.
@@ -46,7 +46,7 @@ def eventful(model: Any, events: Any) -> Any:
     """The model with events besides its own, built where it is not there yet."""
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
-        build = by_eomc("pipeline", "events of a run are compiled").with_events
+        build = require_eomc("pipeline", "events of a run are compiled").with_events
         known[key] = build(model, events, Path(__file__).parent)._model
         vars(known[key])["_asked"] = model, events  # for files of its runs
     return known[key]

@@ -49,7 +49,7 @@ def check_replaceable(file: File) -> None:
 
 
 @contextmanager
-def replacing(file: File, cached: bool = False) -> Iterator[Path]:
+def atomic_write(file: File, cached: bool = False) -> Iterator[Path]:
     """A name beside `file`, with its suffix, for what takes its place when all is written.
 
     Where that fails or is interrupted the file is as it was, and nothing is beside it. Of a link

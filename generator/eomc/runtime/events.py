@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .facts import Facts
+from .metadata import ModelInfo
 from .package import reduced
 
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
 
 
 @dataclass(frozen=True, repr=False)
-class Happened:
+class EventLog:
     """Where an event happened: t (n,), s; q and qd (n, nq), before a jump."""
 
     t: Array
@@ -24,7 +24,7 @@ class Happened:
     qd: Array
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return reduced(f"happened.{type(self).__name__}", *self.__dict__.values())
+        return reduced(f"events.{type(self).__name__}", *self.__dict__.values())
 
     def __len__(self) -> int:
         return len(self.t)
@@ -41,13 +41,13 @@ class Happened:
 
 
 @dataclass(frozen=True, repr=False)
-class HappenedInBatch(Happened):
+class BatchEventLog(EventLog):
     """The same of many: instance (n,) tells which; they follow one another, each in its order."""
 
     instance: Array
     _batch: int
 
-    def of(self, k: int) -> Happened:
+    def of(self, k: int) -> EventLog:
         """Those of instance k, of the last where k is -1. Raises IndexError where there is none."""
         try:
             at = index(k)
@@ -56,25 +56,25 @@ class HappenedInBatch(Happened):
         if not -self._batch <= at < self._batch:
             raise IndexError(f"of: there is no instance {at}: they are 0 to {self._batch - 1}")
         own = self.instance == at % self._batch
-        return Happened(self.t[own], self.q[own], self.qd[own])
+        return EventLog(self.t[own], self.q[own], self.qd[own])
 
     def __repr__(self) -> str:
         many = f", in {len(np.unique(self.instance))} of {self._batch} instances"
         return f"<{self._times}{many if len(self) else ''}>"
 
 
-class FoundInBatch:
+class BatchEventBuffer:
     """All events of many instances, found in calls by any thread."""
 
-    def __init__(self, model: Facts, most: float) -> None:
+    def __init__(self, model: ModelInfo, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
-    def room(self, count: int) -> GroupRoom:
+    def room(self, count: int) -> GroupEventBuffer:
         """Room for a call of so many instances."""
-        return GroupRoom(self.model, count)
+        return GroupEventBuffer(self.model, count)
 
-    def keep(self, room: GroupRoom, first: int) -> None:
+    def keep(self, room: GroupEventBuffer, first: int) -> None:
         """Copy what a call has found of instances from `first` on."""
         some = np.arange(room.which.shape[1]) < room.counts[:, None]
         if some.any():
@@ -95,10 +95,10 @@ class FoundInBatch:
         return instances[order], which[order], rows[order]
 
 
-class GroupRoom:
+class GroupEventBuffer:
     """Room for the events of a call of some instances."""
 
-    def __init__(self, model: Facts, count: int) -> None:
+    def __init__(self, model: ModelInfo, count: int) -> None:
         self.counts = np.zeros(count, "l")
         each = _EVENTS_EACH + len(model.events)
         self.which = np.empty((count, each), np.intc)
@@ -110,10 +110,10 @@ class GroupRoom:
         )  # fmt: skip
 
 
-class Found:
+class EventBuffer:
     """Room for the events of a call, and all that were found."""
 
-    def __init__(self, model: Facts) -> None:
+    def __init__(self, model: ModelInfo) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
         self.which = np.empty(_EVENTS + len(model.events), np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)

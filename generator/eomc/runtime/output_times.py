@@ -15,8 +15,8 @@ from .adaptive_arguments import as_times
 from .arguments import Array
 from .dense import parts, within
 from .estimate import Estimate, estimate
-from .laws import Law
-from .slices import longer
+from .laws import FeedbackLaw
+from .slices import next_chunk
 from .status import STATUS
 from .stepping import Stepping
 from .trajectory import Run
@@ -124,7 +124,7 @@ def as_asked(
 
 def run(
     model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int, times: Array,
-    acts: tuple[Law | None, Array | None, int, int], p: Array, method: str,
+    acts: tuple[FeedbackLaw | None, Array | None, int, int], p: Array, method: str,
     progress: Callable[[int, int], None] | None,
 ) -> TimedRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) from t0 on.
@@ -174,7 +174,7 @@ class _Way:
 
     def __init__(
         self, model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int,
-        acts: tuple[Law | None, Array | None, int, int], p: Array, method: str,
+        acts: tuple[FeedbackLaw | None, Array | None, int, int], p: Array, method: str,
     ) -> None:  # fmt: skip
         self.model, self.t0, self.h, self.steps = model, t0, h, steps
         _, self.run, _, self.stages, self.work_type, self.counted = model._loops[method]
@@ -211,7 +211,7 @@ class _Way:
             if said != "ok":
                 return said
             if count == self.chunk:
-                self.chunk = longer(count, perf_counter() - begun)
+                self.chunk = next_chunk(count, perf_counter() - begun)
             if progress is not None:
                 progress(self.done, self.steps)
         return "ok"

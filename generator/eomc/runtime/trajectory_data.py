@@ -29,7 +29,7 @@ class _Half:
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
-    def __get__(self, run: Recorded | None, owner: type) -> Array:
+    def __get__(self, run: Trajectory | None, owner: type) -> Array:
         if run is None:
             return self  # type: ignore[return-value]  # on the class, as for help()
         half: Array = run._rows[self.index]
@@ -38,7 +38,7 @@ class _Half:
 
 
 @dataclass(eq=False, repr=False)
-class Recorded(ConstrainedRun, Columns):
+class Trajectory(ConstrainedRun, Columns):
     """What `trajectory.Run` keeps, and what follows from that alone."""
 
     _model: Stepping
@@ -134,7 +134,7 @@ class Recorded(ConstrainedRun, Columns):
         """What a function of the state gives at each row, (n, ...)."""
         return np.asarray(function(self.q, self.qd, t=self.t, params=self._params, **held))
 
-    def _even(self) -> Recorded:
+    def _even(self) -> Trajectory:
         """With rows equally far apart, as many as there are steps, or enough to draw it."""
         return self if self.every == 1 else self._again(1, 1, None, None)
 
@@ -205,7 +205,7 @@ class Recorded(ConstrainedRun, Columns):
         return reduced(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_state", state)
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Recorded):
+        if not isinstance(other, Trajectory):
             return NotImplemented
         alike = self._settings() == other._settings()
         return alike and np.array_equal(self.q, other.q) and np.array_equal(self.qd, other.qd)

@@ -12,9 +12,9 @@ from . import adaptive
 from .adaptive import SteppedRun
 from .adaptive_arguments import as_times
 from .arguments import Array, as_count, as_number, as_period, as_step_size, check_time
-from .facts import SOME
-from .laws import called_each_step
-from .periods import as_acting
+from .input_schedule import input_schedule
+from .laws import warn_called_each_step
+from .metadata import SOME
 from .stepping import Stepping
 
 
@@ -40,8 +40,8 @@ def simulate(
     end = float(model.dtype.type(t0 + span))
     hold = as_hold(u, control_period, h)
     if callable(u) and hold == h:
-        called_each_step(model)
-    held = as_acting(model, u, hold, span, params, duration)
+        warn_called_each_step(model)
+    held = input_schedule(model, u, hold, span, params, duration)
     if span >= SOME * h and (method, h) not in model._warned:
         look(q, qd, h, t0, held if isinstance(held, np.ndarray) else None, p, method)
     first = 0 if rows is None else int(rows[0] == t0)

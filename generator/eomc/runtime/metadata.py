@@ -14,7 +14,7 @@ CHUNK = 16_384  # steps times coordinates before the first look, some ms
 SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 
 
-class Facts(Statics):
+class ModelInfo(Statics):
     """A compiled scene with the facts that runs need of it."""
 
     source: Any = None  # what eomc.load made it from, a path or a System; pictures need it

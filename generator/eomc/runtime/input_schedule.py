@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, as_step_size, cut_table, machine_memory
-from .facts import Facts
-from .laws import Sampled, asked
+from .laws import SampledSignal, asked
+from .metadata import ModelInfo
 from .status import PART
 
 NO_PERIOD = (
@@ -22,7 +22,7 @@ _VALUE = 200  # bytes of what is held over a period, as it is kept
 
 
 @dataclass(frozen=True)
-class Periods:
+class ZeroOrderHold:
     """What is held over one period after another: by a function u(t, q, qd), or by rows (n, nu)."""
 
     of: Callable[..., Any] | Array
@@ -30,18 +30,18 @@ class Periods:
     count: int  # of the run, the last of which may be shorter
 
 
-def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
+def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array) -> Array:
     """Which of values (..., n, nu) are held at times (m,), (..., m, nu): at a start its own."""
     starts = np.asarray(t0 + period * np.arange(values.shape[-2]), times.dtype)
     begun = np.searchsorted(starts, times, side="right") - 1
     return np.asarray(values[..., np.maximum(begun, 0), :])
 
 
-def as_acting(
-    model: Facts, u: Any, control_period: float | None, span: float, params: Any,
+def input_schedule(
+    model: ModelInfo, u: Any, control_period: float | None, span: float, params: Any,
     duration: float | None = None,
-) -> Array | Periods | None:  # fmt: skip
-    """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError.
+) -> Array | ZeroOrderHold | None:  # fmt: skip
+    """The inputs of a run by a tolerance as `InputSchedule` takes them, or a ValueError.
 
     duration: which a table may cover instead of the span, s.
     """
@@ -51,12 +51,14 @@ def as_acting(
     if u is None:
         if period is None or not model.nu:
             return None
-        return _few(model, Periods(Sampled(model, params), period, periods_in(span, period)))
+        return _few(
+            model, ZeroOrderHold(SampledSignal(model, params), period, count_periods(span, period))
+        )
     if not model.nu:
         raise ValueError("u: this scene has no inputs")
     if not callable(u):
         if period is not None and duration is not None:
-            u = cut_table(u, model.nu, periods_in(duration, period), periods_in(span, period))
+            u = cut_table(u, model.nu, count_periods(duration, period), count_periods(span, period))
         if isinstance(u, Mapping):
             u = model._by_name(u)
         rows = model._numbers(u, "u")
@@ -70,7 +72,7 @@ def as_acting(
                 f"u: shape {np.shape(u)}, expected ({model.nu},): one value an input; rows, each "
                 "held over a control period, take control_period=, in s"
             )
-        if len(rows) != (count := periods_in(span, period)):
+        if len(rows) != (count := count_periods(span, period)):
             raise ValueError(
                 f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row "
                 f"each, or duration={len(rows) * period:g}"
@@ -78,10 +80,10 @@ def as_acting(
         u = rows.copy()
     if period is None:
         raise ValueError(NO_PERIOD)
-    return _few(model, Periods(u, period, periods_in(span, period)))
+    return _few(model, ZeroOrderHold(u, period, count_periods(span, period)))
 
 
-def _few(model: Facts, made: Periods) -> Periods:
+def _few(model: ModelInfo, made: ZeroOrderHold) -> ZeroOrderHold:
     """The same, or a MemoryError where a run can't keep its rows."""
     count = made.count
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
@@ -92,30 +94,30 @@ def _few(model: Facts, made: Periods) -> Periods:
     return made
 
 
-def periods_in(span: float, period: float) -> int:
+def count_periods(span: float, period: float) -> int:
     """Periods in a span, the last of which may be shorter."""
     return max(ceil(span / period * (1 - 1e-12)), 1)
 
 
-def end_of(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
+def period_end(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
     """Where the k-th period of a run ends, as the module's numbers hold it."""
     return float(dtype.type(t0 + (k + 1) * period))
 
 
-class Acting:
+class InputSchedule:
     """The inputs of a run on its way: what C takes now, and the time until which that holds."""
 
     def __init__(
         self,
-        model: Facts,
-        u: Array | Periods | None,
+        model: ModelInfo,
+        u: Array | ZeroOrderHold | None,
         t0: float,
         t_end: float,
         q: Array,
         qd: Array,
     ) -> None:
         self.model, self.t0, self.t_end, self.stop = model, t0, t_end, t_end
-        self.periods = u if isinstance(u, Periods) else None
+        self.periods = u if isinstance(u, ZeroOrderHold) else None
         self.held: Any = None if self.periods else u
         self.values: list[Array] = []  # of each period
         if self.periods:
@@ -147,7 +149,7 @@ class Acting:
         self.values.append(self.held)
         self.stop = self.t_end
         if done + 1 < self.periods.count:
-            self.stop = min(end_of(done, self.t0, self.periods.period, model.dtype), self.t_end)
+            self.stop = min(period_end(done, self.t0, self.periods.period, model.dtype), self.t_end)
 
     @property
     def u(self) -> Any:
