@@ -5,7 +5,7 @@ import sympy
 from sympy.physics.mechanics import dynamicsymbols
 
 from eomc.base.errors import EomcError
-from eomc.model.constraints import Dependence
+from eomc.model.constraints import VelocityDegree
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import Coordinate, dot, symbol, t
 from eomc.model.system import System
@@ -71,7 +71,7 @@ def test_without_constraints_everything_is_held():
 def test_dependence_follows_definitions():
     x, y = Coordinate("x"), Coordinate("y")
     p, v = symbol("p"), symbol("v")
-    of = Dependence([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).of
+    of = VelocityDegree([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).of
 
     def found(e):
         rates = of(e)

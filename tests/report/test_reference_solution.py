@@ -17,7 +17,7 @@ from conftest import ROOT, needs
 import eomc
 from eomc.base.errors import EomcError
 from eomc.emit import c_expression
-from eomc.model.corners import corners
+from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.report import reference_solution
 
@@ -167,7 +167,7 @@ def test_a_jump_costs_digits(tmp_path: Path) -> None:
     rubbed = System.make("rubbed", {x: (1.0, 0.0)}, v**2 / 2, 9 * x**2 / 2,
                          forces={x: -sympy.sign(v) / 2}, duration=2.0)  # fmt: skip
     made = reference_solution.solve(rubbed, rows=8, root=tmp_path)
-    assert corners(rubbed) == "sign"
+    assert nonsmooth_functions(rubbed) == "sign"
     assert made.digits[-1] < 20
     # half a swing about x = 1/18 until pi/3, then about -1/18
     turned = -1 + 2 / 18

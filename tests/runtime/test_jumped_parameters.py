@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import eomc
 from eomc.base.errors import SceneError
-from eomc.model.discrete import constant
+from eomc.model.discrete import with_constant_parameters
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.assembly import assembled
@@ -165,7 +165,7 @@ def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
     assert not gripper.acceleration(q, qd)[2:].any()
     A = gripper.linearize(q, qd)[0]
     assert A[6, 2] != 0 and not A[8:].any()  # they move others, and nothing moves them
-    core = constant(system)
+    core = with_constant_parameters(system)
     assert [c.name for c in core.coordinates] == ["x", "theta"]
     assert {p.name: p.value for p in core.parameters}["l"] == 0.5
     assert "q = (x, theta)" in equations.write_equations(system)
@@ -276,7 +276,10 @@ def test_both_references_have_them_as_constants(text: str) -> None:
     system = assembled(from_scene(parse(text, "test.toml")))
     n = len(system.q)
     q, qd = np.random.default_rng(2).uniform(0.3, 0.9, (2, 5, n))
-    one, other = reference_for(system), DiscreteReference(system, TaylorReference(constant(system)))
+    one, other = (
+        reference_for(system),
+        DiscreteReference(system, TaylorReference(with_constant_parameters(system))),
+    )
     names = ["D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "power"]
     names += ["constraint_jacobian", "gamma"] if system.constraints else []
     for name in names:

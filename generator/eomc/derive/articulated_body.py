@@ -18,7 +18,7 @@ from sympy import Expr, S
 from eomc.derive.newton_euler import Inertia, Recursion
 from eomc.derive.tape import Stage
 from eomc.derive.vectors import AXES, ZERO, Vector
-from eomc.model.exact import Matrix
+from eomc.model.rational import Matrix
 
 Rows = list[list[Expr]]
 Column = tuple[Sequence[Expr], Sequence[Expr]]  # U = I s of a joint axis s: moment, force

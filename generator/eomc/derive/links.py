@@ -10,7 +10,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.spatial import transposed
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
-from eomc.model.exact import Matrix
+from eomc.model.rational import Matrix
 from eomc.model.tree import Tree
 
 

@@ -24,7 +24,7 @@ from eomc.base.spatial import ENTRIES
 from eomc.derive.links import Links
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector
-from eomc.model.exact import Matrix
+from eomc.model.rational import Matrix
 from eomc.model.tree import Link, Tree
 
 

@@ -17,7 +17,7 @@ from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
 from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, FixedSteps
 from eomc.integrators.tableaux import GAUSS16, Row
-from eomc.model.corners import steep
+from eomc.model.nonsmooth import has_steep_terms
 from eomc.model.system import System
 from eomc.program import outline
 from eomc.scene.schema import MAX_TOLERANCE
@@ -43,7 +43,7 @@ def memory(functions: Functions) -> str:
 
 def workspace_size(system: System, width: int) -> int:
     """Return the length of the workspace. width: of a vector of coordinates."""
-    vectors, scalars = (8, 26) if steep(system) else (6, 22)
+    vectors, scalars = (8, 26) if has_steep_terms(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
     event_numbers = 11 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
     vectors += 2 * any(e.begins is not None for e in system.events)
@@ -259,7 +259,7 @@ def steps(stepping: Stepping) -> Adaptive:
             most=f"{target.literal(REJECT_AFTER_TWO)}*aim", cap="capped ? cap : 0", **references
         ),
         within=stepping.interpolate,
-        corners=steep(target.system),
+        corners=has_steep_terms(target.system),
         longest=target.literal(MAX_TIME_SCALES),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(KINK_SHARE),
@@ -385,7 +385,7 @@ def steps_in_parallel(target: Target) -> bool:
     Large systems occupy the vector registers with one instance.
     """
     s = target.system
-    plain = not (s.events or s.constraints or steep(s))
+    plain = not (s.events or s.constraints or has_steep_terms(s))
     return (
         plain
         and s.run.batch

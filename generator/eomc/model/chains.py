@@ -10,8 +10,8 @@ from sympy import Expr, S
 
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
-from eomc.model import exact
-from eomc.model.exact import ONE, ZERO, Matrix, Vector
+from eomc.model import rational
+from eomc.model.rational import ONE, ZERO, Matrix, Vector
 from eomc.scene.assembly import WORLD
 
 Named = Callable[[str, Vector, Matrix], tuple[Vector, Matrix]]  # a body's place, by names
@@ -63,9 +63,9 @@ class Chains:
             at = plus(at, apply(R, step.offset))
             R, angle = product(R, step.rotation), angle + step.angle
             for motion, axis, by in step.motions:
-                k, aligned = exact.aligned_with(axis)
+                k, aligned = rational.aligned_with(axis)
                 if motion == "t":
-                    x, y, z = map(S, exact.unit(axis))
+                    x, y, z = map(S, rational.unit(axis))
                     at = plus(at, scaled(apply(R, (x, y, z)), by))
                 elif self.plane:
                     angle = angle + by

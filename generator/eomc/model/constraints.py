@@ -35,7 +35,7 @@ _DRIFTS = "is the rate of a position, and where rates alone are held, the positi
 
 
 @dataclass(frozen=True)
-class Rates:
+class Degree:
     """How an expression depends on rates.
 
     degree: 0, 1, or 2 for all that is not linear. moves: what else it varies with: 0 nothing, 1 the
@@ -48,23 +48,23 @@ class Rates:
     exact: bool = False
 
 
-_FIXED, _TIME, _POSITION, _RATE = Rates(), Rates(0, 1), Rates(0, 2), Rates(1, 2, True)
-_NONLINEAR = Rates(2, 2)
+_FIXED, _TIME, _POSITION, _RATE = Degree(), Degree(0, 1), Degree(0, 2), Degree(1, 2, True)
+_NONLINEAR = Degree(2, 2)
 
 
-class Dependence:
+class VelocityDegree:
     """How expressions depend on rates, definitions followed."""
 
     def __init__(
         self, coordinates: Iterable[Coordinate], definitions: Iterable[tuple[Symbol, Expr]]
     ) -> None:
-        self.known: dict[Expr, Rates] = {t: _TIME}
+        self.known: dict[Expr, Degree] = {t: _TIME}
         for c in coordinates:
             self.known |= {c.q: _POSITION, c.qd: _RATE}
         for name, e in definitions:
             self.known[name] = self.of(e)
 
-    def of(self, e: Expr) -> Rates:
+    def of(self, e: Expr) -> Degree:
         """That of an expression over coordinates, rates, t, parameters and the definitions."""
         found = self.known.get(e)
         if found is None:
@@ -72,26 +72,26 @@ class Dependence:
             self.known[e] = found
         return found
 
-    def _made(self, e: Expr, parts: Sequence[Rates]) -> Rates:
+    def _made(self, e: Expr, parts: Sequence[Degree]) -> Degree:
         degree = max((p.degree for p in parts), default=0)
         moves = max((p.moves for p in parts), default=0)
         if isinstance(e, dot):
             (inside,) = parts
             return (_FIXED, _TIME, _RATE)[inside.moves] if not inside.degree else _NONLINEAR
         if degree == 0:
-            return Rates(0, moves)
+            return Degree(0, moves)
         if isinstance(e, sympy.Add):
             exact = all(p.exact or (p.degree == 0 and p.moves < 2) for p in parts)
-            return Rates(degree, moves, exact and degree == 1)
+            return Degree(degree, moves, exact and degree == 1)
         if isinstance(e, sympy.Mul):
             degree = sum(p.degree for p in parts)
             factors = [p for p in parts if p.degree == 0]
             still = all(p.moves == 0 for p in factors)
-            return Rates(min(degree, 2), moves, degree == 1 and still and self._exact(parts))
+            return Degree(min(degree, 2), moves, degree == 1 and still and self._exact(parts))
         return _NONLINEAR
 
     @staticmethod
-    def _exact(parts: Iterable[Rates]) -> bool:
+    def _exact(parts: Iterable[Degree]) -> bool:
         return all(p.exact for p in parts if p.degree)
 
 
@@ -114,7 +114,7 @@ class Rows:
         self.values = values
         self.fault = fault
         self.doubt = doubt
-        self.depends = Dependence(coordinates, definitions)
+        self.depends = VelocityDegree(coordinates, definitions)
 
     def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
         """The rows, holonomic ones first, each told what it is."""

@@ -14,7 +14,7 @@ from eomc.model.mechanics import Made, Mechanics
 from eomc.model.symbols import Coordinate, Parameter
 
 
-def discrete(system: Made) -> Made:
+def add_discrete_coordinates(system: Made) -> Made:
     """The system whose parameters that jumps set are discrete variables, behind its coordinates.
 
     Raises SceneError where a name that one needs is taken, one is a limit of an input, or an
@@ -86,7 +86,7 @@ def _idle(system: Mechanics, found: list[Parameter]) -> list[Problem]:
     return problems
 
 
-def constant(system: Made) -> Made:
+def with_constant_parameters(system: Made) -> Made:
     """The system with parameters in place of its discrete variables, which nothing sets."""
     if not system.discrete:
         return system
@@ -110,7 +110,7 @@ def constant(system: Made) -> Made:
     )
 
 
-def beside(system: Made, core: Made) -> Made:
+def with_parameters_as_states(system: Made, core: Made) -> Made:
     """The system with start and rows of its `core`, which has parameters and is assembled."""
     more = [c for c in system.coordinates if c.name in system.discrete]
     return replace(

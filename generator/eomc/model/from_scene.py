@@ -8,13 +8,13 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import algebra, constraints, growth, limits
-from eomc.model.crossing import crossing
-from eomc.model.discrete import discrete
+from eomc.model import algebra, constraints, digit_bound, saturation
+from eomc.model.coulomb_friction import Friction, add_stick_slip
+from eomc.model.discrete import add_discrete_coordinates
+from eomc.model.event_function import check_event_functions
 from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
-from eomc.model.sticking import Friction, sticking
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -46,14 +46,14 @@ class _Formulas:
         self.known |= {name: symbol(name) for name in given}
         self.problems: list[Problem] = []
         self.doubts: list[Problem] = []
-        self.sizes: dict[str, growth.Size] = {}  # of constants and definitions
+        self.sizes: dict[str, digit_bound.Bound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
         """The expression of the formula at a key; zero where it is at fault."""
         name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
-            self.sizes[name] = growth.VARIES
-            self.sizes[name] = growth.size(formula, self.sizes)
+            self.sizes[name] = digit_bound.VARIES
+            self.sizes[name] = digit_bound.bound(formula, self.sizes)
             return algebra.expression(formula, self.known)
         except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
             message = f"'{formula.shown}' {fault}"
@@ -261,7 +261,9 @@ def from_scene(scene: Scene) -> System:
     )
     if faults := made.problems or system.beyond_float():
         raise SceneError(faults)
-    return sticking(discrete(limits.within(crossing(system))), sticks)
+    return add_stick_slip(
+        add_discrete_coordinates(saturation.saturate_inputs(check_event_functions(system))), sticks
+    )
 
 
 def _follows(scene: Scene, c: Written) -> Iterator[str]:

@@ -13,14 +13,14 @@ from sympy.core.function import AppliedUndef
 
 from eomc.base import names
 from eomc.base.errors import EomcError, Problem
-from eomc.model import constraints, given
+from eomc.model import api_arguments, constraints
 from eomc.model.algebra import UNDEFINED
+from eomc.model.coulomb_friction import Friction
 from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.mechanics import Made
-from eomc.model.pictured import pictured
-from eomc.model.pictured import text as formula_text
+from eomc.model.picture_from_sympy import picture_scene
+from eomc.model.picture_from_sympy import text as formula_text
 from eomc.model.rewrite import JumpError, rewritten
-from eomc.model.sticking import Friction
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -55,7 +55,7 @@ class Maker:
 
     def __init__(self, name: str) -> None:
         if not isinstance(name, str):
-            raise given.fault("name", f"must be text, here {name!r}")
+            raise api_arguments.fault("name", f"must be text, here {name!r}")
         if why := names.module_fault(name):
             raise EomcError(f"System.make: name: {why}")
         self.name = name
@@ -68,8 +68,8 @@ class Maker:
 
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
-            raise given.fault(role, f"{one!r} is not a symbol")
-        text = given.name_of(one)
+            raise api_arguments.fault(role, f"{one!r} is not a symbol")
+        text = api_arguments.name_of(one)
         used = names.plain(text) if names.fault(text) else text
         if used in self.taken:
             raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
@@ -81,8 +81,8 @@ class Maker:
     def _expression(self, value: Any, role: str, rule: str = "") -> Expr:
         if isinstance(value, str):
             known = {s.name: s for s in self.known}
-            value = given.from_text(value, role, known, rule)
-        expr = given.expression(value, role)
+            value = api_arguments.from_text(value, role, known, rule)
+        expr = api_arguments.expression(value, role)
         if not isinstance(value, str):
             self.used |= {s.name: s for s in expr.free_symbols}
         expr = expr.replace(
@@ -96,30 +96,34 @@ class Maker:
         strange = sorted(map(str, functions))
         strange += sorted(s.name for s in expr.free_symbols if s not in self.known)
         if any(d.derivative_count > 1 for d in expr.atoms(sympy.Derivative)):
-            raise given.fault(role, "accelerations are what is solved for, none can be used")
+            raise api_arguments.fault(
+                role, "accelerations are what is solved for, none can be used"
+            )
         if strange == ["t"] and not rule:
-            raise given.fault(
+            raise api_arguments.fault(
                 role,
                 "this t is not the time: write eomc.model.system.t, or "
                 "dynamicsymbols._t where coordinates are dynamicsymbols",
             )
         if strange:
-            raise given.undeclared(role, strange, (s.name for s in self.known), rule)
+            raise api_arguments.undeclared(role, strange, (s.name for s in self.known), rule)
         try:
             expr = rewritten(expr, self.fixed)
         except JumpError as jump:
-            raise given.fault(role, str(jump)) from None
+            raise api_arguments.fault(role, str(jump)) from None
         if expr.has(*UNDEFINED, sympy.I):
             raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
-        given.check_functions(expr, role)
+        api_arguments.check_functions(expr, role)
         return expr
 
     def _parameter(self, one: Any, given_value: Any, units: Mapping[str, str]) -> Parameter:
-        value = given.number(given_value, f"parameter {one}", _OF_NUMBERS)
+        value = api_arguments.number(given_value, f"parameter {one}", _OF_NUMBERS)
         never_negative = getattr(one, "is_nonnegative", None) is True
         if never_negative and value < 0:
-            raise given.fault(f"parameter {one}", f"its symbol can't be negative, here {value:g}")
-        unit = units.get(given.name_of(one), "")
+            raise api_arguments.fault(
+                f"parameter {one}", f"its symbol can't be negative, here {value:g}"
+            )
+        unit = units.get(api_arguments.name_of(one), "")
         declared = Parameter(self._declare(one, "parameter"), value, unit)
         self.fixed[declared.symbol] = never_negative
         return declared
@@ -134,11 +138,11 @@ class Maker:
     ) -> Made:  # fmt: skip
         """The system, of the class `of`."""
         as_given = (coordinates, parameters, inputs, definitions)
-        starts = given.symbols(coordinates, "coordinates", None)
-        parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
-        forces = given.by_name(forces, "forces", "{x: F}")
-        definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
-        units = given.by_name(units, "units", '{m: "kg"}')
+        starts = api_arguments.symbols(coordinates, "coordinates", None)
+        parameters = api_arguments.mapping(parameters, "parameters", "{m: 2.0}")
+        forces = api_arguments.by_name(forces, "forces", "{x: F}")
+        definitions = api_arguments.mapping(definitions, "definitions", "{y: l*cos(theta)}")
+        units = api_arguments.by_name(units, "units", '{m: "kg"}')
         for text in (title, *units.values()):
             if not isinstance(text, str):
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
@@ -148,9 +152,11 @@ class Maker:
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         made = [*self._started(made, starts.values(), declared)]
         made = self._held(made, [*starts], guess, bool(rows))
-        pending = given.symbols(inputs, "inputs", 0)
-        named = map(given.name_of, (*starts, *parameters, *pending, *definitions))
-        given.check_units(units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)])
+        pending = api_arguments.symbols(inputs, "inputs", 0)
+        named = map(api_arguments.name_of, (*starts, *parameters, *pending, *definitions))
+        api_arguments.check_units(
+            units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)]
+        )
         given_inputs = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
@@ -161,15 +167,17 @@ class Maker:
             defined = symbol(self._declare(one, "definition"))
             self.known.add(defined)
             ordered.append((defined, expr))
-        if unknown := [f for f in forces if f not in map(given.name_of, starts)]:
+        if unknown := [f for f in forces if f not in map(api_arguments.name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
-        rubbed = given.by_name(friction, "friction", "{x: mu*m*g}")
-        sticks = [f"{self.map[x].name}_sticks" for x in starts if given.name_of(x) in rubbed]
+        rubbed = api_arguments.by_name(friction, "friction", "{x: mu*m*g}")
+        sticks = [
+            f"{self.map[x].name}_sticks" for x in starts if api_arguments.name_of(x) in rubbed
+        ]
         drawn, drawn_text = None, ""
         if picture is not None:
             names = given_inputs.values()
-            drawn, drawn_text = pictured(picture, expression, made, declared, names, ordered)
+            drawn, drawn_text = picture_scene(picture, expression, made, declared, names, ordered)
         energies = self._energies(
             {"kinetic": kinetic, "potential": potential, "dissipation": dissipation},
             ordered, [c.qd for c in made], given_inputs.values(),
@@ -179,7 +187,7 @@ class Maker:
             "coordinates": tuple(made),
             **energies,
             "forces": tuple(
-                expression(forces.get(given.name_of(c), 0), f"force on {c}") for c in starts
+                expression(forces.get(api_arguments.name_of(c), 0), f"force on {c}") for c in starts
             ),
             "parameters": tuple(declared),
             "inputs": tuple(self._inputs(pending, given_inputs, units, ends, ordered)),
@@ -210,19 +218,19 @@ class Maker:
         for role, energy in made.items():
             if held := _input_in(energy, definitions, inputs):
                 why = f"{held} is an input, and an energy can't depend on inputs"
-                raise given.fault(role, f"{why}: let it act through forces")
+                raise api_arguments.fault(role, f"{why}: let it act through forces")
             what = f"the {role} energy"
-            given.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
+            api_arguments.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
         try:
             made["potential"], linear = split(made["potential"], definitions, velocities)
         except NotLinearError as why:
-            raise given.fault("potential", str(why)) from None
+            raise api_arguments.fault("potential", str(why)) from None
         return made if linear == 0 else {**made, "linear_potential": linear}
 
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
         """A coordinate, whose symbols are known from here on."""
         name = self._name_of(one, "coordinate")
-        c = Coordinate(name, units.get(given.name_of(one), ""))
+        c = Coordinate(name, units.get(api_arguments.name_of(one), ""))
         self.map[one] = c.q
         if isinstance(one, AppliedUndef):
             time = one.args[0]
@@ -243,17 +251,17 @@ class Maker:
         rule = "a start is made of numbers and parameters"
         for c, whole in zip(made, starts, strict=True):
             role, ends = f"start of {c.name}", []
-            for x in given.start(whole, role):
+            for x in api_arguments.start(whole, role):
                 follows = ""
                 if isinstance(x, (str, Expr)):
                     x = self._expression(x, role, rule)
                     if x.has(dot):
-                        raise given.undeclared(role, ["dot(...)"], (), rule)
+                        raise api_arguments.undeclared(role, ["dot(...)"], (), rule)
                     if x.free_symbols:
                         follows = formula_text(x)
-                        given.from_text(follows, role, {s.name: s for s in values}, rule)
+                        api_arguments.from_text(follows, role, {s.name: s for s in values}, rule)
                     x = x.xreplace(values)
-                ends.append((None if x is None else given.number(x, role), follows))
+                ends.append((None if x is None else api_arguments.number(x, role), follows))
             (start, follows), (rate, rate_follows) = ends
             yield replace(
                 c, start=start or 0.0, rate=rate or 0.0, held=start is not None,
@@ -265,13 +273,17 @@ class Maker:
     ) -> list[Coordinate]:
         """The coordinates, all held where there are no rows, else those that are no guess."""
         if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
-            raise given.fault("guess", f"give a list of coordinates, such as [x], here {guess!r}")
-        guessed = {given.name_of(given.symbol_of(one, "guess")) for one in guess}
-        if unknown := sorted(guessed - {given.name_of(one) for one in given_as}):
-            raise given.fault("guess", f"{', '.join(unknown)} not among the coordinates")
+            raise api_arguments.fault(
+                "guess", f"give a list of coordinates, such as [x], here {guess!r}"
+            )
+        guessed = {api_arguments.name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
+        if unknown := sorted(guessed - {api_arguments.name_of(one) for one in given_as}):
+            raise api_arguments.fault("guess", f"{', '.join(unknown)} not among the coordinates")
         if guessed and not rows:
-            raise given.fault("guess", "constraints move a guess, and there are none: leave it out")
-        free = [given.name_of(one) in guessed for one in given_as]
+            raise api_arguments.fault(
+                "guess", "constraints move a guess, and there are none: leave it out"
+            )
+        free = [api_arguments.name_of(one) in guessed for one in given_as]
         return [
             replace(
                 c,
@@ -288,23 +300,25 @@ class Maker:
         """The rows of constraints, under their key of the system where there are any."""
         if not isinstance(rows, Mapping):
             example = '{"rod": x**2 + y**2 - l**2}'
-            raise given.fault("constraints", f"give a dict, such as {example}, here {rows!r}")
+            raise api_arguments.fault(
+                "constraints", f"give a dict, such as {example}, here {rows!r}"
+            )
         found = []
         moving = (s.name for c in made for s in (c.qd, c.qdd))
         taken = {*self.taken, *moving, "energy"}
         for one, formula in rows.items():
-            name, role = given.called(one, "constraints"), f"constraint {one}"
+            name, role = api_arguments.called(one, "constraints"), f"constraint {one}"
             if name in taken:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
-            given.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
+            api_arguments.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
             if held := _input_in(expr, ordered, inputs):
                 why = f"{held} is an input, whose rate is not known: let it act through forces"
-                raise given.fault(role, why)
+                raise api_arguments.fault(role, why)
             found.append(Constraint(name, expr, unit=units.get(name, "")))
 
         def fault(row: Constraint, message: str) -> None:
-            raise given.fault(f"constraint {row.name}", f"{row.formula} {message}")
+            raise api_arguments.fault(f"constraint {row.name}", f"{row.formula} {message}")
 
         doubts: list[Problem] = []
 
@@ -325,10 +339,12 @@ class Maker:
     ) -> Iterator[Input]:  # fmt: skip
         """The inputs by the names that are used."""
         for one, signal in signals.items():
-            name, role = given.name_of(one), f"signal of {one}"
+            name, role = api_arguments.name_of(one), f"signal of {one}"
             value = self._expression(signal, role)
             if held := _input_in(value, definitions, used.values()):
-                raise given.fault(role, f"{held} is an input, and a signal can't depend on inputs")
+                raise api_arguments.fault(
+                    role, f"{held} is an input, and a signal can't depend on inputs"
+                )
             ends = limits.get(name, (None, None))
             yield Input(used[one], units.get(name, ""), value, limits=ends)
 
@@ -338,21 +354,23 @@ class Maker:
         """The limits of inputs by their names, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
-        known, found = {given.name_of(i) for i in inputs}, dict[str, Ends]()
+        known, found = {api_arguments.name_of(i) for i in inputs}, dict[str, Ends]()
         rule = "limits are made of numbers and parameters"
-        for name, pair in given.by_name(limits, "limits", "{F: (-1, 1)}").items():
+        for name, pair in api_arguments.by_name(limits, "limits", "{F: (-1, 1)}").items():
             role = f"limits of {name}"
             if name not in known:
-                raise given.fault(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
+                raise api_arguments.fault(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise given.fault(role, f"give the least and the largest value, here {pair!r}")
+                raise api_arguments.fault(
+                    role, f"give the least and the largest value, here {pair!r}"
+                )
             ends = zip(pair, (-sympy.oo, sympy.oo), strict=True)
             least, most = (
                 None if x is None or x == end else self._expression(x, role, rule)
                 for x, end in ends
             )
             if least is not None and most is not None and (most - least).xreplace(values) <= 0:
-                raise given.fault(role, f"{least}, the least value, is not below {most}")
+                raise api_arguments.fault(role, f"{least}, the least value, is not below {most}")
             found[name] = (least, most)
         return found
 
@@ -361,34 +379,38 @@ class Maker:
     ) -> Iterator[Event]:
         """The events, each a formula or a dict as [[event]] has it."""
         if not isinstance(events, Mapping):
-            raise given.fault("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
+            raise api_arguments.fault(
+                "events", f'give a dict, such as {{"impact": y}}, here {events!r}'
+            )
         state: dict[str, str] = {}  # names, by what a user may call them
         for one in starts:
             name = self.map[one].name
             rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
-            state |= {str(one): name, given.name_of(one): name}
-            state |= {str(rate): f"{name}_dot", f"{given.name_of(one)}_dot": f"{name}_dot"}
-        state |= {given.name_of(self.taken[p.name]): p.name for p in parameters}
+            state |= {str(one): name, api_arguments.name_of(one): name}
+            state |= {str(rate): f"{name}_dot", f"{api_arguments.name_of(one)}_dot": f"{name}_dot"}
+        state |= {api_arguments.name_of(self.taken[p.name]): p.name for p in parameters}
         for name, entry in events.items():
-            called, role = given.called(name, "events"), f"event {name}"
+            called, role = api_arguments.called(name, "events"), f"event {name}"
             table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
             when = self._expression(table.pop("when", None) if table else entry, role)
             if not when.free_symbols:
-                raise given.fault(role, f"{when} never crosses zero: it has no names")
+                raise api_arguments.fault(role, f"{when} never crosses zero: it has no names")
             direction, action = table.pop("direction", "both"), table.pop("action", "record")
             if not isinstance(note := table.pop("note", ""), str):
-                raise given.fault(role, f"note is a text, not {note!r}")
+                raise api_arguments.fault(role, f"note is a text, not {note!r}")
             for key, word, known in (
                 ("direction", direction, DIRECTIONS), ("action", action, ACTIONS),
             ):  # fmt: skip
                 if word not in known:
-                    raise given.fault(role, f"{key} is one of {', '.join(known)}, here {word!r}")
+                    raise api_arguments.fault(
+                        role, f"{key} is one of {', '.join(known)}, here {word!r}"
+                    )
             if strange := [key for key in table if key not in state]:
                 why = f"{strange[0]} is no coordinate, velocity or parameter, which a jump sets"
-                raise given.fault(role, why)
+                raise api_arguments.fault(role, why)
             if (action == "jump") != bool(table):
                 remedy = 'add "action": "jump" where something is set, and only there'
-                raise given.fault(role, remedy)
+                raise api_arguments.fault(role, remedy)
             jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
             yield Event(called, when, direction, action, tuple(jump), note=note)
 
@@ -397,16 +419,16 @@ class Maker:
     ) -> Iterator[Friction]:
         """Friction that sticks, along coordinates, over parameters."""
         values = {p.symbol: p.value for p in parameters}
-        known = {given.name_of(one): self.map[one].name for one in starts}
-        for name, size in given.by_name(friction, "friction", "{x: mu*m*g}").items():
+        known = {api_arguments.name_of(one): self.map[one].name for one in starts}
+        for name, size in api_arguments.by_name(friction, "friction", "{x: mu*m*g}").items():
             role = f"friction of {name}"
             if name not in known:
-                raise given.fault(role, f"coordinates are {', '.join(known)}")
+                raise api_arguments.fault(role, f"coordinates are {', '.join(known)}")
             found = self._expression(size, role)
             if moving := sorted(s.name for s in found.free_symbols - self.fixed.keys()):
-                raise given.fault(role, f"{moving[0]} is no parameter, of which it is made")
+                raise api_arguments.fault(role, f"{moving[0]} is no parameter, of which it is made")
             if (value := float(found.xreplace(values))) < 0:
-                raise given.fault(role, f"is {value:g}, and can't be negative")
+                raise api_arguments.fault(role, f"is {value:g}, and can't be negative")
             yield Friction(known[name], found, "friction")
 
     def _outputs(
@@ -426,15 +448,19 @@ class Maker:
                 self.map |= {name: multiplier, Symbol(name.name): multiplier}
                 self.known |= {name, multiplier}
         if not isinstance(outputs, Mapping):
-            raise given.fault("outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}')
+            raise api_arguments.fault(
+                "outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}'
+            )
         moving = {x for c in made for x in (c.q, c.qd)}
         for name, formula in outputs.items():
-            called = given.called(name, "outputs")
+            called = api_arguments.called(name, "outputs")
             expr = self._expression(formula, f"output {name}")
             if called in rows:
-                raise given.fault("outputs", f"'{name}' is a constraint already: rename one")
+                raise api_arguments.fault(
+                    "outputs", f"'{name}' is a constraint already: rename one"
+                )
             if expr in moving and is_in_degrees(units.get(name, "")):
-                raise given.fault(
+                raise api_arguments.fault(
                     "outputs",
                     f"{name}: angles are in radians, nothing is converted: give {formula}*180/pi",
                 )
@@ -443,7 +469,7 @@ class Maker:
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)
         self.map[one] = symbol(used)
-        if one == symbol(given.name_of(one)):  # as a name gives it: whatever the assumptions
+        if one == symbol(api_arguments.name_of(one)):  # also without the assumption of real values
             self.map[Symbol(one.name)] = symbol(used)
         return used
 
@@ -460,7 +486,7 @@ def _own_symbols(
     """
     moving, found = {*coordinates}, dict[str, Expr]()
     for name, one in declared.items():
-        if given.name_of(one) in as_text:
+        if api_arguments.name_of(one) in as_text:
             continue
         found[name] = one
         if one in moving and isinstance(one, AppliedUndef):

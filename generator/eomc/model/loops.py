@@ -27,9 +27,9 @@ import sympy
 from sympy import Expr, S
 
 from eomc.base.spatial import apply, cross, dot, plus, product, scaled, transposed
-from eomc.model import exact
-from eomc.model.exact import ZERO, Matrix, Vector
+from eomc.model import rational
 from eomc.model.mechanics import Mechanics
+from eomc.model.rational import ZERO, Matrix, Vector
 from eomc.model.symbols import Constraint, Reaction, needed, symbol, t
 from eomc.scene.assembly import Loop
 
@@ -100,7 +100,7 @@ def close(
 
 def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
     """Rows of what is between two points."""
-    along = {kind: _Pull(p[k], force=exact.ONE[k]) for k, kind in enumerate("xyz")}
+    along = {kind: _Pull(p[k], force=rational.ONE[k]) for k, kind in enumerate("xyz")}
     return {**along, "length": _Pull((dot(p, p) - length**2) / 2, force=p)}
 
 
@@ -150,7 +150,7 @@ def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterat
 
 
 def _unit(axis: Sequence[float]) -> Vector:
-    x, y, z = exact.unit(axis)
+    x, y, z = rational.unit(axis)
     return x, y, z
 
 
@@ -159,7 +159,7 @@ def across(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
     along = _unit(axis)
     if plane:
         return (-along[1], along[0], S.Zero), (S.Zero, S.Zero, S.One), along
-    k, aligned = exact.aligned_with(axis)
+    k, aligned = rational.aligned_with(axis)
     columns = transposed(aligned)
     return columns[(k + 1) % 3], columns[(k + 2) % 3], along
 

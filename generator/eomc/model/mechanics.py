@@ -16,13 +16,13 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem
-from eomc.model.closure import Closure
+from eomc.model.constraint_report import ConstraintSummary
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
     Event,
+    FrictionMode,
     Input,
-    Mode,
     Output,
     Parameter,
     Reaction,
@@ -108,8 +108,8 @@ class Mechanics:
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
     scene: Scene | None = field(default=None, compare=False, repr=False)
     pictured: Scene | None = field(default=None, compare=False, repr=False)
-    closure: Closure | None = field(default=None, compare=False, repr=False)
-    modes: tuple[Mode, ...] = ()
+    closure: ConstraintSummary | None = field(default=None, compare=False, repr=False)
+    modes: tuple[FrictionMode, ...] = ()
     discrete: tuple[str, ...] = ()
     again: partial[Any] | None = field(default=None, compare=False, repr=False)
     own_symbols: Mapping[str, Expr] = field(default_factory=dict, compare=False, repr=False)

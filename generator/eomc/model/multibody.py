@@ -15,11 +15,11 @@ from sympy import Add, Expr, S, Symbol
 
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
-from eomc.model import exact, loops
+from eomc.model import loops, rational
 from eomc.model.chains import Chains, Named, Step, rotation_about
-from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
+from eomc.model.coulomb_friction import Friction
 from eomc.model.loops import Closed
-from eomc.model.sticking import Friction
+from eomc.model.rational import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
 from eomc.model.tree import Frame, Link, Tree
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spring
@@ -123,7 +123,7 @@ class Builder:
         place = _Place(
             parent.link,
             plus(parent.offset, apply(parent.rotation, numeric(offset))),
-            exact.clean(product(parent.rotation, exact.clean(rotation))),
+            rational.clean(product(parent.rotation, rational.clean(rotation))),
             at,
             R,
             angle,
@@ -159,9 +159,9 @@ class Builder:
         q = self._named(f"{name}_q", moved)
         self.moved.setdefault(name, []).append(q)
         terms.tree_kinetic.append(armature * self.terms.rates.get(q, _rate(q)) ** 2 / 2)
-        k, aligned = exact.aligned_with(axis)
-        direction = tuple(S(x) for x in exact.unit(axis))
-        rotation = exact.clean(product(place.rotation, aligned))
+        k, aligned = rational.aligned_with(axis)
+        direction = tuple(S(x) for x in rational.unit(axis))
+        rotation = rational.clean(product(place.rotation, aligned))
         terms.links.append(
             Link(
                 name, place.link, motion == "r", k, moved, place.offset, rotation, armature=armature

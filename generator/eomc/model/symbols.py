@@ -192,7 +192,7 @@ class Constraint(_Named):
 
 
 @dataclass(frozen=True)
-class Mode:
+class FrictionMode:
     """A coordinate that is 1, -1 or 0, as another slides forwards, backwards or sticks.
 
     at, of: the places of both among the coordinates.

@@ -12,12 +12,13 @@ from functools import partial
 from typing import Any, Never
 
 from eomc.base.errors import SceneError
-from eomc.model import from_sympy, given
-from eomc.model.crossing import crossing
-from eomc.model.discrete import discrete
-from eomc.model.limits import within
+from eomc.model import api_arguments, from_sympy
+from eomc.model.api_arguments import or_empty
+from eomc.model.coulomb_friction import add_stick_slip
+from eomc.model.discrete import add_discrete_coordinates
+from eomc.model.event_function import check_event_functions
 from eomc.model.mechanics import Mechanics
-from eomc.model.sticking import sticking
+from eomc.model.saturation import saturate_inputs
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -124,21 +125,26 @@ class System(Mechanics):
         (theta_dot,)
         """
         asked = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
-        given.check_arguments(unknown, asked)
+        api_arguments.check_arguments(unknown, asked)
         if kinetic is None:
-            raise given.fault("kinetic", f"None is not an expression: {given.LAGRANGIAN}")
-        run = given.run(
+            raise api_arguments.fault(
+                "kinetic", f"None is not an expression: {api_arguments.LAGRANGIAN}"
+            )
+        run = api_arguments.run(
             h, duration, methods, real, batch, linearize, discretize, tolerance,
             bool(events or friction), inverse_dynamics,
         )  # fmt: skip
         maker = from_sympy.Maker(name)
         system = maker.make(
-            cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
-            given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
-            given.or_none(constraints), guess, given.or_none(units), title, run,
-            given.or_none(limits), given.or_none(events), picture, given.or_none(friction),
+            cls, coordinates, kinetic, potential, or_empty(parameters), dissipation,
+            or_empty(forces), inputs, or_empty(definitions), or_empty(outputs),
+            or_empty(constraints), guess, or_empty(units), title, run,
+            or_empty(limits), or_empty(events), picture, or_empty(friction),
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        system = sticking(discrete(within(crossing(system))), maker.frictions)
+        system = add_stick_slip(
+            add_discrete_coordinates(saturate_inputs(check_event_functions(system))),
+            maker.frictions,
+        )
         return replace(system, again=partial(cls.make, **asked))

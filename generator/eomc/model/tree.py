@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sympy import Expr, S, Symbol
 
-from eomc.model.exact import ZERO, Matrix, Vector
+from eomc.model.rational import ZERO, Matrix, Vector
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
-from eomc.model import discrete, loops, sticking
-from eomc.model.closure import Closure, Move
+from eomc.model import coulomb_friction, discrete, loops
+from eomc.model.constraint_report import ConstraintSummary, Move
 from eomc.model.system import System
 from eomc.program import contradictions
 from eomc.program.manifold import AWAY, ROUNDED, Flags, Manifold, Place, Vector
@@ -53,9 +53,13 @@ def assembled(system: System) -> System:
         return system
     if system.modes or system.discrete:
         if system.modes:
-            made = sticking.beside(system, assembled(sticking.without(system)))
+            made = coulomb_friction.with_modes(
+                system, assembled(coulomb_friction.without_modes(system))
+            )
         else:
-            made = discrete.beside(system, assembled(discrete.constant(system)))
+            made = discrete.with_parameters_as_states(
+                system, assembled(discrete.with_constant_parameters(system))
+            )
         assert made.closure is not None
         return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
     manifold = Manifold(system)
@@ -222,13 +226,13 @@ def _moves(
             yield Move(name, one, other, unit)
 
 
-def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
+def _closure(manifold: Manifold, start: Start, found: Ranks) -> ConstraintSummary:
     system = manifold.system
     names = [c.name for c in system.constraints]
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
     units = [(c.name, c.unit) for c in system.coordinates]
     speeds = [(f"{c.name}_dot", f"{c.unit}/s" if c.unit else "") for c in system.coordinates]
-    return Closure(
+    return ConstraintSummary(
         rows=tuple(names),
         coordinates=len(system.q),
         rank=found.rank,
@@ -292,7 +296,7 @@ def _refuse_wrong_rotations(system: System) -> None:
         raise SceneError(found)
 
 
-def _warnings(manifold: Manifold, found: Ranks, closure: Closure) -> Iterator[Problem]:
+def _warnings(manifold: Manifold, found: Ranks, closure: ConstraintSummary) -> Iterator[Problem]:
     """What a build says of it."""
     system = manifold.system
     if closure.redundant or closure.sums:

@@ -27,7 +27,7 @@ import numpy as np
 from eomc import pipeline
 from eomc.base.errors import EomcError, SceneError
 from eomc.integrators.tableaux import GAUSS16, METHODS
-from eomc.model.corners import corners
+from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.report import reference_solution
 from eomc.report.linearised import (
@@ -200,7 +200,7 @@ def measure(
         growth=growth(module, reference, finest.method, finest.steps),
         eigenvalue=complex(fastest),
         condition=(at, *place),
-        corners=corners(system),
+        corners=nonsmooth_functions(system),
         events=", ".join(e.name for e in system.events),
         t=reference.t,
         coordinates=tuple(module.coordinates),

@@ -12,7 +12,7 @@ from sympy import Expr, ImmutableMatrix
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
-from eomc.model.discrete import constant
+from eomc.model.discrete import with_constant_parameters
 from eomc.model.symbols import symbol
 from eomc.model.system import System
 from eomc.pipeline import ScenePath
@@ -168,7 +168,7 @@ def derive(system: System) -> Equations:
 
     Raises EomcError if they would fill many pages.
     """
-    system = constant(system)
+    system = with_constant_parameters(system)
     if not symbolic.is_small(system, MAX_EXPANDED_SIZE):
         raise too_long_error(system)
     plain = symbolic.derive(symbolic.without_definitions(system))
@@ -241,7 +241,7 @@ def write_equations(system: System, form: str = "text") -> str:
     except EomcError:
         if form == "python":
             raise
-        system = constant(system)
+        system = with_constant_parameters(system)
         return large_system.latex(system) if form == "latex" else large_system.text(system)
     if form == "python":
         return equations_text.python(derived)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import sympy
 from sympy import Expr
 
-from eomc.model.exact import Vector
+from eomc.model.rational import Vector
 from eomc.model.symbols import needed
 from eomc.model.system import System, t
 from eomc.model.tree import Link, Tree

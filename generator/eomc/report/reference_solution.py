@@ -37,8 +37,8 @@ from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
 from eomc.emit.render import show
 from eomc.emit.views import Quad
-from eomc.model.corners import corners
-from eomc.model.discrete import constant
+from eomc.model.discrete import with_constant_parameters
+from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.numeric import compiled
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
@@ -227,7 +227,7 @@ def _run(
             f"{system.name}: the reference solution got to t = {reached:.6g} s of {span:g} s in "
             f"{MAX_SECONDS:g} s of computing: ask for a shorter duration"
         )
-    if completed.returncode and (jumps := corners(system)):
+    if completed.returncode and (jumps := nonsmooth_functions(system)):
         raise EomcError(
             f"{system.name}: no reference solution beyond t = {reached:.6g} s: a force that jumps "
             f"({jumps}) holds the motion there; write it smooth, such as tanh(v/0.001) for "
@@ -313,7 +313,7 @@ def _compare_plain(system: System, rows: Text, spacing: float) -> tuple[float, f
             a = plain.acceleration(states[k][:n], states[k][n : 2 * n], mpmath.mpf(spacing) * k)
             for i in range(n):
                 digits = min(digits, _digits(a[i] - states[k][2 * n + i], size[i]))
-        if digits < MIN_PLAIN_DIGITS and not corners(system):
+        if digits < MIN_PLAIN_DIGITS and not nonsmooth_functions(system):
             raise EomcError(
                 f"{system.name}: accelerations in __float128 and those of the plain equations "
                 f"agree to {digits:.0f} digits only: please report it, with the scene"
@@ -342,7 +342,7 @@ class _PlainEquations:
     """D, bias, tau, constraints and signals of the symbolic reference, evaluated with mpmath."""
 
     def __init__(self, system: System) -> None:
-        core = constant(system)
+        core = with_constant_parameters(system)
         r = symbolic.derive(core)
         symbols = (*system.q, *system.qd, time_symbol, *system.u)
         symbols += tuple(p.symbol for p in system.parameters)

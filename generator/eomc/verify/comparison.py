@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.model.corners import corners
+from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.verify import one_step
 from eomc.verify.advice import PARTS, Advice
@@ -160,7 +160,7 @@ class Comparison:
     @cached_property
     def corners(self) -> str:
         """The functions in the scene that jump or bend."""
-        return corners(self.system)
+        return nonsmooth_functions(self.system)
 
     @property
     def forms(self) -> list[tuple[Any, str]]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from sympy import Expr, ImmutableMatrix
 
 from eomc.base.errors import EomcError
-from eomc.model.discrete import constant
+from eomc.model.discrete import with_constant_parameters
 from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, t
 from eomc.verify.discrete import DiscreteReference
@@ -140,7 +140,7 @@ def reference_for(system: System) -> Reference:
     Raises EomcError as `derive` and `TaylorReference` do.
     """
     if system.discrete:
-        return DiscreteReference(system, reference_for(constant(system)))
+        return DiscreteReference(system, reference_for(with_constant_parameters(system)))
     return derive(system) if is_small(system) else TaylorReference(system)
 
 

@@ -23,7 +23,7 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Closure:
+class ConstraintSummary:
     """The constraints of a system, as found around its assembled start.
 
     rows: names of all. rank: of their Jacobian, almost everywhere on the positions they leave, so

@@ -10,7 +10,7 @@ from eomc.model.mechanics import Made
 from eomc.model.symbols import symbol
 
 
-def within(system: Made) -> Made:
+def saturate_inputs(system: Made) -> Made:
     """The system with a definition for each limited input, `force_limited`, used in its place."""
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
     made: dict[Symbol, Symbol] = {}

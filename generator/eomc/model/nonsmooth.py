@@ -13,7 +13,7 @@ KINDS = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
 STEEP = (*KINDS, sympy.tanh, sympy.atan)  # corners to steps longer than they are wide
 
 
-def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
+def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
     """The functions in the scene that jump or bend, by name; "" where all is smooth."""
     s = system
     exprs = (
@@ -27,13 +27,13 @@ def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
     return ", ".join(sorted(found))
 
 
-def steep(system: System) -> bool:
+def has_steep_terms(system: System) -> bool:
     """Whether there are corners, or what may be one to a long step.
 
     That is tanh or atan of anything, and whatever is not a polynomial, sine or cosine in the
     velocities, such as friction that is smoothed by v/sqrt(v**2 + w**2) or Stribeck's exp(-v**2).
     """
-    if corners(system, STEEP):
+    if nonsmooth_functions(system, STEEP):
         return True
     s, fast = system, set(system.qd)
     for name, e in s.definitions:

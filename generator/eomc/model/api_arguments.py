@@ -13,7 +13,7 @@ from sympy.core.function import AppliedUndef
 from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
-from eomc.model import algebra, growth
+from eomc.model import algebra, digit_bound
 from eomc.model.mechanics import in_words_of_python
 from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
@@ -108,7 +108,7 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
             raise undeclared(role, strange, known, rule)
-        growth.size(formula, {})
+        digit_bound.bound(formula, {})
         return algebra.expression(formula, known)
     except FormulaError as wrong:
         shown = text if len(text) <= 80 else text[:79] + "…"
@@ -227,9 +227,9 @@ def name_of(one: Any) -> str:
     return str(one.func.__name__ if isinstance(one, AppliedUndef) else one)
 
 
-def or_none(given: Any) -> Any:
-    """What was given, nothing where it was None."""
-    return {} if given is None else given
+def or_empty(value: Any) -> Any:
+    """Return the value, or an empty dict in place of None."""
+    return {} if value is None else value
 
 
 def symbols(given: Any, role: str, default: Any) -> dict[Any, Any]:

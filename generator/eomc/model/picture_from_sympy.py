@@ -16,7 +16,7 @@ from sympy import Expr, Symbol
 from sympy.printing.str import StrPrinter
 
 from eomc.base.errors import SceneError
-from eomc.model import given
+from eomc.model import api_arguments
 from eomc.model.symbols import Coordinate, Parameter
 from eomc.scene import read
 from eomc.scene.scene import Scene
@@ -39,7 +39,7 @@ _WORDS = (  # of advice, as TOML has them and as Python does
 _NAMES = {"Abs": "abs", "Max": "max", "Min": "min"}
 
 
-def pictured(
+def picture_scene(
     picture: Any, expression: Callable[[Any, str], Expr], coordinates: Iterable[Coordinate],
     parameters: Iterable[Parameter], inputs: Iterable[str],
     definitions: Sequence[tuple[Symbol, Expr]],
@@ -49,7 +49,7 @@ def pictured(
     expression: from a user's expression to ours. Raises EomcError as a scene with that [picture].
     """
     if not isinstance(picture, Mapping):
-        raise given.fault("picture", f"give a dict, such as {_EXAMPLE}, here {picture!r}")
+        raise api_arguments.fault("picture", f"give a dict, such as {_EXAMPLE}, here {picture!r}")
     table = _written(picture, expression)
     coordinates = [*coordinates]
     tree: dict[str, Any] = {

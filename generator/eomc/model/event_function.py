@@ -9,7 +9,7 @@ from eomc.base.errors import SceneError
 from eomc.model.mechanics import Made
 
 
-def crossing(system: Made) -> Made:
+def check_event_functions(system: Made) -> Made:
     """The system. Raises SceneError where sign and heaviside alone change what an event watches."""
     if not system.events:
         return system

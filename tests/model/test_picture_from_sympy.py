@@ -15,7 +15,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
-from eomc.model.pictured import in_python, text
+from eomc.model.picture_from_sympy import in_python, text
 from eomc.report.drawing import drawing
 from eomc.scene import formulas
 from eomc.scene.read import parse

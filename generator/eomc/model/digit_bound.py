@@ -15,18 +15,18 @@ from typing import Any
 from eomc.scene import formulas
 from eomc.scene.formulas import MAX_LOG10, Formula, FormulaError
 
-MOST_DIGITS = 10_000  # of an exact number
+MAX_DIGITS = 10_000  # of an exact number
 
 _ROOT = 20.0  # digits: what sqrt(2), sin(1) or pi count for in the numbers made of them
 _TOO_LONG = (
-    f"makes exact numbers of more than {MOST_DIGITS:,} digits, with what it is made of: "
+    f"makes exact numbers of more than {MAX_DIGITS:,} digits, with what it is made of: "
     "write the large powers out as decimals"
 )
 _RANGE = f"is not between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size, as numbers must be"
 
 
 @dataclass(frozen=True)
-class Size:
+class Bound:
     """What is known of a value before it is made.
 
     value: the number that it is, None where it varies. digits: at most so many has the number, or
@@ -36,27 +36,27 @@ class Size:
     value: float | None = None
     digits: float = 0.0
 
-    def __add__(self, other: Size) -> Size:
+    def __add__(self, other: Bound) -> Bound:
         return _made(lambda a, b: a + b, self.digits + other.digits, self, other)
 
-    def __sub__(self, other: Size) -> Size:
+    def __sub__(self, other: Bound) -> Bound:
         return _made(lambda a, b: a - b, self.digits + other.digits, self, other)
 
-    def __mul__(self, other: Size) -> Size:
+    def __mul__(self, other: Bound) -> Bound:
         return _made(lambda a, b: a * b, self.digits + other.digits, self, other)
 
-    def __truediv__(self, other: Size) -> Size:
+    def __truediv__(self, other: Bound) -> Bound:
         if other.value == 0:
             raise FormulaError("divides by zero")
         return _made(lambda a, b: a / b, self.digits + other.digits, self, other)
 
-    def __neg__(self) -> Size:
-        return Size(None if self.value is None else -self.value, self.digits)
+    def __neg__(self) -> Bound:
+        return Bound(None if self.value is None else -self.value, self.digits)
 
-    def __pos__(self) -> Size:
+    def __pos__(self) -> Bound:
         return self
 
-    def __pow__(self, other: Size) -> Size:
+    def __pow__(self, other: Bound) -> Bound:
         if other.value is None:
             if self.value == 0:
                 raise FormulaError(
@@ -69,16 +69,16 @@ class Size:
         return _made(lambda a, b: a**b, digits, self, other)
 
 
-VARIES = Size()
+VARIES = Bound()
 
 
-def _made(function: Callable[..., Any], digits: float, *parts: Size) -> Size:
+def _made(function: Callable[..., Any], digits: float, *parts: Bound) -> Bound:
     """A size within the bounds. Raises FormulaError."""
-    if not digits <= MOST_DIGITS:
+    if not digits <= MAX_DIGITS:
         raise FormulaError(_TOO_LONG)
     numbers = [part.value for part in parts]
     if None in numbers:
-        return Size(None, digits)
+        return Bound(None, digits)
     try:
         value = function(*numbers)
     except OverflowError:
@@ -91,40 +91,40 @@ def _made(function: Callable[..., Any], digits: float, *parts: Size) -> Size:
         raise FormulaError("has no real value")
     if not abs(value) < 10.0**MAX_LOG10:
         raise FormulaError(_RANGE)
-    return Size(float(value), digits)
+    return Bound(float(value), digits)
 
 
-def _literal(text: str) -> Size:
+def _literal(text: str) -> Bound:
     mantissa, _, exponent = text.partition("e") if text[:2] != "0x" else (text, "", "")
     digits = float(len(mantissa) + abs(int(exponent or 0)))
-    return Size(formulas.NUMERIC["number"](text), digits)
+    return Bound(formulas.NUMERIC["number"](text), digits)
 
 
-def _call(name: str) -> Callable[..., Size]:
+def _call(name: str) -> Callable[..., Bound]:
     function = formulas.NUMERIC[name]
     rational = name in ("abs", "min", "max", "sign", "heaviside")
 
-    def size(*parts: Size) -> Size:
+    def bound_of_call(*parts: Bound) -> Bound:
         if any(part.value is None for part in parts):
             return VARIES
         return _made(function, sum(p.digits for p in parts) + (0 if rational else _ROOT), *parts)
 
-    return size
+    return bound_of_call
 
 
 _ALGEBRA: Mapping[str, Any] = {
     "number": _literal,
-    "pi": Size(math.pi, _ROOT),
+    "pi": Bound(math.pi, _ROOT),
     "dot": lambda _: VARIES,
     **{name: _call(name) for name in formulas.FUNCTIONS if name != "dot"},
 }
 
 
-def size(formula: Formula, known: Mapping[str, Size]) -> Size:
+def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
     """The size of a formula's value; names that are not known vary.
 
     Raises FormulaError where it is no number that a double can be, or needs too many digits.
     """
     found = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
-    assert isinstance(found, Size)
+    assert isinstance(found, Bound)
     return found if found.value is not None else VARIES

@@ -16,9 +16,9 @@ import sympy
 from sympy import Expr, S
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model.closure import Closure
+from eomc.model.constraint_report import ConstraintSummary
 from eomc.model.mechanics import Made, Mechanics
-from eomc.model.symbols import Constraint, Coordinate, Event, Mode
+from eomc.model.symbols import Constraint, Coordinate, Event, FrictionMode
 
 NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
 
@@ -32,7 +32,7 @@ class Friction:
     key: str
 
 
-def sticking(system: Made, frictions: Sequence[Friction]) -> Made:
+def add_stick_slip(system: Made, frictions: Sequence[Friction]) -> Made:
     """The system with friction that sticks, along coordinates; of one coordinate they add up.
 
     Raises SceneError where a name that it needs is taken.
@@ -45,7 +45,7 @@ def sticking(system: Made, frictions: Sequence[Friction]) -> Made:
     if taken := _taken(system, whole):
         raise SceneError(taken)
     at = {c.name: k for k, c in enumerate(system.coordinates)}
-    modes = tuple(Mode(len(at) + n, at[name]) for n, name in enumerate(whole))
+    modes = tuple(FrictionMode(len(at) + n, at[name]) for n, name in enumerate(whole))
     forces = [*(system.forces or [S.Zero] * len(at)), *[S.Zero] * len(modes)]
     made, rows, events, energy = [], [], [], S.Zero
     sliding: dict[str, str] = {}  # the mode of each velocity
@@ -119,7 +119,7 @@ def _jumping(event: Event, sliding: Mapping[str, str]) -> Event:
     return replace(event, jump=(*event.jump, *modes))
 
 
-def without(system: Made) -> Made:
+def without_modes(system: Made) -> Made:
     """The system without its modes, for what rows of constraints leave where all slides."""
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
@@ -138,14 +138,14 @@ def without(system: Made) -> Made:
     )
 
 
-def beside(system: Made, core: Made) -> Made:
+def with_modes(system: Made, core: Made) -> Made:
     """The system with start and rows of its `core`, which has no modes and is assembled."""
     modes = [
         replace(system.coordinates[m.at], start=_side(core.coordinates[m.of].rate))
         for m in system.modes
     ]
     own = system.constraints[len(core.constraints) :]
-    found = core.closure or Closure((), len(core.rates), 0)
+    found = core.closure or ConstraintSummary((), len(core.rates), 0)
     closure = replace(
         found,
         rows=(*found.rows, *(row.name for row in own)),
