@@ -178,9 +178,9 @@ def test_a_run_in_one_call_has_its_room_whatever_others_do(
 
     def meanwhile(x0: object, name: str) -> object:
         model._room = 0
-        return type(model)._from(model, x0, name)
+        return type(model)._checked_half(model, x0, name)
 
-    monkeypatch.setattr(model, "_from", meanwhile, raising=False)
+    monkeypatch.setattr(model, "_checked_half", meanwhile, raising=False)
     assert model._room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
     assert model._room == 0  # the long way would have found it anew
 
@@ -287,7 +287,7 @@ def test_a_moved_start_may_be_another_motion(kepler: ModuleType) -> None:
         return steps[-1]
 
     run = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"]).run
-    made.error_of(own, counted, None)
+    made.error_by_tighter_tolerance(own, counted, None)
     assert max(run.steps for run in steps) < 1_000_000
 
 

@@ -201,7 +201,11 @@ def _overrides(
                 remedy = f", but an input: --input {name}={value:g}"
             for kind, coordinate in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
                 if coordinate in module.coordinates:
-                    kind = "state that jumps set" if coordinate in module._model.still else kind
+                    kind = (
+                        "state that jumps set"
+                        if coordinate in module._model.discrete_coordinates
+                        else kind
+                    )
                     remedy = f", but a {kind}: --start {name}={value:g}"
                     break
             raise EomcError(f"--set: '{name}' is not a parameter{remedy}")
@@ -353,7 +357,9 @@ def _print_summary(
     for name, q, qd in ends:
         unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
-        going = "" if name in module._model.still else f"   {name}_dot {qd: .9g} {rate}"
+        going = (
+            "" if name in module._model.discrete_coordinates else f"   {name}_dot {qd: .9g} {rate}"
+        )
         say(f"  {name:{wide}} {q: .9g} {unit}{going}".rstrip())
     _print_energy(run, balance, summary)
     for name, times in summary["events"].items():

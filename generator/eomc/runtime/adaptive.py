@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times, as_tolerance
-from .adaptive_error import error_of
-from .adaptive_memory import Kept, Rows
+from .adaptive_error import error_by_tighter_tolerance
+from .adaptive_memory import RowBuffer, StepCounters
+from .adaptive_trajectory import AdaptiveTrajectory
 from .arguments import Array, as_number, check_time
 from .balance import with_jumps
 from .dense import within
 from .estimate import Estimate
 from .events import EventBuffer
-from .fitted import Fitted
 from .input_schedule import InputSchedule, ZeroOrderHold, input_schedule
 from .section import crossings
 from .slices import next_chunk
@@ -36,7 +36,7 @@ _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
 
 
-class AdaptiveRun(Fitted):
+class AdaptiveRun(AdaptiveTrajectory):
     """A run whose steps fit `tol`: rows after each step, or at the times that were asked for.
 
     h is the mean step, `rejected` how many steps were tried in vain, `stiff_steps` how many were
@@ -59,11 +59,11 @@ class AdaptiveRun(Fitted):
         first = int(bool(len(asked)) and asked[0] <= self.t0)
         rows[:, :first] = [[q], [qd]]
         if len(asked) > first:
-            rows[:, first:] = self._made(asked[first:], self._t_end)._rows
+            rows[:, first:] = self._rerun(asked[first:], self._t_end)._rows
         both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
         return both[0], both[1]
 
-    def _made(self, times: Array | None, end: float) -> AdaptiveRun:
+    def _rerun(self, times: Array | None, end: float) -> AdaptiveRun:
         """The same run with rows at times, or after each step and on both sides of each jump."""
         q, qd = self._begin
         held = self._held
@@ -78,7 +78,7 @@ class AdaptiveRun(Fitted):
         """Itself, with rows between where steps are too long for curves."""
         if len(self) < 2 or len(self) >= _DRAWN:
             return self
-        return self._with(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
+        return self._insert_rows(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
 
     def _evenly(self, count: int) -> AdaptiveRun:
         """Interpolate the run at `count` equidistant times, with both rows of each jump."""
@@ -92,7 +92,7 @@ class AdaptiveRun(Fitted):
         both = zip((steps.q[own], steps.qd[own]), self(times), strict=True)
         return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
 
-    def _with(self, times: Array) -> AdaptiveRun:
+    def _insert_rows(self, times: Array) -> AdaptiveRun:
         """Itself, with rows at some times within among its own."""
         whole = np.concatenate([self.t, times])
         order = np.argsort(whole, kind="stable")
@@ -106,7 +106,7 @@ class AdaptiveRun(Fitted):
         t, parts = made.t[:, None], np.arange(1, _EVEN) / _EVEN
         between = (t[:-1] + np.diff(t, axis=0) * parts).astype(t.dtype)
         apart = (t[:-1] < between) & (between < t[1:])
-        found = crossings(made._with(between[apart]).to_dict(), name, value, rising, period)
+        found = crossings(made._insert_rows(between[apart]).to_dict(), name, value, rising, period)
         asked = found["t"] >= self.t[0]
         times, by = found["t"][asked], 1e-6 * float(np.max(np.diff(made.t)))
         turns = 0.0 if period is None else period * np.round((found[name][asked] - value) / period)
@@ -131,7 +131,7 @@ class AdaptiveRun(Fitted):
         return self._at(times, np.array(self(times)))
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
-        return error_of(self, run, progress)
+        return error_by_tighter_tolerance(self, run, progress)
 
 
 class SteppedRun(AdaptiveRun):
@@ -181,7 +181,7 @@ def simulate(
     return found
 
 
-def plain(
+def simulate_short_run(
     model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
@@ -197,9 +197,9 @@ def plain(
             return None
         held = held.copy()
     if q0 is not None:
-        from_q = model._from(q0, "q0")[1]
+        from_q = model._checked_half(q0, "q0")[1]
     if qd0 is not None:
-        from_qd = model._from(qd0, "qd0")[1]
+        from_qd = model._checked_half(qd0, "qd0")[1]
     if params is not None:
         p = model._parameters(params).copy()
         at_p = model._pointer(p)
@@ -244,20 +244,20 @@ def run(
     events = EventBuffer(model) if model.events else None
     each = 2 if events else 1  # rows of a step, beside a jump
     room = max(_ROOM, min(model._room, _AT_ONCE // nq))
-    rows = Rows(model, times, 1 + each * room)
+    rows = RowBuffer(model, times, 1 + each * room)
     call = model._lib.adaptive_begin
     place: tuple[Any, ...] = address(real, q), address(real, qd), t0
-    said, kept = "ok", Kept(model)
+    said, counters = "ok", StepCounters(model)
     try:
         while True:
             begun = perf_counter()
-            most, *to = rows.taken(room, each)
+            most, *to = rows.c_arguments(room, each)
             found = call(
                 *place, acting.stop, tol, h_most, acting.at, most, *to,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
-            kept.count(work, bool(events))
-            rows.filled += _kept(work, events)
+            counters.add(work, bool(events))
+            rows.filled += _take_rows(work, events)
             said = STATUS[found]
             ended, cut = found or (events and work.stopped), work.t < acting.stop
             if ended or work.steps >= enough or not acting.on(work):
@@ -266,16 +266,16 @@ def run(
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
             room = min(next_chunk(room, perf_counter() - begun), _MOST) if cut else room
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
-            if not (room := kept.at_most(room, each)):
+            if not (room := counters.limit_steps(room, each)):
                 said = FULL
                 break
-            rows.more(room, each)
+            rows.reserve(room, each)
         if progress is not None and said == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
-        rows.filled += _kept(work, events)
+        rows.filled += _take_rows(work, events)
         said = "interrupted"
-    stamps, both = rows.all()
+    stamps, both = rows.concatenate()
     steps = work.steps
     odd = events or model.constraint_names or nq * steps > _AT_ONCE
     model._room = 0 if odd else steps + _ROOM
@@ -305,7 +305,7 @@ def run(
     return made
 
 
-def _kept(work: Any, events: EventBuffer | None) -> int:
+def _take_rows(work: Any, events: EventBuffer | None) -> int:
     """The rows of the last call, whose events are kept."""
     rows, work.rows = work.rows, 0
     if events:

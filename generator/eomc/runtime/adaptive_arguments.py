@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, as_flag, as_number, as_step_size, check_time, unmasked
+from .arguments import Array, as_flag, as_number, as_step_size, check_time, without_mask
 from .metadata import ModelInfo
 from .package import option
 
@@ -20,7 +20,7 @@ FIXED = {  # what belongs to fixed steps, where nothing is said of it
 }  # fmt: skip
 
 
-def fits(
+def uses_adaptive_steps(
     model: ModelInfo, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any
 ) -> bool:
     """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
@@ -88,7 +88,7 @@ def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
 
 def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
     """A C-contiguous array, of any shape, or a ValueError."""
-    unmasked(value, name)
+    without_mask(value, name)
     try:
         given = np.asarray(value)
         if given.dtype.kind in "cUSmM":  # text that looks like a number is none

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from .adaptive_arguments import LEAST
+from .adaptive_trajectory import AdaptiveTrajectory
 from .arguments import Array
 from .estimate import Estimate, growth_of, moving, rounding_words, scales
-from .fitted import Fitted
 from .growth import mean_mass_matrix
 from .input_schedule import ZeroOrderHold
 from .status import FULL, REMEDY
@@ -32,8 +32,8 @@ _ZENO = 0.01  # of the time to an accumulation point: jumps that are nearer diff
 _LONGER = 100  # times the steps, which a moved start takes at most
 
 
-def error_of(
-    own: Fitted, run: Callable[..., Fitted],
+def error_by_tighter_tolerance(
+    own: AdaptiveTrajectory, run: Callable[..., AdaptiveTrajectory],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
     """The error of a run, beside one of a hundredth of its tolerance in shorter steps, and from a
@@ -45,10 +45,10 @@ def error_of(
     """
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
-    model, again = own._model, _Again(own, run, progress)
+    model, again = own._model, _Rerun(own, run, progress)
     x, begin = again.x, np.ravel(own._begin).astype(float)
     eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
-    scale = scales(x, float(np.ptp(own.t)), eps, len(model.still))
+    scale = scales(x, float(np.ptp(own.t)), eps, len(model.discrete_coordinates))
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
     finer, other = again.finer(begin, least)
@@ -102,11 +102,14 @@ def error_of(
     )  # fmt: skip
 
 
-class _Again:
+class _Rerun:
     """A run once more, by another tolerance, in other steps or from another start."""
 
     def __init__(
-        self, own: Fitted, run: Callable[..., Fitted], progress: Callable[[int, int], None] | None
+        self,
+        own: AdaptiveTrajectory,
+        run: Callable[..., AdaptiveTrajectory],
+        progress: Callable[[int, int], None] | None,
     ) -> None:
         self.own, self.run, self.progress = own, run, progress
         self.u: Any = ZeroOrderHold(own._u, own._period, own._periods) if own._period else own._u
@@ -120,7 +123,7 @@ class _Again:
     def __call__(
         self, tol: float, start: Array, h_most: float, steps: float = np.inf,
         end: float | None = None,
-    ) -> tuple[Array, Fitted | None]:  # fmt: skip
+    ) -> tuple[Array, AdaptiveTrajectory | None]:  # fmt: skip
         """The states at the rows, nan where the run has none, and the run itself."""
         own = self.own
         out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
@@ -128,14 +131,14 @@ class _Again:
         if not len(self.kept):
             return out[self.beside], None
         to = float(own.t[-1]) if end is None else end
-        made = self._made(tol, start, h_most, steps, to, own.t[self.kept])
+        made = self._rerun(tol, start, h_most, steps, to, own.t[self.kept])
         out[self.kept[: len(made)]] = made.x
         self._end(out, made)
         return out[self.beside], made
 
-    def _made(
+    def _rerun(
         self, tol: float, start: Array, h_most: float, steps: float, end: float, times: Array
-    ) -> Fitted:
+    ) -> AdaptiveTrajectory:
         own, nq = self.own, self.own._model.nq
         made = self.run(
             own._model, start[:nq], start[nq:], own.t0, end, tol, times.astype(own._model.dtype),
@@ -145,7 +148,7 @@ class _Again:
             raise KeyboardInterrupt
         return made
 
-    def _end(self, rows: Array, made: Fitted) -> None:
+    def _end(self, rows: Array, made: AdaptiveTrajectory) -> None:
         """The last row where the same event ends both runs, the other a hair sooner or later."""
         own = self.own
         if own.stopped and made.stopped == own.stopped and own.t[-1] == self.reached:
@@ -172,7 +175,7 @@ class _Again:
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
         if len(times) > 1:
-            made = self._made(tol, start, h_most, steps, float(own.t[-1]), times[1:])
+            made = self._rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
             out[1 : 1 + len(made)] = made.x
             self._end(out, made)
         return out
@@ -184,7 +187,7 @@ class _Again:
         out[self.kept] = states[np.searchsorted(self.times, self.own.t[self.kept].astype(float))]
         return np.asarray(out[self.beside])
 
-    def finer(self, begin: Array, least: float) -> tuple[Array, Fitted | None]:
+    def finer(self, begin: Array, least: float) -> tuple[Array, AdaptiveTrajectory | None]:
         """The same by a finer run."""
         own, end = self.own, None
         if own.stopped:  # shorter steps may detect that event later, or not at all
@@ -214,7 +217,9 @@ class _Events:
     end: Array | None
 
     @classmethod
-    def compare(cls, own: Fitted, other: Fitted | None, left: Array, scale: Array) -> _Events:
+    def compare(
+        cls, own: AdaptiveTrajectory, other: AdaptiveTrajectory | None, left: Array, scale: Array
+    ) -> _Events:
         """Pair the events of both runs up to where their states differ by a tenth of the motion.
 
         Two events are the same one if they are nearest to one another, and not further apart than
@@ -265,7 +270,7 @@ class _Events:
             None if found is None else np.concatenate([found.q[-1], found.qd[-1]]).astype(float),
         )
 
-    def words(self, own: Fitted) -> list[str]:
+    def words(self, own: AdaptiveTrajectory) -> list[str]:
         """What was missed, and what was detected in vain, a sentence each."""
         finer, remedy = "shorter steps", "a smaller h"
         if not own._by:
@@ -304,7 +309,7 @@ def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
     return np.flatnonzero(mutual), at[mutual]
 
 
-def _finer(own: Fitted, least: float) -> tuple[float, float]:
+def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
     """Tolerance and longest step of a run to compare with: in other steps where there is no smaller
     tolerance too, as rounding differs, and what comes and goes between two nodes shows. Of fixed
     steps a quarter of their size."""
@@ -331,7 +336,7 @@ def _filled(rows: Array) -> Array:
 
 
 def _verdict(
-    own: Fitted, left: Array, rounding: Array, amplification: float, events: _Events
+    own: AdaptiveTrajectory, left: Array, rounding: Array, amplification: float, events: _Events
 ) -> str:
     """What speaks against the run; its differences, and rounding, relative to the scales."""
     words = []

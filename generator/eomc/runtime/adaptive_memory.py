@@ -11,22 +11,22 @@ from .metadata import ModelInfo
 from .status import PART
 
 
-class Kept:
+class StepCounters:
     """How many rows and events a run keeps, and how many more there is room for."""
 
     def __init__(self, model: ModelInfo) -> None:
         self.rows, self.most = 0, room_for(model)
 
-    def count(self, work: Any, events: bool) -> None:
+    def add(self, work: Any, events: bool) -> None:
         """Those of the last call of C."""
         self.rows += work.rows + (work.events if events else 0)
 
-    def at_most(self, steps: int, each: int) -> int:
+    def limit_steps(self, steps: int, each: int) -> int:
         """So many steps of `each` rows, or as many as there is room for; 0: none."""
         return int(min(steps, max(0.0, self.most - self.rows) // each))
 
 
-class Rows:
+class RowBuffer:
     """Times and rows as C fills them, in pieces: one after each step, or at `times` (n,)."""
 
     def __init__(self, model: ModelInfo, times: Array | None, count: int) -> None:
@@ -41,13 +41,13 @@ class Rows:
         self.to = address(real, self.whole)
         self.to_t = self.to if self.times is None else address(real, self.times)
 
-    def more(self, steps: int, each: int) -> None:
+    def reserve(self, steps: int, each: int) -> None:
         """Have room for a step of `each` rows at least: where there is none, for so many steps."""
         if self.own and self.count - self.filled < each:
             self.pieces.append(self._filled())
             self._piece(1 + each * steps)
 
-    def taken(self, steps: int, each: int) -> tuple[Any, ...]:
+    def c_arguments(self, steps: int, each: int) -> tuple[Any, ...]:
         """What C takes: steps at most, times and how many, room for times, for q and for qd."""
         null, nq, left = self.model._c[2], self.model.nq, self.count - self.filled
         to_q = self.to + (self.count + nq * self.filled)
@@ -56,7 +56,7 @@ class Rows:
             return (left - (not self.filled)) // each, null, 0, self.to_t + self.filled, *at
         return steps, self.to_t + self.filled, left, null, *at
 
-    def all(self) -> tuple[Array, Array]:
+    def concatenate(self) -> tuple[Array, Array]:
         """The times (n,) and rows (2, n, nq)."""
         times, rows = self._filled()
         if self.pieces:

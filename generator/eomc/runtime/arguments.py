@@ -64,7 +64,7 @@ class Params:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # a copy too goes this way
-        return reduced("_model._made_params", dict(zip(self._names, self._values(), strict=True)))
+        return reduced("_model._create_params", dict(zip(self._names, self._values(), strict=True)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Params):
@@ -122,7 +122,7 @@ class Arguments:
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 
-    def _made_params(self, values: Mapping[str, float]) -> Any:
+    def _create_params(self, values: Mapping[str, float]) -> Any:
         return self.Params(**values)
 
     @property
@@ -144,7 +144,7 @@ class Arguments:
         address, real, null = self._c
         return null if array is None else address(real, array)
 
-    def _given(self, u: Any, params: Any) -> tuple[Any, Any]:
+    def _input_pointers(self, u: Any, params: Any) -> tuple[Any, Any]:
         """The addresses of inputs and parameters."""
         held = self._c[2] if u is None else self._pointer(self._inputs(u))
         return held, self._at[2] if params is None else self._pointer(self._parameters(params))
@@ -172,7 +172,7 @@ class Arguments:
     def _numbers(self, value: ArrayLike, name: str) -> Array:
         """A C-contiguous, aligned array of the module's numbers, of any shape."""
         if not isinstance(value, list):
-            unmasked(value, name)
+            without_mask(value, name)
         try:
             array = np.asarray(value)
             if array.dtype.kind in "cUSmM":  # text that looks like a number is none
@@ -219,7 +219,7 @@ class Arguments:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
 
-    def _from(self, x0: Any, name: str) -> tuple[Array, Any]:
+    def _checked_half(self, x0: Any, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""
         if (numbers := self._listed(x0, self._shape)) is not None:
             return x0, numbers  # an array, as was seen
@@ -245,12 +245,12 @@ class Arguments:
             raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
         if isinstance(params, Mapping):
             given = self.Params()
-            for name, value in named(params).items():
+            for name, value in by_name(params).items():
                 if name in self.coordinates:
                     raise ValueError(f"params: {of_a_start(self, name)}")
                 given._set(name, value)
             return np.asarray(given._array)
-        unmasked(params, "params")
+        without_mask(params, "params")
         try:
             array = self._numbers(params, "params")
         except ValueError:
@@ -275,7 +275,7 @@ class Arguments:
             if array.ndim == 2 and array.shape[1] == len(self.parameters):
                 return _finite(array, "params: not all numbers are finite: {}")
             return self._parameters(params)[None]
-        params = named(params)
+        params = by_name(params)
         sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
         count = max(sizes.values(), default=1)
         table = np.tile(self._p0, (count, 1))
@@ -305,7 +305,7 @@ class Arguments:
 
         All are to be given: held inputs and signals, which go on through a step, can't be mixed.
         """
-        u = named(u)
+        u = by_name(u)
         for name in u:
             if name not in self.inputs:
                 raise ValueError(not_one_of("u", name, self.inputs))
@@ -332,7 +332,7 @@ class Arguments:
     def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
         if out is None:
             return empty(shape, self.dtype)
-        unmasked(out, name)
+        without_mask(out, name)
         good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.carray
         if not good or out.shape != shape:
             raise ValueError(
@@ -345,7 +345,7 @@ class Arguments:
     def _movable(self, x: Array, name: str) -> None:
         """A ValueError where C can't move these states in place."""
         found = f"a {type(x).__name__}"
-        if isinstance(unmasked(x, name), np.ndarray):
+        if isinstance(without_mask(x, name), np.ndarray):
             right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
             if right and flags.carray:
                 return
@@ -393,9 +393,9 @@ class StateArguments:
         u_stride = acting.shape[-1] if acting is not None and acting.ndim == 2 else 0
         p_stride = 0
         if rows and isinstance(params, Mapping):
-            params = named(params)
+            params = by_name(params)
             for name in [name for name, value in params.items() if np.ndim(value)]:
-                unmasked(params[name], f"params: {name}")
+                without_mask(params[name], f"params: {name}")
                 _check_rows(f"params: {name}", np.shape(params[name]), rows)
                 p_stride = len(model.parameters)
         elif rows and isinstance(params, ndarray) and params.ndim == 2:
@@ -412,7 +412,7 @@ class StateArguments:
         """The time of state k."""
         return self.t if self.times is None else float(self.times[k])
 
-    def at(self, k: int) -> tuple[float, Any, Any, Any]:
+    def pointers(self, k: int) -> tuple[float, Any, Any, Any]:
         """The last arguments of a function in C, from state k on: t, u, p and strides."""
         if not self.own:
             return self.t, self.u, self.p, self.own
@@ -429,7 +429,7 @@ def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
     """A time for each row, (n,); None where there is one for all. Raises ValueError."""
     if not (rows and np.ndim(t)):
         return None
-    unmasked(t, "t")
+    without_mask(t, "t")
     if np.shape(t) != rows:
         raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
     return _finite(model._numbers(t, "t"), "t: {} is not a finite number")
@@ -449,12 +449,12 @@ def _finite(array: Array, words: str) -> Array:
     return array
 
 
-def named(given: Mapping[Any, Any]) -> dict[str, Any]:
+def by_name(given: Mapping[Any, Any]) -> dict[str, Any]:
     """By names: keys may be symbols of SymPy too, or its functions of time."""
     return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in given.items()}
 
 
-def unmasked(value: Any, name: str) -> Any:
+def without_mask(value: Any, name: str) -> Any:
     """The value; a ValueError where it is an array with masked numbers, for these have none."""
     ma: Any = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
     masked = getattr(ma, "MaskedArray", ())  # another thread may be at that just now

@@ -219,7 +219,7 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
     bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    made: Trajectory = bare._with(np.concatenate(times)) if times else bare
+    made: Trajectory = bare._insert_rows(np.concatenate(times)) if times else bare
     return made.t, made.q, made.qd
 
 
@@ -233,7 +233,7 @@ def with_jumps(run: Any) -> Any:
 
 def _after_steps(run: Any) -> Any:
     """The same run with a row after each step, and both of each jump."""
-    return run._made(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
+    return run._rerun(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import batch_adaptive, batch_fixed
-from .adaptive_arguments import as_progress, fits
+from .adaptive_arguments import as_progress, uses_adaptive_steps
 from .arguments import (
     Array,
     Start,
@@ -22,7 +22,7 @@ from .arguments import (
     as_number,
     as_step_size,
     row_times,
-    unmasked,
+    without_mask,
 )
 from .batch_instances import Instances
 from .batch_run import BatchRun
@@ -71,12 +71,12 @@ class BatchModel(Instances):
             other, given = with_events(self.simulate_batch, dict(locals()))
             return cast(BatchRun, other.simulate_batch(**given))
         progress = as_progress(progress)
-        if fits(self, h, steps, method, tol, h_most, stiff):
+        if uses_adaptive_steps(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
                 stiff, control_period, (h, steps, method, every, None), max_evaluations,
             )  # fmt: skip
-            return self._told(fitted, whole)
+            return self._finish(fitted, whole)
         if max_evaluations is not None:
             raise ValueError("max_evaluations: belongs to adaptive steps: give tol=, and no h=")
         if self.events and not self._passes_over:
@@ -84,7 +84,7 @@ class BatchModel(Instances):
                 self, q0, qd0, h, duration, steps, every, params, u, threads, method, t0, progress,
                 times, control_period,
             )  # fmt: skip
-            return self._told(seen, whole)
+            return self._finish(seen, whole)
         step = self._stepper(method, "batch")
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         at = None
@@ -101,15 +101,17 @@ class BatchModel(Instances):
         if steps >= SOME and (method, h) not in self._warned:
             first, u0 = (starts[0][0], starts[1][0]), None if held is None else held[0, 0]
             self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
-        asked = batch_fixed.Asked(step, h, t0, steps, every, at, method, threads, progress, codes)
+        asked = batch_fixed.FixedStepRequest(
+            step, h, t0, steps, every, at, method, threads, progress, codes
+        )
         run, whole = batch_fixed.simulate(self, starts, held, table, asked)
-        return self._told(run, whole)
+        return self._finish(run, whole)
 
-    def _told(self, run: BatchRun, whole: bool) -> BatchRun:
+    def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
         """A batch as `simulate_batch` returns it, with a warning of those that could not go on."""
         if not whole:
             raise Interrupted(run)
-        if words := run._lost:
+        if words := run._no_convergence_message:
             warn(f"{self.name}: {words}")
         return run
 
@@ -152,7 +154,7 @@ class BatchModel(Instances):
             self._method(method)  # raises, with those there are
         if out is not None:
             into = self._pair(out, np.shape(q))
-            into[0][...], into[1][...] = unmasked(q, "q"), unmasked(qd, "qd")
+            into[0][...], into[1][...] = without_mask(q, "q"), without_mask(qd, "qd")
             q, qd = into
         self._movable(q, "q")
         self._movable(qd, "qd")

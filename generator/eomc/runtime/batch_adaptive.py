@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times
 from .adaptive_memory import room_for
+from .adaptive_trajectory import failure_message
 from .arguments import Array, Start, as_count, as_number, as_step_size, check_time, cut_table
 from .batch_instances import Instances
-from .batch_run import BatchRun, stuck
-from .batch_work import all_of, as_threads
+from .batch_run import BatchRun, initial_failures
+from .batch_work import as_threads, run_groups
 from .by_name import ByName
 from .events import BatchEventBuffer, BatchEventLog
-from .fitted import said
 from .fixed_step_events import as_hold, as_rows
 from .input_schedule import count_periods, period_end, sample_zero_order_hold
 from .metadata import SOME
@@ -98,7 +98,7 @@ class AdaptiveBatchRun(BatchRun):
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
             (held, self._period), p, self._stiff, self._by,
         )  # fmt: skip
-        work.leave(stuck(self))
+        work.leave(initial_failures(self))
         if self._max_evaluations:  # what states between steps take is besides
             each = _BETWEEN + 2 * model.nq + 1
             work.limit(self._max_evaluations + each * (len(times) + len(self.t)))
@@ -144,7 +144,7 @@ class AdaptiveBatchRun(BatchRun):
             return f"event '{event}' jumps to no finite state"
         if status == "accumulated":
             return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
-        return said(self._model, status, self._by)
+        return failure_message(self._model, status, self._by)
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
@@ -349,7 +349,7 @@ class _Work:
         count = len(self.q)
         group = _GROUP if count > 8 * _GROUP else _FEWEST
         groups = [(at, min(group, count - at)) for at in range(0, count, group)]
-        whole = all_of(
+        whole = run_groups(
             self, groups, as_threads(threads), lambda: progress and progress(self.ended, count)
         )
         self.rows[:, np.arange(len(self.times)) >= self.kept[:, None]] = np.nan
@@ -367,13 +367,13 @@ class _Work:
             end = self.limits[0]
             if k + 1 < periods:
                 end = period_end(k, self.t0, self.period, model.dtype)
-            if self._on(at, count, end, u + k * model.nu if k else u, each, look):
+            if self._advance(at, count, end, u + k * model.nu if k else u, each, look):
                 return  # it was stopped
         self.open[at : at + count] = False
         self.ended += count  # a figure for the bar; threads may lose one another's
         look()
 
-    def _on(
+    def _advance(
         self, at: int, count: int, t_end: float, u: Any, u_instance: int,
         look: Callable[[], object],
     ) -> bool:  # fmt: skip

@@ -13,8 +13,8 @@ import numpy as np
 
 from .arguments import Array, machine_memory
 from .batch_instances import Instances
-from .batch_run import BatchRun, way_of
-from .batch_work import Way, Work
+from .batch_run import BatchRun, stepper_for
+from .batch_work import BatchStepper, Work
 from .dense import parts
 from .model import LARGE
 from .status import STATUS
@@ -41,8 +41,8 @@ class TimedBatchRun(BatchRun):
 
     def _states(self, times: Array) -> Array:
         found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
-        way = way_of(self, self._begin.copy(), self._u)
-        way.rows(parts(times, self.t0, self.h), found)
+        stepper = stepper_for(self, self._begin.copy(), self._u)
+        stepper.rows(parts(times, self.t0, self.h), found)
         return found
 
     def _all(self) -> tuple[Any, ...]:
@@ -61,7 +61,7 @@ class TimedBatchRun(BatchRun):
         return (*super()._settings(), self._times.tolist())
 
 
-class Asked(NamedTuple):
+class FixedStepRequest(NamedTuple):
     """What a run by fixed steps was asked for; times (n,): rows there.
 
     codes: the status of each at its start, (batch,), where one can't be assembled.
@@ -80,7 +80,11 @@ class Asked(NamedTuple):
 
 
 def simulate(
-    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances,
+    starts: tuple[Array, Array],
+    held: Array | None,
+    table: Array,
+    asked: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """From checked arguments, and whether it is whole, not cut off by Ctrl-C."""
     made = _by_steps if asked.times is None else _at_times
@@ -88,7 +92,11 @@ def simulate(
 
 
 def _by_steps(
-    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances,
+    starts: tuple[Array, Array],
+    held: Array | None,
+    table: Array,
+    asked: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """Rows after every so many steps, and the last."""
     step, h, t0, steps, every, _, method, threads, progress, codes = asked
@@ -116,17 +124,21 @@ def _by_steps(
 
 
 def _at_times(
-    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances,
+    starts: tuple[Array, Array],
+    held: Array | None,
+    table: Array,
+    asked: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """Rows at the times that were asked for."""
     h, t0, method, times = asked.h, asked.t0, asked.method, asked.times
     assert times is not None
     places = parts(times, t0, h, asked.steps)
     both, (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), len(times))
-    way = Way(model, method, both, t0, h, held, table, starts)
-    way.work.leave(asked.codes)
-    whole = way.rows(places, (q_rows, qd_rows), asked.threads, asked.progress)
-    work, last = way.work, int(places[0][-1])
+    stepper = BatchStepper(model, method, both, t0, h, held, table, starts)
+    stepper.work.leave(asked.codes)
+    whole = stepper.rows(places, (q_rows, qd_rows), asked.threads, asked.progress)
+    work, last = stepper.work, int(places[0][-1])
     if not whole:
         work.status[(work.status == 0) & (work.done < last)] = _CUT
     given = None if held is None else _at_rows(held, places[0], asked.steps)

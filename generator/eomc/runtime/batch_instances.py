@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, unmasked
+from .arguments import Array, without_mask
 from .model import LARGE, Model
 from .starts import initial_state_for_parameters, is_by_name
 
@@ -76,7 +76,7 @@ class Instances(Model):
     def _rows_of(self, given: ArrayLike, name: str) -> Array:
         """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
         if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == self.nq:
-            unmasked(given, name)
+            without_mask(given, name)
             if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
                 return given
         return self._array(given, name, self.nq)

@@ -17,7 +17,7 @@ from .plugins import require_eomc
 _OF_ONE = {"phase", "section", "other", "labels"}
 
 
-def alone(runs: Any) -> str:
+def single_run_hint(runs: Any) -> str:
     """Where to find what single runs have and batches have not."""
     name = runs._model.name
     return f"is of one run: {name}.simulate(runs.q[k, 0], runs.qd[k, 0], params=...)"
@@ -38,7 +38,7 @@ class Fans:
         the last value of each is drawn instead. Else as `Run.plot`.
         """
         for name in _OF_ONE & style.keys():
-            raise TypeError(f"plot: {name}= {alone(self)}.plot({name}=...)")
+            raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
         return fan(self, names, quantiles, lines, over, wrap, ax, axes, file, style)
 
     def animate(

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array
-from .batch_plot import Fans, alone
+from .batch_plot import Fans, single_run_hint
 from .batch_values import Values
-from .batch_work import Way
+from .batch_work import BatchStepper
 from .by_name import ByName
 from .columns import Columns
 from .dense import parts, within
@@ -114,18 +114,18 @@ class BatchRun(Values, Fans, Columns):
         found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         for row in np.unique(whole // every):
             own, first = (whole // every == row).nonzero()[0], int(row) * every
-            way = way_of(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
-            way.work.status[self.steps < first] = STATUS.index(
+            stepper = stepper_for(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
+            stepper.work.status[self.steps < first] = STATUS.index(
                 "not finite"
             )  # who never came so far
             here = slice(own[0], own[-1] + 1)
-            way.rows((whole[own], rest[own]), found[:, :, here])
+            stepper.rows((whole[own], rest[own]), found[:, :, here])
         return found
 
     def __getattr__(self, name: str) -> Any:
         """A column that the scene names; of what one run alone has, where to find it."""
         if name in _OF_ONE and name not in self._named():
-            raise AttributeError(f"{name} {alone(self)}.{_OF_ONE[name]}")
+            raise AttributeError(f"{name} {single_run_hint(self)}.{_OF_ONE[name]}")
         return super().__getattr__(name)
 
     @property
@@ -156,7 +156,7 @@ class BatchRun(Values, Fans, Columns):
         return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
 
     @property
-    def _lost(self) -> str:
+    def _no_convergence_message(self) -> str:
         """How many could not go on, and why the first of them could not; "" where all did."""
         if not self._codes.any():
             return ""
@@ -204,14 +204,14 @@ class BatchRun(Values, Fans, Columns):
         return f"<BatchRun of {self._model.name}: {self.message}>"
 
 
-def stuck(run: BatchRun) -> Array:
+def initial_failures(run: BatchRun) -> Array:
     """The status of those that made no step, (batch,), and 0 of the others."""
     return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
-def way_of(run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:
-    """A run's way again, from its states behind so many steps."""
+def stepper_for(run: BatchRun, both: Array, held: Array | None, first: int = 0) -> BatchStepper:
+    """A run's stepper again, from its states behind so many steps."""
     model: Any = run._model
-    way = Way(model, run.method, both, run.t0, run.h, held, run._params, None, first)
-    way.work.leave(stuck(run))
-    return way
+    stepper = BatchStepper(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+    stepper.work.leave(initial_failures(run))
+    return stepper

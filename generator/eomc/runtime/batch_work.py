@@ -70,7 +70,7 @@ class Work:
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
         self._begin_all(threads if len(groups) > 1 else 1)
         total = count * self.steps
-        return all_of(self, groups, threads, lambda: progress and progress(self.moved, total))
+        return run_groups(self, groups, threads, lambda: progress and progress(self.moved, total))
 
     def _begin_all(self, threads: int) -> None:
         """The starts of all into what is moved, and into the first rows.
@@ -134,8 +134,8 @@ class Work:
             look()
 
 
-class Way:
-    """Instances on their way by whole steps, with shorter ones to times between."""
+class BatchStepper:
+    """Instances on their stepper by whole steps, with shorter ones to times between."""
 
     def __init__(
         self, model: Instances, method: str | None, both: Any, t0: float, h: float,
@@ -186,7 +186,7 @@ class Grouped(Protocol):
     def _group(self, at: int, count: int, look: Callable[[], object] = ...) -> None: ...
 
 
-def all_of(
+def run_groups(
     work: Grouped, groups: list[tuple[int, int]], threads: int, look: Callable[[], object]
 ) -> bool:
     """All groups, in threads; look: called now and then. False where Ctrl-C came in between."""

@@ -21,7 +21,7 @@ from .status import SAID, STATUS, MotionError, state_text
 AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
 
-class Rows(NamedTuple):
+class ConstraintRows(NamedTuple):
     """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
 
     holonomic: how many of the constraints are; they come first. redundant: which of them were left
@@ -42,7 +42,7 @@ class Rows(NamedTuple):
 class Constrained(Frames):
     """What scenes with [constraints] or [[loop]] have besides."""
 
-    _rows = Rows()
+    _rows = ConstraintRows()
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
@@ -192,7 +192,7 @@ class Constrained(Frames):
             said = STATUS[codes[k]]
             where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
             kept = [n for n, h in zip(self._states, held, strict=False) if h]
-            kept = [n for n in kept if n.removesuffix("_dot") not in self.still]
+            kept = [n for n in kept if n.removesuffix("_dot") not in self.discrete_coordinates]
             what = SAID[said] if said != "locked" else (
                 "no state near that obeys the constraints"
                 + (f" with {', '.join(kept)} as given: leave one free" if kept else "")
@@ -210,7 +210,7 @@ class Constrained(Frames):
         codes, first = np.zeros(at.size // n, "i"), 0
         from_q, from_qd = self._pointer(at), self._pointer(moving)
         while first < len(codes):
-            now, _, p, own = acts.at(first)
+            now, _, p, own = acts.pointers(first)
             found = self._lib.project(
                 len(codes) - first, from_q + n * first, from_qd + n * first, now, flags, p, own
             )
@@ -234,10 +234,10 @@ class Constrained(Frames):
         """
         if not self._rows.names:
             return q, qd, None
-        q, qd, codes = self._begun_rows(q, qd, t0, table if len(table) > 1 else table[0])
+        q, qd, codes = self._project_starts(q, qd, t0, table if len(table) > 1 else table[0])
         return q, qd, codes if codes.any() else None
 
-    def _tell(self, run: Any, method: str, work: Any) -> None:
+    def _record_singular_steps(self, run: Any, method: str, work: Any) -> None:
         """A run what its steps met, as their work in C has it."""
         if not self._rows.names:
             return
@@ -250,13 +250,15 @@ class Constrained(Frames):
         q0, qd0 = self._completed(q0, 0), self._completed(qd0, 1)
         for x, name in ((q0, "q0"), (qd0, "qd0")):
             if x is not None:
-                self._from(x, name)
+                self._checked_half(x, name)
         if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
             return q0, qd0
         q, qd = self._start
-        return self._begun(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
+        return self._project_start(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
 
-    def _begun(self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any) -> tuple[Array, Array]:
+    def _project_start(
+        self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
+    ) -> tuple[Array, Array]:
         """A start on the rows, and its modes as the velocities say that these leave."""
         held = self._rows.held
         if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
@@ -266,7 +268,7 @@ class Constrained(Frames):
             *self._in_modes(*self._projected(q, qd, t0, params, held)), t0, params, held
         )
 
-    def _begun_rows(
+    def _project_starts(
         self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
         """The same of many states, with the status of each; one that fails stays as given."""
@@ -287,7 +289,7 @@ class Constrained(Frames):
         return q
 
     @property
-    def still(self) -> tuple[str, ...]:
+    def discrete_coordinates(self) -> tuple[str, ...]:
         """The coordinates that only jumps change: the last ones, without velocities."""
         return self.coordinates[self.nq - len(self._rows.modes) - self._rows.discrete :]
 

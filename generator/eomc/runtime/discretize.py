@@ -42,7 +42,7 @@ def discretize(
         model._pointer(x) if x.size else null for x in (Phi, Gamma, q, qd)
     )
     for k, many in slices(q.size // n, _STEPS // (steps * n**3) + 1):
-        now, held, p, own = acts.at(k)
+        now, held, p, own = acts.pointers(k)
         found = derivative(
             many, to_Phi + 4 * n**2 * k, to_Gamma + 2 * n * model.nu * k if model.nu else null,
             from_q + n * k, from_qd + n * k, now, h, steps, held, p, own,

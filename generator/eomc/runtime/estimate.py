@@ -157,7 +157,7 @@ def _growth(run: Trajectory, own: Array, eps: float, again: _Again) -> tuple[Arr
         every = max(1, run.steps // _ROWS)
         made = again(1, every)
         base, times = made.x.astype(float), made.t
-    scale = scales(base, float(np.ptp(run.t)), eps, len(model.still))
+    scale = scales(base, float(np.ptp(run.t)), eps, len(model.discrete_coordinates))
     moves = moving(model)
     signs = moves * np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
@@ -198,7 +198,7 @@ def growth_of(
     place: the start (2 nq,), its time and parameters. moved: finds another difference from a nudge
     of the start, (2 nq,).
     """
-    n, (start, t0, p) = model.nq - len(model.still), place
+    n, (start, t0, p) = model.nq - len(model.discrete_coordinates), place
     free = [*range(n), *range(model.nq, model.nq + n)]
 
     def allowed(nudge: Array) -> Array:
@@ -300,7 +300,9 @@ def _counts(run: Trajectory, every: int, rows: int) -> Array:
 
 def moving(model: Stepping) -> Array:
     """(2 nq,): 1 of what moves and is nudged, 0 of what jumps alone change."""
-    return np.tile(np.arange(model.nq) < model.nq - len(model.still), 2).astype(float)
+    return np.tile(np.arange(model.nq) < model.nq - len(model.discrete_coordinates), 2).astype(
+        float
+    )
 
 
 def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:

@@ -102,9 +102,11 @@ class Functions(Arguments):
                     break
                 here = self.nq * k
                 moving = from_qd + here if of_velocity and k else from_qd
-                function(many, to + size * k, from_q + here if k else from_q, moving, *acts.at(k))
+                function(
+                    many, to + size * k, from_q + here if k else from_q, moving, *acts.pointers(k)
+                )
         else:
-            time, (inputs, p) = as_number(t, "t"), self._given(u, params)
+            time, (inputs, p) = as_number(t, "t"), self._input_pointers(u, params)
             if function is not None:
                 function(1, address(real, result), from_q, from_qd, time, inputs, p, null)
         if function is None:  # no forces, no power
@@ -268,14 +270,14 @@ class Functions(Arguments):
             result = self._out(out, at.shape)
         to, function, done = self._pointer(made), self._lib.acceleration, 0
         if at.ndim == 1:
-            time, (inputs, p) = as_number(t, "t"), self._given(u, params)
+            time, (inputs, p) = as_number(t, "t"), self._input_pointers(u, params)
             found = function(1, to, from_q, from_qd, time, inputs, p, self._c[2])
             said = STATUS[found & 7]
         else:
             n, acts = self.nq, StateArguments(self, at.shape[:1], t, u, params)
             done, said = self._all_rows(
                 lambda k, many: function(
-                    many, to + n * k, from_q + n * k, from_qd + n * k, *acts.at(k)
+                    many, to + n * k, from_q + n * k, from_qd + n * k, *acts.pointers(k)
                 ),
                 len(at), _ROWS // n**2 + 1,
             )  # fmt: skip
@@ -343,7 +345,7 @@ class Functions(Arguments):
         done, said = self._all_rows(
             lambda k, many: self._lib.linearization(
                 many, *(to + k * size for to, size in out), from_q + n * k, from_qd + n * k,
-                *acts.at(k),
+                *acts.pointers(k),
             ),
             q.size // n, _ROWS // n**3 + 1,
         )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
-from .constrained import Rows
+from .constrained import ConstraintRows
 from .package import MODEL, option, reduced
 from .statics import Statics
 
@@ -28,7 +28,7 @@ class ModelInfo(Statics):
         super().__init__(extension, **scene)
         self.h, self.duration, self.tolerance = h, duration, tolerance
         self.events = events
-        self._rows = Rows(*constrained)
+        self._rows = ConstraintRows(*constrained)
         self.methods = tuple(methods)
         self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}

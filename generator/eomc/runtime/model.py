@@ -16,7 +16,7 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from . import adaptive, fixed_step_events, output_times, saved
-from .adaptive_arguments import as_progress, fits
+from .adaptive_arguments import as_progress, uses_adaptive_steps
 from .arguments import (
     Array,
     Parameters,
@@ -120,12 +120,14 @@ class Model(Stepping):
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
             and h_most is None and every == 1 and stiff is False
-            and (r := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room)) is not None
+            and (
+                r := adaptive.simulate_short_run(self, q0, qd0, duration, u, params, t0, tol, room)
+            ) is not None
         ):  # fmt: skip
             return r
         estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        by_tol = fits(self, h, steps, method, tol, h_most, stiff)
+        by_tol = uses_adaptive_steps(self, h, steps, method, tol, h_most, stiff)
         if by_tol or (self.events and not self._passes_over):
             given = q0, qd0, duration, u, params, t0, progress, times, control_period
             fixed = h, steps, method, every, out
@@ -138,9 +140,9 @@ class Model(Stepping):
         method = self.methods[0] if method is None else self._method(method)
         (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0
         if q0 is not None:
-            q, from_q = self._from(q0, "q0")
+            q, from_q = self._checked_half(q0, "q0")
         if qd0 is not None:
-            qd, from_qd = self._from(qd0, "qd0")
+            qd, from_qd = self._checked_half(qd0, "qd0")
         h = self.h if h is None else as_step_size(h, self.dtype)
         if params is not None:
             p = self._parameters(params).copy()
@@ -272,7 +274,7 @@ class Model(Stepping):
         evaluations = counted(work) if counted else stages * done
         given = law.law if law else None if held is None else held.copy()
         made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
-        self._tell(made, method, work)
+        self._record_singular_steps(made, method, work)
         if law:
             made._hold = hold
             made._applied = law.rows(len(made), self.nu)

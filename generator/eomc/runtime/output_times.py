@@ -157,7 +157,7 @@ def run(
         model, t0, rows[:, : len(stamps)], h, way.done, said, p, 1, way.given, method,
         way.evaluations, _times=stamps, _begin=np.array([q, qd]),
     )  # fmt: skip
-    model._tell(made, method, way.work)
+    model._record_singular_steps(made, method, way.work)
     if way.law:
         made._hold, made._applied = way.hold, applied[: len(stamps)]
         made._gave = np.reshape(way.values, (-1, model.nu)).astype(model.dtype)

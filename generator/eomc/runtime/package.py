@@ -191,7 +191,7 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 def of_a_start(model: Any, name: str) -> str:
     """That a name of `q` is no parameter, and where it is given."""
-    if name in model.still:
+    if name in model.discrete_coordinates:
         return (
             f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
             f"it in q0, [{', '.join(model.coordinates)}], or eomc run --start {name}=..."

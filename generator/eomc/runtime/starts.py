@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .arguments import Array, as_number, named, not_one_of
+from .arguments import Array, as_number, by_name, not_one_of
 from .constrained import Constrained
 
 _OPERATORS: Mapping[type, Callable[..., Any]] = {
@@ -99,9 +99,9 @@ def values_by_name(
     if not hasattr(x, "keys"):
         return None
     what, found = ("q0", "qd0")[half], dict[str, Array]()
-    moving = [name for name in model.coordinates if name not in model.still]
+    moving = [name for name in model.coordinates if name not in model.discrete_coordinates]
     known = moving if half else model.coordinates
-    for key, value in named(x).items():
+    for key, value in by_name(x).items():
         name = key.removesuffix("_dot") if half and key not in known else key
         if name not in known:
             if not half and key.removesuffix("_dot") in moving:

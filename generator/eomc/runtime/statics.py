@@ -95,7 +95,7 @@ class Statics(Constrained):
         at, moving = self._one(
             *initial_state_for_parameters(self, q, moving, self._parameters(params))
         )
-        moves = [name for name in self.coordinates if name not in self.still]
+        moves = [name for name in self.coordinates if name not in self.discrete_coordinates]
         names = moves if free is None else tuple(free)
         held = self._inputs(u)
         return equilibrium(self, at, moving, held, names, as_number(t, "t"), params)

@@ -41,7 +41,7 @@ class Stepping(ModelInfo):
         """
         from_q, from_qd, at, moving = self._read(q, qd, many=False)
         h = self.h if h is None else as_step_size(h, self.dtype)
-        inputs, p = self._given(u, params)
+        inputs, p = self._input_pointers(u, params)
         address, real, null = self._c
         if out is None:
             both = empty((2, self.nq), self.dtype)

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from .arguments import Array
 from .atomic_write import File
 from .balance import Balance, balance
-from .begun import infinite_at_start
 from .by_name import ByName
 from .dense import states
 from .estimate import Estimate, estimate
+from .initial_checks import infinite_at_start
 from .laws import asked
 from .notebook import html
 from .package import warn

@@ -11,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from .arguments import Array
-from .begun import infinite_at_start
 from .by_name import ByName
 from .events import EventLog
+from .initial_checks import infinite_at_start
 from .input_schedule import sample_zero_order_hold
 from .package import is_made_in_python, option
 from .status import SAID, state_text
@@ -22,12 +22,12 @@ from .trajectory import Run
 from .trajectory_data import LEFT_OUT
 
 _NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
-STOPPED = (
+STEP_TOO_SHORT = (
     "no step is short enough to go on: forces grow without end there, as in a fall into a centre, "
     "or keep jumping: for friction by sign(x_dot) that sticks {}, or let events switch it; else a "
     "looser tolerance"
 )
-REMEDIES = (
+FRICTION_REMEDIES = (
     "take {}",
     "give its coordinate friction = in place of the force",  # where the scene has that
 )
@@ -40,15 +40,15 @@ def _friction() -> str:
     )
 
 
-def said(model: Stepping, status: str, fixed: str) -> str:
+def failure_message(model: Stepping, status: str, fixed: str) -> str:
     """Why steps by a tolerance, or fixed ones of a method, could not go on."""
     if status == "no convergence" and not fixed:
-        return STOPPED.format(REMEDIES[bool(model._rows.modes)].format(_friction()))
+        return STEP_TOO_SHORT.format(FRICTION_REMEDIES[bool(model._rows.modes)].format(_friction()))
     return SAID[status]
 
 
 @dataclass(eq=False, repr=False)
-class Fitted(Run):
+class AdaptiveTrajectory(Run):
     """What `adaptive.AdaptiveRun` keeps, and what follows from that alone."""
 
     tol: float = field(kw_only=True)
@@ -91,7 +91,7 @@ class Fitted(Run):
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
                 f"run ends, after {done}"
             )
-        why = infinite_at_start(self) or said(self._model, self.status, self._by)
+        why = infinite_at_start(self) or failure_message(self._model, self.status, self._by)
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
         return f"stopped at t = {end:.9g} after {done}, {where}: {why}"
