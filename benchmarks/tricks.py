@@ -285,7 +285,7 @@ def calls(rounds: int) -> Iterator[str]:
     ):
         loops = less._model._loops  # the third: up to how many steps there is one
         loops |= {name: (*loop[:2], -1, *loop[3:]) for name, loop in loops.items()}
-        vars(sys.modules[f"{less.__name__}.adaptive"])["plain"] = lambda *_: None
+        vars(sys.modules[f"{less.__name__}._runtime.adaptive"])["plain"] = lambda *_: None
         for name, how in ways.items():
             one, other = (m.simulate(**how).q for m in (less, full))
             if not np.array_equal(one, other):

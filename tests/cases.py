@@ -71,7 +71,7 @@ FEW_ALIKE = (
 def fast_kit(made: Sources) -> dict[str, str]:
     """The generated files, the fast form's header and source in the place of the plain ones."""
     flat = {f: text for f, text in made.files.items() if "/" not in f}
-    fast = {f.removeprefix("fast/"): text for f, text in made.files.items() if "/" in f}
+    fast = {f[5:]: text for f, text in made.files.items() if f.startswith("fast/")}
     return flat | fast
 
 

@@ -123,7 +123,9 @@ def built(
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
         if file.startswith("fast/") == (form == "fast") or file.endswith(".py"):
-            (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
+            path = folder / file.removeprefix("fast/")
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
     ffi = cffi.FFI()
     ffi.cdef(sources.cdef)
     ffi.set_source(EXTENSION, sources.binding)

@@ -42,7 +42,7 @@ def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
 
 def test_only_scenes_that_ask_have_it() -> None:
     plain = eomc.sources(eomc.read(SCENES / "cartpole.toml"))
-    assert "batch" not in plain.files["fast/cartpole.c"] and "batch.py" not in plain.files
+    assert "batch" not in plain.files["fast/cartpole.c"] and "_runtime/batch.py" not in plain.files
 
 
 @pytest.mark.slow

@@ -162,7 +162,7 @@ def test_without_eomc_a_run_says_what_to_do(modules, monkeypatch):
     from importlib import import_module
 
     run = modules("cartpole").simulate(duration=0.1)
-    shown = import_module(type(run).__module__.replace(".trajectory", ".shown"))
+    shown = import_module(type(run).__module__.replace(".trajectory", ".plugins"))
 
     def missing(name):
         raise ModuleNotFoundError(name, name="eomc")

@@ -101,7 +101,7 @@ def test_rows_at_times_are_those_of_runs_that_end_there(kepler: ModuleType) -> N
 
 def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     run = kepler.simulate(duration=50.0)
-    module = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"])
+    module = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"])
     monkeypatch.setattr(module, "_ROOM", 1)
     monkeypatch.setattr(module, "_MOST", 3)
     monkeypatch.setattr(kepler._model, "_room", 0)
@@ -278,7 +278,7 @@ def test_the_error_at_the_least_tolerance_is_found(kepler: ModuleType) -> None:
 
 def test_a_moved_start_may_be_another_motion(kepler: ModuleType) -> None:
     """Moved by more than it is away from the centre: it went round there 1e7 times."""
-    made = __import__(f"{kepler.__name__}.adaptive_error", fromlist=["adaptive_error"])
+    made = __import__(f"{kepler.__name__}._runtime.adaptive_error", fromlist=["adaptive_error"])
     q0, speed = 1e-6, math.sqrt((2 - 1e-6) / 1e-6)
     own, steps = kepler.simulate([q0, 0], [0, speed], duration=6.0, tol=1e-10), []
 
@@ -286,7 +286,7 @@ def test_a_moved_start_may_be_another_motion(kepler: ModuleType) -> None:
         steps.append(run(*given))
         return steps[-1]
 
-    run = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"]).run
+    run = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"]).run
     made.error_by_tighter_tolerance(own, counted, None)
     assert max(run.steps for run in steps) < 1_000_000
 

@@ -90,7 +90,7 @@ def test_each_of_many_is_as_it_is_alone(bouncing: ModuleType) -> None:
 
 def test_a_run_is_the_same_in_pieces(bouncing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     run = bouncing.simulate()
-    module = __import__(f"{bouncing.__name__}.adaptive", fromlist=["adaptive"])
+    module = __import__(f"{bouncing.__name__}._runtime.adaptive", fromlist=["adaptive"])
     monkeypatch.setattr(module, "_ROOM", 1)
     monkeypatch.setattr(module, "_MOST", 3)
     assert bouncing.simulate() == run

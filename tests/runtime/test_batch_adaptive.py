@@ -69,7 +69,7 @@ def test_it_is_the_same_in_pieces(orbits: ModuleType, monkeypatch: pytest.Monkey
     """However few steps a call has, and however many instances a thread takes at once."""
     how = {"tol": 1e-10, "times": np.linspace(0.1, 40.0, 30)}
     run = orbits.simulate_batch(*starts(21), **how)
-    module = __import__(f"{orbits.__name__}.batch_adaptive", fromlist=["batch_adaptive"])
+    module = __import__(f"{orbits.__name__}._runtime.batch_adaptive", fromlist=["batch_adaptive"])
     monkeypatch.setattr(module, "next_chunk", lambda many, spent: many)
     for few, group in ((1, 16), (7, 5), (64, 128)):
         monkeypatch.setattr(module, "_FEW", few)

@@ -27,7 +27,7 @@ def balls() -> ModuleType:
 
 def own(module: ModuleType, name: str) -> ModuleType:
     """A file of those beside a module."""
-    return sys.modules[f"{module.__name__}.{name}"]
+    return sys.modules[f"{module.__name__}._runtime.{name}"]
 
 
 @pytest.mark.filterwarnings("ignore:.*jumps follow one another")

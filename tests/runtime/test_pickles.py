@@ -160,7 +160,7 @@ def test_where_no_build_is_left_all_but_errors_is_refused(
 
 
 def test_a_damaged_build_is_not_read(versions: dict[str, Any], folder: Path) -> None:
-    for file in folder.glob(".builds/*/status.py"):
+    for file in folder.glob(".builds/*/_runtime/status.py"):
         file.write_text(file.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     with pytest.raises(eomc.EomcError, match="which is gone"):
         pickle.loads(versions["first"]["module"]).simulate()

@@ -133,7 +133,7 @@ def test_rows_in_slices_are_rows(
     whole = getattr(driven, name)(*place, t=0.2, **how)
     rows = [getattr(driven, name)(*(x[k] for x in place), t=0.2, **how) for k in range(0, 5003, 7)]
     assert np.array_equal(whole[::7], rows)
-    monkeypatch.setattr(sys.modules[f"{driven.__name__}.functions"], "_ROWS", 100)
+    monkeypatch.setattr(sys.modules[f"{driven.__name__}._runtime.functions"], "_ROWS", 100)
     assert np.array_equal(getattr(driven, name)(*place, t=0.2, **how), whole)
 
 
@@ -142,7 +142,7 @@ def test_accelerations_in_slices_are_rows_and_name_the_bad_one(
 ) -> None:
     q, qd = np.random.default_rng(3).standard_normal((2, 5003, 2))
     whole = cartpole.acceleration(q, qd)
-    monkeypatch.setattr(sys.modules[f"{cartpole.__name__}.functions"], "_ROWS", 100)
+    monkeypatch.setattr(sys.modules[f"{cartpole.__name__}._runtime.functions"], "_ROWS", 100)
     assert np.array_equal(cartpole.acceleration(q, qd), whole)
     qd[3777] = [0, 1.25e200]
     with pytest.raises(cartpole.MotionError, match=r"1\.25e\+200"):

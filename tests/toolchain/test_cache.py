@@ -215,7 +215,7 @@ def test_what_is_built_and_unchanged_needs_no_compiler(
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
     scene.write_text(TEXT, encoding="utf-8")
-    (built.folder / "slices.py").write_text("", encoding="utf-8")  # no longer whole
+    (built.folder / "_runtime" / "slices.py").write_text("", encoding="utf-8")  # no longer whole
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
 
@@ -281,3 +281,21 @@ def test_a_system_of_which_something_was_replaced_is_built_anew(tmp_path: Path) 
     other = replace(made, run=replace(made.run, methods=("dp8",)))
     assert eomc.load(other, tmp_path).methods == ("dp8",)
     assert not pipeline.build(other, tmp_path).fresh
+
+
+def test_the_folder_of_a_model_lists_what_its_user_needs(root: Path, scene: Path) -> None:
+    """Python's own files are in `_runtime`; those that a former version left are removed."""
+    built = eomc.build(scene, root)
+    manifest = built.folder / "build.json"
+    contents = json.loads(manifest.read_text(encoding="utf-8"))
+    contents["files"]["former.py"] = contents["files"]["../other.py"] = ""
+    manifest.write_text(json.dumps(contents), encoding="utf-8")
+    for file in (built.folder / "former.py", root / "other.py"):
+        file.write_text("", encoding="utf-8")
+    assert eomc.build(scene, root).fresh
+    names = {path.name for path in built.folder.iterdir() if not path.name.startswith("_simple")}
+    assert names - {"__pycache__"} == {
+        "CMakeLists.txt", "__init__.py", "_runtime", "build.json", "costs.txt", "fast", "main.c",
+        "selftest.c", "simple_pendulum.c", "simple_pendulum.h", "simple_pendulum.pc.in",
+    }  # fmt: skip
+    assert (root / "other.py").exists()

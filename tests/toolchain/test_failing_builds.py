@@ -107,8 +107,8 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
 ) -> None:  # fmt: skip
     """Header, C, Python's files and library, at whichever of them it fails."""
     folder, move, moved = root / "simple_pendulum", os.replace, list[str]()
-    (folder / "slices.py").write_text("of another version", encoding="utf-8")
-    (folder / "laws.py").unlink()  # which that had not yet
+    (folder / "_runtime" / "slices.py").write_text("of another version", encoding="utf-8")
+    (folder / "_runtime" / "laws.py").unlink()  # which that had not yet
     before, last = contents(folder), ""
 
     def failing(old: Path, new: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
     monkeypatch.setattr(os, "replace", failing)
     if not links:
         monkeypatch.setattr(os, "link", no_links)
-    for last in ("simple_pendulum.c", "slices.py", "__init__.py", "build.json"):
+    for last in ("simple_pendulum.c", "_runtime/slices.py", "__init__.py", "build.json"):
         with pytest.raises(eomc.EomcError if isinstance(fault, OSError) else KeyboardInterrupt):
             eomc.build(scene, root)
         assert contents(folder) == before and leftovers(root) == []

@@ -25,12 +25,16 @@ def scenes() -> dict[str, Path]:
 
 
 def runtime(batch: bool) -> dict[str, str]:
-    """The files of runtime/ that are copied next to a built module; batch: those for many at once.
+    """Return the text of each file of runtime/, by its path in the folder of a built module.
 
-    Their text by name.
+    The modules of batches are included only if `batch` is true.
     """
-    files = sorted((PACKAGE / "runtime").glob("[!_]*.py"))
-    return {f.name: f.read_text(encoding="utf-8") for f in files if batch or f.stem[:5] != "batch"}
+    files = sorted((PACKAGE / "runtime").glob("*.py"))
+    return {
+        f"_runtime/{f.name}": f.read_text(encoding="utf-8")
+        for f in files
+        if batch or not f.stem.startswith("batch")
+    }
 
 
 def parts() -> Iterator[tuple[str, Path]]:

@@ -1,1 +1,1 @@
-"""What is copied next to a built module, batch*.py for batches only. Imports NumPy, and no eomc."""
+"""What a compiled model needs at run time, copied into its folder; imports nothing of eomc."""

@@ -118,7 +118,7 @@ class Arguments:
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),
             "_dtype": dtype,
-            "__module__": __package__,  # where pickle finds the class
+            "__module__": str(__package__).rpartition(".")[0],  # where pickle finds the class
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple, NoReturn
 # whoever loaded it under that name.
 found_by: tuple[Callable[..., Any], tuple[str, ...]] | None = None
 
+# the built package, such as "cartpole"; "eomc" within the generator, which is no build
+_BUILT = str(__package__).rpartition(".")[0]
 MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all others are of data
 
 
@@ -44,7 +46,7 @@ def identity() -> tuple[Any, ...]:
 
     () within eomc itself, which is no build.
     """
-    package: Any = import_module(str(__package__))
+    package: Any = import_module(_BUILT)
     if (model := getattr(package, "_model", None)) is None:
         return ()
     return (
@@ -55,7 +57,7 @@ def identity() -> tuple[Any, ...]:
 
 def own_model() -> Any:
     """The model of this package."""
-    return import_module(str(__package__))._model
+    return import_module(_BUILT)._model
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
@@ -69,10 +71,12 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
 def made(path: str, arguments: tuple[Any, ...]) -> Any:
     """What lies at a path in this package, such as "status.MotionError", called."""
     first, *rest = path.split(".")
-    # a function of the package may have the name of a file, which begins without an underscore
-    inside = () if first.startswith("_") else (first,)
-    start: Any = import_module(".".join((str(__package__), *inside)))
-    return functools.reduce(getattr, rest if inside else (first, *rest), start)(*arguments)
+    if first.startswith("_"):  # an attribute of the built package, not a module of its runtime
+        start, names = import_module(_BUILT), [first, *rest]
+    else:
+        start, names = import_module(f"{__package__}.{first}"), rest
+    value: Any = functools.reduce(getattr, names, start)
+    return value(*arguments)
 
 
 def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
@@ -175,7 +179,7 @@ def named_outputs() -> str:
 
 def is_made_in_python() -> bool:
     """Whether this package is built from a System that `System.make` returned."""
-    package = import_module(str(__package__))
+    package = import_module(_BUILT)
     return bool(getattr(package, "_made_in_python", False))
 
 
@@ -231,7 +235,7 @@ def warn(words: str) -> None:
 
 def _of_eomc(package: str) -> bool:
     """Whether a module of the package is a built one's, or eomc's own."""
-    whole = sys.modules.get(package)
+    whole = sys.modules.get(package.removesuffix("._runtime"))
     return package.split(".")[0] == "eomc" or (
         type(whole).__name__ == Package.__name__ and "_model" in vars(whole)
     )

@@ -47,6 +47,6 @@ def eventful(model: Any, events: Any) -> Any:
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = require_eomc("pipeline", "events of a run are compiled").with_events
-        known[key] = build(model, events, Path(__file__).parent)._model
+        known[key] = build(model, events, Path(__file__).parents[1])._model
         vars(known[key])["_asked"] = model, events  # for files of its runs
     return known[key]

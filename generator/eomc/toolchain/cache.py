@@ -129,6 +129,15 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+def _python_files_of(folder: Path) -> set[Path]:
+    """Return the Python files of the build in `folder`; none if its manifest can't be read."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        names = [Path(file) for file in _manifest(folder)["files"]]
+        own = (Path(), Path("_runtime"))  # a manifest that was tampered with may name any path
+        return {folder / p for p in names if p.parent in own and p.suffix == ".py"}
+    return set()
+
+
 def _digest_of_files(files: dict[str, str]) -> str:
     """SHA-256 of a list of files and their digests: a list that lacks one is no build."""
     return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()
@@ -185,7 +194,8 @@ def _free(folder: Path) -> None:
     if folder.is_symlink() or folder.exists():
         if not folder.is_dir():
             raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
-        if (folder / "__init__.py").exists() and not (folder / "slices.py").exists():
+        ours = (folder / "_runtime").is_dir() or (folder / MANIFEST).exists()
+        if (folder / "__init__.py").exists() and not ours:
             raise EomcError(
                 f"{folder}: is a package that eomc did not build, and stays as it is: "
                 "rename the scene, or use --build DIR"
@@ -227,6 +237,7 @@ def _build(
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
     _keep(folder, scene_digest, new / ".kept")
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
+    stale += _python_files_of(folder) - {folder / file for file in kept}
     # the face last: until it is there, the old one is whole; the manifest after it
     _move(new, folder, [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST])
     for path in stale:
@@ -338,7 +349,7 @@ def load(built: Built, home: str = "") -> ModuleType:
         raise
     # another process can't import the alias; what is pickled here is found by its place there
     place = (built.name, home or str(folder), key)
-    sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
+    sys.modules[f"{alias}._runtime.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
 
 
@@ -366,7 +377,7 @@ def unpickled(
 
     name, folder, _ = place
     try:
-        package = importlib.import_module(f"{_build_of(place).__name__}.package")
+        package = importlib.import_module(f"{_build_of(place).__name__}._runtime.package")
         why = package.refusal(identity, path)
         if not why:
             return package.made(path, arguments)
