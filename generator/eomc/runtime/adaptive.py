@@ -53,13 +53,13 @@ class AdaptiveRun(AdaptiveTrajectory):
         ValueError outside of the run.
         """
         times = within(self, t)
-        asked, place = np.unique(times, return_inverse=True)
+        sorted_times, place = np.unique(times, return_inverse=True)
         q, qd = self._begin
-        rows = np.empty((2, len(asked), len(q)), self._model.dtype)
-        first = int(bool(len(asked)) and asked[0] <= self.t0)
+        rows = np.empty((2, len(sorted_times), len(q)), self._model.dtype)
+        first = int(bool(len(sorted_times)) and sorted_times[0] <= self.t0)
         rows[:, :first] = [[q], [qd]]
-        if len(asked) > first:
-            rows[:, first:] = self._rerun(asked[first:], self._t_end)._rows
+        if len(sorted_times) > first:
+            rows[:, first:] = self._rerun(sorted_times[first:], self._t_end)._rows
         both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
         return both[0], both[1]
 
@@ -102,19 +102,23 @@ class AdaptiveRun(AdaptiveTrajectory):
     def _crossings(
         self, name: str, value: float, rising: bool | None, period: float | None
     ) -> dict[str, Array]:
-        made: AdaptiveRun = with_jumps(self)
-        t, parts = made.t[:, None], np.arange(1, _EVEN) / _EVEN
+        steps: AdaptiveRun = with_jumps(self)
+        t, parts = steps.t[:, None], np.arange(1, _EVEN) / _EVEN
         between = (t[:-1] + np.diff(t, axis=0) * parts).astype(t.dtype)
-        apart = (t[:-1] < between) & (between < t[1:])
-        found = crossings(made._insert_rows(between[apart]).to_dict(), name, value, rising, period)
-        asked = found["t"] >= self.t[0]
-        times, by = found["t"][asked], 1e-6 * float(np.max(np.diff(made.t)))
-        turns = 0.0 if period is None else period * np.round((found[name][asked] - value) / period)
-        jumps = np.unique(made.t[1:][np.diff(made.t) == 0])
+        is_inside = (t[:-1] < between) & (between < t[1:])
+        columns = crossings(
+            steps._insert_rows(between[is_inside]).to_dict(), name, value, rising, period
+        )
+        in_run = columns["t"] >= self.t[0]
+        times, by = columns["t"][in_run], 1e-6 * float(np.max(np.diff(steps.t)))
+        turns = (
+            0.0 if period is None else period * np.round((columns[name][in_run] - value) / period)
+        )
+        jumps = np.unique(steps.t[1:][np.diff(steps.t) == 0])
         piece = np.searchsorted(jumps, times)  # a state at a jump is that before it
         ends = (
-            np.array([made.t[0], *np.nextafter(jumps, np.inf)])[piece],
-            np.array([*jumps, made.t[-1]])[piece],
+            np.array([steps.t[0], *np.nextafter(jumps, np.inf)])[piece],
+            np.array([*jumps, steps.t[-1]])[piece],
         )
         for _ in range(2):  # Newton's method
             places = times, np.clip(times - by, *ends), np.clip(times + by, *ends)
@@ -172,13 +176,13 @@ def simulate(
         rows = as_times(times, t0, model.dtype, duration)
         first, end = int(rows[0] == t0), float(rows[-1])
         check_time(model.dtype, t0, end - t0)
-    held = input_schedule(model, u, control_period, end - t0, params, duration)
-    asked = None if rows is None else rows[first:]
-    found = run(model, q, qd, t0, end, tol, asked, held, p, most, progress, stiff)
+    inputs = input_schedule(model, u, control_period, end - t0, params, duration)
+    later_times = None if rows is None else rows[first:]
+    trajectory = run(model, q, qd, t0, end, tol, later_times, inputs, p, most, progress, stiff)
     if first:
-        both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
-        return found._at(rows[: both.shape[1]], both)  # type: ignore[index]
-    return found
+        both = np.concatenate([np.array([[q], [qd]]), trajectory._rows], axis=1)
+        return trajectory._at(rows[: both.shape[1]], both)  # type: ignore[index]
+    return trajectory
 
 
 def simulate_short_run(
@@ -190,12 +194,12 @@ def simulate_short_run(
     Not for scenes with events or constraints.
     """
     (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
-    held, at_u = None, null
+    inputs, at_u = None, null
     if u is not None:
-        held = np.array([u], model.dtype) if type(u) is float else u
-        if (at_u := model._listed(held, (model.nu or None,))) is None:
+        inputs = np.array([u], model.dtype) if type(u) is float else u
+        if (at_u := model._listed(inputs, (model.nu or None,))) is None:
             return None
-        held = held.copy()
+        inputs = inputs.copy()
     if q0 is not None:
         from_q = model._checked_half(q0, "q0")[1]
     if qd0 is not None:
@@ -209,17 +213,17 @@ def simulate_short_run(
     work, whole = model._ffi.new("adaptive_work *"), np.empty(count * (1 + 2 * nq), model.dtype)
     to_t = address(real, whole)
     to_q = to_t + count
-    found = model._lib.adaptive_begin(
+    code = model._lib.adaptive_begin(
         from_q, from_qd, t0, end, tol, 0.0, at_u, count - 1, null, 0,
         to_t, to_q, to_q + nq * count, at_p, work,
     )  # fmt: skip
-    if found or work.t < end:
+    if code or work.t < end:
         model._room = 0
         return None
     steps, filled = work.steps, work.rows
     both = whole[count:].reshape(2, count, nq)[:, :filled]
     return AdaptiveRun(
-        model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, held, "gauss16",
+        model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, inputs, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
         _times=whole[:filled], _t_end=end,
     )  # fmt: skip
@@ -242,67 +246,67 @@ def run(
     acting = InputSchedule(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
     events = EventBuffer(model) if model.events else None
-    each = 2 if events else 1  # rows of a step, beside a jump
+    rows_per_step = 2 if events else 1  # rows of a step, beside a jump
     room = max(_ROOM, min(model._room, _AT_ONCE // nq))
-    rows = RowBuffer(model, times, 1 + each * room)
+    rows = RowBuffer(model, times, 1 + rows_per_step * room)
     call = model._lib.adaptive_begin
     place: tuple[Any, ...] = address(real, q), address(real, qd), t0
-    said, counters = "ok", StepCounters(model)
+    status, counters = "ok", StepCounters(model)
     try:
         while True:
-            begun = perf_counter()
-            most, *to = rows.c_arguments(room, each)
-            found = call(
+            call_start = perf_counter()
+            most, *to = rows.c_arguments(room, rows_per_step)
+            code = call(
                 *place, acting.stop, tol, h_most, acting.at, most, *to,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
             counters.add(work, bool(events))
             rows.filled += _take_rows(work, events)
-            said = STATUS[found]
-            ended, cut = found or (events and work.stopped), work.t < acting.stop
+            status = STATUS[code]
+            ended, cut = code or (events and work.stopped), work.t < acting.stop
             if ended or work.steps >= enough or not acting.on(work):
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
-            room = min(next_chunk(room, perf_counter() - begun), _MOST) if cut else room
+            room = min(next_chunk(room, perf_counter() - call_start), _MOST) if cut else room
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
-            if not (room := counters.limit_steps(room, each)):
-                said = FULL
+            if not (room := counters.limit_steps(room, rows_per_step)):
+                status = FULL
                 break
-            rows.reserve(room, each)
-        if progress is not None and said == "ok":
+            rows.reserve(room, rows_per_step)
+        if progress is not None and status == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
         rows.filled += _take_rows(work, events)
-        said = "interrupted"
+        status = "interrupted"
     stamps, both = rows.concatenate()
     steps = work.steps
-    odd = events or model.constraint_names or nq * steps > _AT_ONCE
-    model._room = 0 if odd else steps + _ROOM
+    is_unusual = events or model.constraint_names or nq * steps > _AT_ONCE
+    model._room = 0 if is_unusual else steps + _ROOM
     h = h_most if method else (work.t - t0) / steps if steps else t_end - t0
     called = model._called(method, steps, work.evaluations) if method else work.evaluations
-    made = (SteppedRun if method else AdaptiveRun)(
-        model, t0, both, h, steps, said, p, 1, acting.u, method or "gauss16",
+    trajectory = (SteppedRun if method else AdaptiveRun)(
+        model, t0, both, h, steps, status, p, 1, acting.u, method or "gauss16",
         called, tol=tol,
         rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _t_end=t_end,
     )  # fmt: skip
-    made._h_most, made._stiff, made._by = h_most, bool(stiff), method
+    trajectory._h_most, trajectory._stiff, trajectory._by = h_most, bool(stiff), method
     if times is not None:
-        made._begin = np.array([q, qd])
+        trajectory._begin = np.array([q, qd])
     if times is not None:
-        made._last = work.t, np.frombuffer(model._ffi.buffer(work.x), model.dtype).copy()
+        trajectory._last = work.t, np.frombuffer(model._ffi.buffer(work.x), model.dtype).copy()
     if acting.periods:
-        made._period, made._held = acting.periods.period, np.array(acting.values)
-        made._periods = acting.periods.count
-        made._told_inputs()
+        trajectory._period, trajectory._held = acting.periods.period, np.array(acting.values)
+        trajectory._periods = acting.periods.count
+        trajectory._told_inputs()
     if events:
-        made._happened = events.all()
-        made.stopped = model.events[work.stopped - 1] if work.stopped else ""
-        made.limit = work.limit if said == "accumulated" else made.limit
+        trajectory._happened = events.all()
+        trajectory.stopped = model.events[work.stopped - 1] if work.stopped else ""
+        trajectory.limit = work.limit if status == "accumulated" else trajectory.limit
     if model.constraint_names:
-        made.singular_steps = work.singular
-        made.first_singular = work.first if work.singular else made.first_singular
-    return made
+        trajectory.singular_steps = work.singular
+        trajectory.first_singular = work.first if work.singular else trajectory.first_singular
+    return trajectory
 
 
 def _take_rows(work: Any, events: EventBuffer | None) -> int:

@@ -42,15 +42,15 @@ def as_limits(
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=True):
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
-                asked = tol is not None or h_most is not None or stiff or "auto" in fixed
-                raise ValueError(f"{name}: {_why_not(model, name, bool(asked))}")
+                wants_adaptive = tol is not None or h_most is not None or stiff or "auto" in fixed
+                raise ValueError(f"{name}: {_why_not(model, name, bool(wants_adaptive))}")
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
 
 
-def _why_not(model: ModelInfo, name: str, asked: bool) -> str:
+def _why_not(model: ModelInfo, name: str, wants_adaptive: bool) -> str:
     """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
-    if asked:
+    if wants_adaptive:
         return (
             "belongs to fixed steps; tol, h_most and stiff to adaptive ones: give one or the other"
         )
@@ -90,10 +90,10 @@ def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
     """A C-contiguous array, of any shape, or a ValueError."""
     without_mask(value, name)
     try:
-        given = np.asarray(value)
-        if given.dtype.kind in "cUSmM":  # text that looks like a number is none
+        array = np.asarray(value)
+        if array.dtype.kind in "cUSmM":  # text that looks like a number is none
             raise TypeError
-        return np.asarray(given, dtype, order="C")
+        return np.asarray(array, dtype, order="C")
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
 
@@ -102,16 +102,16 @@ def as_times(
     times: ArrayLike, t0: float, dtype: np.dtype[Any], duration: float | None = None
 ) -> Array:
     """Times in ascending order from t0 on, within the duration if there is one, or a ValueError."""
-    found = np.atleast_1d(as_numbers(times, "times", dtype))
-    if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
+    array = np.atleast_1d(as_numbers(times, "times", dtype))
+    if array.ndim != 1 or not len(array) or not (isfinite(array[0]) and isfinite(array[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")
-    if found[0] < t0 or not (found[1:] > found[:-1]).all():
+    if array[0] < t0 or not (array[1:] > array[:-1]).all():
         raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
     if duration is not None:
         end = t0 + as_number(duration, "duration")
-        if found[-1] > end + 4 * np.finfo(dtype).eps * abs(end):  # sums of steps are rounded
+        if array[-1] > end + 4 * np.finfo(dtype).eps * abs(end):  # sums of steps are rounded
             raise ValueError(
-                f"times: {found[-1]:g} s is behind the end of the duration, {end:g} s: leave out "
+                f"times: {array[-1]:g} s is behind the end of the duration, {end:g} s: leave out "
                 "such times, or duration, as a run ends with the last of its times"
             )
-    return found
+    return array

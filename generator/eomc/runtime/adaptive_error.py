@@ -131,29 +131,29 @@ class _Rerun:
         if not len(self.kept):
             return out[self.beside], None
         to = float(own.t[-1]) if end is None else end
-        made = self._rerun(tol, start, h_most, steps, to, own.t[self.kept])
-        out[self.kept[: len(made)]] = made.x
-        self._end(out, made)
-        return out[self.beside], made
+        rerun = self._rerun(tol, start, h_most, steps, to, own.t[self.kept])
+        out[self.kept[: len(rerun)]] = rerun.x
+        self._end(out, rerun)
+        return out[self.beside], rerun
 
     def _rerun(
         self, tol: float, start: Array, h_most: float, steps: float, end: float, times: Array
     ) -> AdaptiveTrajectory:
         own, nq = self.own, self.own._model.nq
-        made = self.run(
+        rerun = self.run(
             own._model, start[:nq], start[nq:], own.t0, end, tol, times.astype(own._model.dtype),
             self.u, own._params, h_most, self.progress, own._stiff, steps, own._by,
         )  # fmt: skip
-        if made.status == "interrupted":
+        if rerun.status == "interrupted":
             raise KeyboardInterrupt
-        return made
+        return rerun
 
-    def _end(self, rows: Array, made: AdaptiveTrajectory) -> None:
+    def _end(self, rows: Array, rerun: AdaptiveTrajectory) -> None:
         """The last row where the same event ends both runs, the other a hair sooner or later."""
         own = self.own
-        if own.stopped and made.stopped == own.stopped and own.t[-1] == self.reached:
-            found = made.events[own.stopped]
-            rows[-1] = np.concatenate([found.q[-1], found.qd[-1]])
+        if own.stopped and rerun.stopped == own.stopped and own.t[-1] == self.reached:
+            event = rerun.events[own.stopped]
+            rows[-1] = np.concatenate([event.q[-1], event.qd[-1]])
 
     @property
     def times(self) -> Array:
@@ -175,9 +175,9 @@ class _Rerun:
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
         if len(times) > 1:
-            made = self._rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
-            out[1 : 1 + len(made)] = made.x
-            self._end(out, made)
+            rerun = self._rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
+            out[1 : 1 + len(rerun)] = rerun.x
+            self._end(out, rerun)
         return out
 
     def at_rows(self, states: Array) -> Array:
@@ -193,11 +193,11 @@ class _Rerun:
         if own.stopped:  # shorter steps may detect that event later, or not at all
             end = min(own._t_end, self.reached + max(self.reached - own.t0, _LATER * own.h))
         tol, shorter = _finer(own, least)
-        rows, made = self(tol, begin, shorter, end=end)
-        if own.status == "ok" and made is not None and made.status not in WHOLE:
+        rows, rerun = self(tol, begin, shorter, end=end)
+        if own.status == "ok" and rerun is not None and rerun.status not in WHOLE:
             # short ones near singular positions
-            rows, made = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
-        return rows, made
+            rows, rerun = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
+        return rows, rerun
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ class _Events:
             return cls({}, {}, {}, True, None)
         reached, came = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
                          for r in (own, other))  # fmt: skip
-        apart = np.where(np.isfinite(left), left, 0.0) / scale
+        relative_difference = np.where(np.isfinite(left), left, 0.0) / scale
         wrong = np.flatnonzero((left > _TENTH * scale).any(axis=1))
         alike = slice(0, wrong[0] if len(wrong) else len(left))
         speed = np.max(np.abs(own.qd.astype(float)), axis=0)
@@ -239,7 +239,9 @@ class _Events:
         shift = _SHIFT * float(np.max(late[np.isfinite(late)], initial=0.0))
         gap = max(own.h, min(shift, _TENTH * abs(reached - own.t0)))
         # an event so near the end of a run may be just behind that of the other
-        edge = abs(reached - own.t0) * max(float(np.max(apart[alike], initial=0.0)), _EDGE)
+        edge = abs(reached - own.t0) * max(
+            float(np.max(relative_difference[alike], initial=0.0)), _EDGE
+        )
         until = float(own.t[wrong[0]]) if len(wrong) else reached - edge
         whole = (r.limit - _ZENO * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit)
         until = min(until, *whole, np.inf)
@@ -261,13 +263,13 @@ class _Events:
         same = own.stopped == other.stopped and (
             not own.stopped or bool(np.isfinite(errors[own.stopped][-1]))
         )
-        found = other.events[other.stopped] if at_end else None
+        event = other.events[other.stopped] if at_end else None
         return cls(
             errors,
             {name: t for name, t in missed.items() if len(t)},
             {name: t for name, t in false.items() if len(t)},
             same or at_end or before_end or other.status not in WHOLE,
-            None if found is None else np.concatenate([found.q[-1], found.qd[-1]]).astype(float),
+            None if event is None else np.concatenate([event.q[-1], event.qd[-1]]).astype(float),
         )
 
     def words(self, own: AdaptiveTrajectory) -> list[str]:
@@ -275,14 +277,16 @@ class _Events:
         finer, remedy = "shorter steps", "a smaller h"
         if not own._by:
             finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"
-        found = []
+        messages = []
         if self.missed:
-            found.append(f"{_listed(self.missed)}, detected by {finer}, was missed: take {remedy}")
+            messages.append(
+                f"{_listed(self.missed)}, detected by {finer}, was missed: take {remedy}"
+            )
         if self.false:
-            found.append(f"{_listed(self.false)}, is not detected by {finer}: take {remedy}")
-        if not (self.stops or found):
-            found.append(f"{finer} end the run elsewhere: take {remedy}")
-        return found
+            messages.append(f"{_listed(self.false)}, is not detected by {finer}: take {remedy}")
+        if not (self.stops or messages):
+            messages.append(f"{finer} end the run elsewhere: take {remedy}")
+        return messages
 
 
 def _listed(events: dict[str, Array]) -> str:
@@ -327,12 +331,12 @@ def _finite(rows: Array) -> Array:
 
 def _filled(rows: Array) -> Array:
     """Differences at rows; behind those that a run came to the last of them."""
-    there = np.isfinite(rows).all(axis=1)
-    found: Array = np.nan_to_num(
-        rows[np.maximum.accumulate(np.where(there, np.arange(len(rows)), 0))]
+    is_finite = np.isfinite(rows).all(axis=1)
+    filled: Array = np.nan_to_num(
+        rows[np.maximum.accumulate(np.where(is_finite, np.arange(len(rows)), 0))]
     )
-    found[-1] = found[-1 - len(rows) // _TAIL :].max(axis=0)  # it may vanish for a moment
-    return found
+    filled[-1] = filled[-1 - len(rows) // _TAIL :].max(axis=0)  # it may vanish for a moment
+    return filled
 
 
 def _verdict(
@@ -342,11 +346,11 @@ def _verdict(
     words = []
     if own.status not in WHOLE:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
-    words += (told := events.words(own))
+    words += (event_messages := events.words(own))
     lost, wrong = (np.asarray((x > _TENTH).any(axis=1)) for x in (rounding, left))
     if lost[-1]:
         words.append(rounding_words(own._model, amplification, float(own.t[np.argmax(lost)])))
-    if wrong.any() and not (told and np.isinf(left[wrong]).all()):
+    if wrong.any() and not (event_messages and np.isinf(left[wrong]).all()):
         row = int(np.argmax(wrong))
         words.append(
             f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "

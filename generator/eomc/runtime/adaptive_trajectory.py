@@ -81,20 +81,20 @@ class AdaptiveTrajectory(Run):
     @property
     def message(self) -> str:
         """What happened, in a sentence."""
-        done = f"{self.steps} steps, {self.told}"
+        progress = f"{self.steps} steps, {self.told}"
         if self.status == "ok":
-            return done
+            return progress
         if self.status == "not finite" and self.stopped:
             return f"event '{self.stopped}' jumps to no finite state at t = {self.t[-1]:.9g} s"
         if self.status == "accumulated":
             return (
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
-                f"run ends, after {done}"
+                f"run ends, after {progress}"
             )
         why = infinite_at_start(self) or failure_message(self._model, self.status, self._by)
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
-        return f"stopped at t = {end:.9g} after {done}, {where}: {why}"
+        return f"stopped at t = {end:.9g} after {progress}, {where}: {why}"
 
     @cached_property
     def events(self) -> dict[str, EventLog]:
@@ -102,8 +102,8 @@ class AdaptiveTrajectory(Run):
         which, rows = self._happened
         nq, names = self._model.nq, self._model.events
         each = (rows[which == k] for k in range(len(names)))
-        found = (EventLog(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
-        return ByName("events", names, found)
+        logs = (EventLog(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
+        return ByName("events", names, logs)
 
     @property
     def told(self) -> str:
@@ -117,13 +117,13 @@ class AdaptiveTrajectory(Run):
 
     def _at(self, times: Array, rows: Array) -> Self:
         """Itself with other rows, (2, n, nq)."""
-        made = copy(self)
-        made._begin = self._begin
+        run = copy(self)
+        run._begin = self._begin
         for name in ("q", "qd", "outputs"):  # which are kept once they were made
-            made.__dict__.pop(name, None)
-        made._rows, made._times, made._energy = rows, times, None
-        made._told_inputs()
-        return made
+            run.__dict__.pop(name, None)
+        run._rows, run._times, run._energy = rows, times, None
+        run._told_inputs()
+        return run
 
     def _told_inputs(self) -> None:
         """Find which of the values that are held over periods acts at each row."""
@@ -164,9 +164,9 @@ class AdaptiveTrajectory(Run):
         return made
 
     def _state(self) -> dict[str, Any]:
-        found = super()._state() | {"_times": self._times}
-        found.pop("events", None)
-        return found
+        state = super()._state() | {"_times": self._times}
+        state.pop("events", None)
+        return state
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self.tol, self._times.tolist())

@@ -146,8 +146,8 @@ class Arguments:
 
     def _input_pointers(self, u: Any, params: Any) -> tuple[Any, Any]:
         """The addresses of inputs and parameters."""
-        held = self._c[2] if u is None else self._pointer(self._inputs(u))
-        return held, self._at[2] if params is None else self._pointer(self._parameters(params))
+        inputs = self._c[2] if u is None else self._pointer(self._inputs(u))
+        return inputs, self._at[2] if params is None else self._pointer(self._parameters(params))
 
     def _listed(self, x: Any, shape: tuple[int | None, ...] | None) -> Any:
         """Such numbers as a list, which C takes soonest; None for all that needs a closer look."""
@@ -197,10 +197,10 @@ class Arguments:
         if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
             return array  # of few numbers the sum is quickest; it may overflow all the same
         if array.shape[-1:] != (width,) or array.ndim > 1 + many:
-            found = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
+            description = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
             rates = array.shape == (2 * self.nq,) and name in ("q", "q0")
             raise ValueError(
-                f"{name}: {found}, expected ({width},){f' or (n, {width})' * many}: "
+                f"{name}: {description}, expected ({width},){f' or (n, {width})' * many}: "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
                 f"{'; velocities go to qd' + name[1:] if rates else ''}"
             )
@@ -244,12 +244,12 @@ class Arguments:
         if hasattr(params, "_names"):  # Params of another module
             raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
         if isinstance(params, Mapping):
-            given = self.Params()
+            complete = self.Params()
             for name, value in by_name(params).items():
                 if name in self.coordinates:
                     raise ValueError(f"params: {of_a_start(self, name)}")
-                given._set(name, value)
-            return np.asarray(given._array)
+                complete._set(name, value)
+            return np.asarray(complete._array)
         without_mask(params, "params")
         try:
             array = self._numbers(params, "params")
@@ -344,7 +344,7 @@ class Arguments:
 
     def _movable(self, x: Array, name: str) -> None:
         """A ValueError where C can't move these states in place."""
-        found = f"a {type(x).__name__}"
+        description = f"a {type(x).__name__}"
         if isinstance(without_mask(x, name), np.ndarray):
             right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
             if right and flags.carray:
@@ -352,10 +352,10 @@ class Arguments:
             order = "" if flags.c_contiguous else ", not C-contiguous"
             order += "" if flags.aligned else ", not aligned"
             order += "" if flags.writeable else ", read-only"
-            found = f"an array of {x.dtype}, shape {x.shape}{order}"
+            description = f"an array of {x.dtype}, shape {x.shape}{order}"
         raise ValueError(
-            f"{name}: {found}; moved in place, it has to be a writeable, C-contiguous array of "
-            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
+            f"{name}: {description}; moved in place, it has to be a writeable, C-contiguous array "
+            f"of {self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
             f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
         )
 
@@ -371,13 +371,13 @@ class Arguments:
 class StateArguments:
     """t, u and parameters of one state or many, as C takes them: one for all states or one each.
 
-    rows: () or (n,). given: what a function takes in the place of u, (width,) or (n, width).
+    rows: () or (n,). replacement: the argument in place of u, (width,) or (n, width).
     u_rows: the inputs, (nu,) or (n, nu), None for the signals. Raises ValueError.
     """
 
     def __init__(
         self, model: Arguments, rows: tuple[int, ...], t: Any, u: Any, params: Any,
-        given: Array | None = None,
+        replacement: Array | None = None,
     ) -> None:  # fmt: skip
         address, real, null = model._c
         self.t, self.own, self.u_rows = 0.0, null, None
@@ -388,9 +388,9 @@ class StateArguments:
             self.u_rows = model._inputs(u, many=bool(rows))
             if self.u_rows is not None and self.u_rows.ndim == 2:
                 _check_rows("u", self.u_rows.shape, (*rows, model.nu))
-        acting = self.u_rows if given is None else given
-        self.u = null if acting is None else address(real, acting)
-        u_stride = acting.shape[-1] if acting is not None and acting.ndim == 2 else 0
+        inputs = self.u_rows if replacement is None else replacement
+        self.u = null if inputs is None else address(real, inputs)
+        u_stride = inputs.shape[-1] if inputs is not None and inputs.ndim == 2 else 0
         p_stride = 0
         if rows and isinstance(params, Mapping):
             params = by_name(params)
@@ -403,7 +403,7 @@ class StateArguments:
             p_stride = len(model.parameters)
         table = model._parameter_rows(params) if p_stride else model._parameters(params)
         self.p = address(real, table)
-        self._arrays = acting, table  # C reads them
+        self._arrays = inputs, table  # C reads them
         if self.times is not None or u_stride or p_stride:
             self.own = model._ffi.new("row_strides *", {"u": u_stride, "p": p_stride})
             self._from_t = null if self.times is None else address(real, self.times)
@@ -449,9 +449,9 @@ def _finite(array: Array, words: str) -> Array:
     return array
 
 
-def by_name(given: Mapping[Any, Any]) -> dict[str, Any]:
+def by_name(values: Mapping[Any, Any]) -> dict[str, Any]:
     """By names: keys may be symbols of SymPy too, or its functions of time."""
-    return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in given.items()}
+    return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in values.items()}
 
 
 def without_mask(value: Any, name: str) -> Any:

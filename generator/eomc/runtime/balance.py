@@ -55,11 +55,11 @@ class Balance:
             (self.lost, "{} J were lost", "negative damping put in {} J"),
             (self.jumps, "jumps put in {} J", "jumps took {} J"),
         )
-        found = [(more if x > 0 else less).format(f"{abs(x):.3g}")
+        messages = [(more if x > 0 else less).format(f"{abs(x):.3g}")
                  for x, more, less in ways if abs(x) > self.unsure]  # fmt: skip
         error = f"{self.left:.2g}" if self.left > 3 * self.unsure else ""
         error = error or f"at most {self.left + self.unsure:.1g}"
-        return f"{', '.join(found) or 'nothing was put in or lost'}; numerical error {error} J"
+        return f"{', '.join(messages) or 'nothing was put in or lost'}; numerical error {error} J"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("balance.Balance", *self.__dict__.values())
@@ -76,10 +76,10 @@ class _Rows:
     qd: Array
     u: Array | None
 
-    def values(self, function: Callable[..., Any], **held: Any) -> Array:
+    def values(self, function: Callable[..., Any], **inputs: Any) -> Array:
         """What a function of the states gives, (n, ...)."""
-        found = function(self.q, self.qd, t=self.t, params=self.params, **held)
-        return np.asarray(found, float)
+        values = function(self.q, self.qd, t=self.t, params=self.params, **inputs)
+        return np.asarray(values, float)
 
 
 def balance(run: Trajectory) -> Balance | None:
@@ -95,30 +95,32 @@ def balance(run: Trajectory) -> Balance | None:
     model, energy = run._model, rows.values(run._model.jacobi)
     none = np.zeros(model.nu) if model.nu else None
     power, rest = (rows.values(model.power, u=u) for u in (rows.u, none))
-    back = _turned_back(model)
-    ahead, behind = (
-        rows.values(lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
-        for way in (lambda q, qd: (q, qd), back)
+    reverse = _velocity_reversal(model)
+    forward, backward = (
+        rows.values(
+            lambda q, qd, transform=transform, **how: model.tau(*transform(q, qd), **how), u=none
+        )
+        for transform in (lambda q, qd: (q, qd), reverse)
     )
-    if not all(np.isfinite(x).all() for x in (power, rest, ahead, behind)):
+    if not all(np.isfinite(x).all() for x in (power, rest, forward, backward)):
         return None
-    braking = np.sum((behind - ahead) / 2 * rows.qd, axis=1).astype(float)
+    braking = np.sum((backward - forward) / 2 * rows.qd, axis=1).astype(float)
     jumps = 1 + np.flatnonzero(np.diff(rows.t) == 0)  # the rows behind them
     (work, off), (other, _), (lost, blur) = (
         _in_pieces(rows.t, y, jumps) for y in (power, rest, braking)
     )
-    leaps = np.zeros(len(energy))
-    leaps[jumps] = energy[jumps] - energy[jumps - 1]
+    jump_energy = np.zeros(len(energy))
+    jump_energy[jumps] = energy[jumps] - energy[jumps - 1]
     inputs, forces = float(work[-1] - other[-1]), float(other[-1] + lost[-1])
-    parts, leapt = (inputs, forces, float(lost[-1])), np.cumsum(leaps)
+    parts, jump_work = (inputs, forces, float(lost[-1])), np.cumsum(jump_energy)
     off, rounding = max(off, blur), float(np.finfo(model.dtype).eps * np.max(np.abs(energy)))
-    left = float(np.max(np.abs(energy - energy[0] - work - leapt)))
-    jumped = float(leapt[-1])
-    told = off <= max(_TOLD * max(map(abs, (*parts, jumped))), 10 * rounding)
-    return Balance(*parts, left, off + rounding, told=told, jumps=jumped)
+    left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
+    jumped = float(jump_work[-1])
+    is_resolved = off <= max(_TOLD * max(map(abs, (*parts, jumped))), 10 * rounding)
+    return Balance(*parts, left, off + rounding, told=is_resolved, jumps=jumped)
 
 
-def _turned_back(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
+def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
     """What takes a state to the one that moves back along the same way.
 
     Friction that sticks has a mode beside each velocity, its sign.
@@ -132,19 +134,21 @@ def _rows(run: Trajectory) -> _Rows | None:
     """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
-        made = _in_steps(run) or _between_jumps(run)  # all its rows: few may look smooth and not be
-        return _Rows(model, run._params, *made, u)
+        states = _in_steps(run) or _between_jumps(
+            run
+        )  # all its rows: few may look smooth and not be
+        return _Rows(model, run._params, *states, u)
     run = with_jumps(run)
     ends, values = _held(run)
     if not len(values):
         return None
-    behind = 1 + np.flatnonzero(np.diff(run.t) == 0)  # a jump
-    begun, (ends, values) = ends, _cut(ends, values, run.t[behind])
-    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / (len(begun) - 1)) + 1
+    after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # a jump
+    periods, (ends, values) = ends, _cut(ends, values, run.t[after_jumps])
+    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / (len(periods) - 1)) + 1
     count = min(max(each, _FEWEST), max(_MOST // len(values), 2))
     t = np.concatenate([np.linspace(a, b, count) for a, b in pairwise(ends.tolist())])
     q, qd = run(t)
-    for row in behind.tolist():
+    for row in after_jumps.tolist():
         first = count * int(np.searchsorted(ends, run.t[row]))
         if first == len(t):  # it jumps at its end
             t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
@@ -175,8 +179,8 @@ def _held(run: Any) -> tuple[Array, Array]:
             return unknown
         first = np.arange(0, min(run.steps, len(values)), run._hold)
         starts, values = run.t0 + run.h * first, values[first]
-    begun = starts < last
-    return np.append(starts[begun], last), values[begun]
+    has_begun = starts < last
+    return np.append(starts[has_begun], last), values[has_begun]
 
 
 def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
@@ -191,11 +195,11 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows were asked for
         run = _after_steps(run)
     t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
-    apart = np.diff(t)
-    long = np.flatnonzero(apart > _FEWEST * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
+    intervals = np.diff(t)
+    long = np.flatnonzero(intervals > _FEWEST * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
     inner = np.arange(1, _FEWEST - 1) / (_FEWEST - 1)
-    at = (t[long, None] + apart[long, None] * inner).ravel()
-    between = 1 + np.flatnonzero(apart[:-1] * apart[1:])  # they end a step, and begin one
+    at = (t[long, None] + intervals[long, None] * inner).ravel()
+    between = 1 + np.flatnonzero(intervals[:-1] * intervals[1:])  # they end a step, and begin one
     rows = np.sort([*range(len(t)), *between])
     places = np.repeat(np.searchsorted(rows, long, side="right"), len(inner))
     q, qd = np.insert(both[:, rows], places, np.array(run(at)), axis=1)
@@ -219,14 +223,14 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
     bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    made: Trajectory = bare._insert_rows(np.concatenate(times)) if times else bare
-    return made.t, made.q, made.qd
+    dense: Trajectory = bare._insert_rows(np.concatenate(times)) if times else bare
+    return dense.t, dense.q, dense.qd
 
 
 def with_jumps(run: Any) -> Any:
     """The same run with both rows of each jump, also where others were asked for."""
-    happened = getattr(run, "_happened", ((),))[0]
-    if not len(happened) or (np.diff(run.t) == 0).any():
+    event_indices = getattr(run, "_happened", ((),))[0]
+    if not len(event_indices) or (np.diff(run.t) == 0).any():
         return run
     return _after_steps(run)
 
@@ -244,15 +248,15 @@ def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:
     if not len(jumps):
         sums, off = _work(t, power)
         return sums, float(off)
-    firsts, behind = np.array([0, *jumps]), np.array([*jumps, len(t)])
-    counts, sums, unsure = behind - firsts, np.zeros(len(t)), 0.0
+    firsts, ends = np.array([0, *jumps]), np.array([*jumps, len(t)])
+    counts, sums, unsure = ends - firsts, np.zeros(len(t)), 0.0
     for n in np.unique(counts).tolist():
         rows = firsts[counts == n][:, None] + np.arange(n)
-        apart = (t[rows[:, -1]] - t[rows[:, 0]]) / max(n - 1, 1)
+        spacing = (t[rows[:, -1]] - t[rows[:, 0]]) / max(n - 1, 1)
         work, off = _work(np.arange(n), power[rows])
-        sums[rows] = work * apart[:, None]
-        unsure += float(np.sum(off * apart))
-    before = np.concatenate([[0.0], np.cumsum(sums[behind - 1])])[:-1]
+        sums[rows] = work * spacing[:, None]
+        unsure += float(np.sum(off * spacing))
+    before = np.concatenate([[0.0], np.cumsum(sums[ends - 1])])[:-1]
     return sums + np.repeat(before, counts), unsure
 
 
@@ -269,16 +273,17 @@ def _work(t: Array, power: Array) -> tuple[Array, Array]:
 
     if n < _FEWEST:
         return sums(np.arange(n)), np.max(np.abs(power), axis=-1) * (t[-1] - t[0])
-    kept = [np.unique([*range(0, n, stride), n - 1]) for stride in (1, 2, 4)]
-    found = [sums(rows) for rows in kept]
+    strides = [np.unique([*range(0, n, stride), n - 1]) for stride in (1, 2, 4)]
+    integrals = [sums(rows) for rows in strides]
     whole, half, quarter = (
-        some[..., np.searchsorted(k, kept[-1])] for some, k in zip(found, kept, strict=True)
+        some[..., np.searchsorted(k, strides[-1])]
+        for some, k in zip(integrals, strides, strict=True)
     )
     near, far = (np.max(np.abs(x), axis=-1) for x in (whole - half, half - quarter))
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.log2(far / near)
     order = np.clip(np.where((near > 0) & (far > 0), order, _LEAST), _LEAST, _ROWS)
-    return found[0], 3 * near / (2.0**order - 1)
+    return integrals[0], 3 * near / (2.0**order - 1)
 
 
 def _intervals(t: Array, y: Array) -> Array:

@@ -94,17 +94,17 @@ class BatchModel(Instances):
         every = min(as_count(every, "every", 1), RARELY)
         u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at, 1)
         batch_adaptive.no_signals(self, u, control_period)
-        starts, table, held, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
-        if held is not None and hold > 1 and held.shape[1] > 1:
-            held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
+        starts, table, inputs, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
+        if inputs is not None and hold > 1 and inputs.shape[1] > 1:
+            inputs = np.ascontiguousarray(np.repeat(inputs, hold, axis=1)[:, :steps])
         method = self._method(method)
         if steps >= SOME and (method, h) not in self._warned:
-            first, u0 = (starts[0][0], starts[1][0]), None if held is None else held[0, 0]
+            first, u0 = (starts[0][0], starts[1][0]), None if inputs is None else inputs[0, 0]
             self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
-        asked = batch_fixed.FixedStepRequest(
+        request = batch_fixed.FixedStepRequest(
             step, h, t0, steps, every, at, method, threads, progress, codes
         )
-        run, whole = batch_fixed.simulate(self, starts, held, table, asked)
+        run, whole = batch_fixed.simulate(self, starts, inputs, table, request)
         return self._finish(run, whole)
 
     def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
@@ -168,17 +168,17 @@ class BatchModel(Instances):
         times = row_times(self, t, (count,))
         if times is None:
             t = as_number(t, "t")
-        held = None if u is None else self._input_rows(u, 1)
+        inputs = None if u is None else self._input_rows(u, 1)
         table = None if params is None else self._parameter_rows(params)
-        for name, given in (("params", table), ("u", held)):
-            if given is not None and len(given) not in (1, count):
-                raise ValueError(f"{name}: {len(given)} instances where q has {count}")
+        for name, rows in (("params", table), ("u", inputs)):
+            if rows is not None and len(rows) not in (1, count):
+                raise ValueError(f"{name}: {len(rows)} instances where q has {count}")
         if threads is not None:
             as_count(threads, "threads", 1)
         if count * steps >= WORTH or count * steps * self.nq > 8 * WORTH:
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
             begin = t if times is None else times
-            work = Work(self, step, q, qd, h, begin, steps, 0, held, table, None, None)
+            work = Work(self, step, q, qd, h, begin, steps, 0, inputs, table, None, None)
             if not work.run(threads, None):
                 raise KeyboardInterrupt
             return work.status
@@ -188,8 +188,8 @@ class BatchModel(Instances):
         self._batch_steps[method](
             count, address(real, q), address(real, qd),
             [t] if times is None else address(real, times), int(times is not None), h, steps,
-            null if held is None else address(real, held),
-            self.nu if held is not None and len(held) > 1 else 0,
+            null if inputs is None else address(real, inputs),
+            self.nu if inputs is not None and len(inputs) > 1 else 0,
             self._at[2] if table is None else address(real, table),
             1 if table is not None and len(table) > 1 else 0, address(self._whole[1], status),
         )  # fmt: skip

@@ -83,20 +83,20 @@ class AdaptiveBatchRun(BatchRun):
         if self._happened is None:
             return ByName("events", (), ())
         nq, (instances, which, rows) = self._model.nq, self._happened
-        found = []
+        logs = []
         for k in range(len(self._model.events)):
             own = which == k
             t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
-            found.append(BatchEventLog(t[:, 0], q, qd, instances[own], len(self)))
-        return ByName("events", self._model.events, found)
+            logs.append(BatchEventLog(t[:, 0], q, qd, instances[own], len(self)))
+        return ByName("events", self._model.events, logs)
 
     def _states(self, times: Array) -> Array:
         model: Any = self._model
         p, limits = self._params, (float(self._times[-1]), self.tol, self._h_most)
-        held = self._held if self._u is None else self._u
+        inputs = self._held if self._u is None else self._u
         work = _Work(
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
-            (held, self._period), p, self._stiff, self._by,
+            (inputs, self._period), p, self._stiff, self._by,
         )  # fmt: skip
         work.leave(initial_failures(self))
         if self._max_evaluations:  # what states between steps take is besides
@@ -127,13 +127,13 @@ class AdaptiveBatchRun(BatchRun):
     def message(self) -> str:
         """What happened, in a sentence."""
         names, counts = np.unique(self.status, return_counts=True)
-        found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
-        done = int(self.steps.sum())
+        statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        step_count = int(self.steps.sum())
         names, counts = np.unique(self.stopped, return_counts=True)
         ends = zip(counts, names, strict=True)
         stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
         how = f" of {self.h:g} s" if self._by else f", tolerance {self.tol:g}"
-        return f"{len(self)} instances, {done} steps{how}: {found}{stops}"
+        return f"{len(self)} instances, {step_count} steps{how}: {statuses}{stops}"
 
     def _end(self, k: int) -> float:
         return float(self.reached[k])
@@ -244,40 +244,40 @@ def _run(
     """
     no_signals(model, u, period or None)
     count = count_periods(span, period) if period else None
-    starts, table, held, codes = model._instances(q0, qd0, params, u, count, t0)
+    starts, table, inputs, codes = model._instances(q0, qd0, params, u, count, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
-    limits, over = (float(rows[-1]), tol, most), held is not None and held.shape[1] > 1
+    limits, over = (float(rows[-1]), tol, most), inputs is not None and inputs.shape[1] > 1
     if method and span >= SOME * most and (method, most) not in model._warned:
-        first = None if held is None else held[0, 0]
+        first = None if inputs is None else inputs[0, 0]
         model._look(q[0], qd[0], most, t0, first, table[0], method, "the first instance: ")
-    work = _Work(model, begin.copy(), t0, rows, limits, (held, period), table, stiff, method)
+    work = _Work(model, begin.copy(), t0, rows, limits, (inputs, period), table, stiff, method)
     work.limit(limit)
     work.leave(codes)
     whole = work.run(threads, progress)
     counts = work.counts
     cut = len(STATUS) if work.full else STATUS.index("interrupted")
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
-    given = None if held is None else held.copy()
-    if held is not None and over:
-        given = sample_zero_order_hold(rows, t0, period, held)
-    h, called = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
+    row_inputs = None if inputs is None else inputs.copy()
+    if inputs is not None and over:
+        row_inputs = sample_zero_order_hold(rows, t0, period, inputs)
+    h, evaluations = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
     if method:
-        h, called = most, model._called(method, counts["steps"], called)
-    made = AdaptiveBatchRun(
-        model, t0, work.rows[0], work.rows[1], h, counts["steps"], codes, 1, 0, table.copy(), given,
-        method or "gauss16", held.copy() if held is not None and over else None, tol=tol,
-        evaluations=called, rejected=counts["rejected"],
+        h, evaluations = most, model._called(method, counts["steps"], evaluations)
+    batch = AdaptiveBatchRun(
+        model, t0, work.rows[0], work.rows[1], h, counts["steps"], codes, 1, 0, table.copy(),
+        row_inputs, method or "gauss16", inputs.copy() if inputs is not None and over else None,
+        tol=tol, evaluations=evaluations, rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
         _period=period, _by=method, _max_evaluations=limit,
     )  # fmt: skip
     if work.events:
-        made._happened = work.events.all()
-        made._stopped = work.counts["stopped"]
+        batch._happened = work.events.all()
+        batch._stopped = work.counts["stopped"]
         at_limit = codes == STATUS.index("accumulated")
-        made._limit = np.where(at_limit, work.counts["limit"], np.nan)
-    return made, whole
+        batch._limit = np.where(at_limit, work.counts["limit"], np.nan)
+    return batch, whole
 
 
 def no_signals(model: Instances, u: Any, control_period: Any) -> None:
@@ -336,8 +336,8 @@ class _Work:
             "names": list(kinds), "formats": list(kinds.values()), "itemsize": ffi.sizeof(memory),
             "offsets": [ffi.offsetof(memory, name) for name in kinds],
         }  # fmt: skip
-        found: Any = np.frombuffer(ffi.buffer(self.memory), np.dtype(layout))
-        return {name: found[name].copy() for name in kinds}
+        counters: Any = np.frombuffer(ffi.buffer(self.memory), np.dtype(layout))
+        return {name: counters[name].copy() for name in kinds}
 
     @property
     def full(self) -> bool:
@@ -357,11 +357,11 @@ class _Work:
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
         """Instances at, ..., at + count - 1 to the end, one control period after the other."""
-        model, held = self.model, self.held
+        model, inputs = self.model, self.held
         u, periods, each = model._c[2], 1, 0
-        if held is not None:
-            many, periods, _ = held.shape
-            u, each = model._pointer(held), periods * model.nu if many > 1 else 0
+        if inputs is not None:
+            many, periods, _ = inputs.shape
+            u, each = model._pointer(inputs), periods * model.nu if many > 1 else 0
             u += at * each
         for k in range(periods):
             end = self.limits[0]
@@ -386,7 +386,7 @@ class _Work:
         events = self.events.room(count) if self.events else None
         more = True
         while more and not self.stop and not self.full:
-            begun = perf_counter()
+            call_start = perf_counter()
             more = model._lib.adaptive_batch(
                 count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
                 t_end, *self.limits[1:], u, u_instance, many, pointer(self.times), n,
@@ -398,6 +398,6 @@ class _Work:
             )  # fmt: skip
             if self.events and events:
                 self.events.keep(events, at)
-            many = min(next_chunk(many, perf_counter() - begun), 2**40)
+            many = min(next_chunk(many, perf_counter() - call_start), 2**40)
             look()
         return bool(more)

@@ -40,10 +40,10 @@ class TimedBatchRun(BatchRun):
         return self._times
 
     def _states(self, times: Array) -> Array:
-        found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
+        rows = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         stepper = stepper_for(self, self._begin.copy(), self._u)
-        stepper.rows(parts(times, self.t0, self.h), found)
-        return found
+        stepper.rows(parts(times, self.t0, self.h), rows)
+        return rows
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
@@ -82,27 +82,27 @@ class FixedStepRequest(NamedTuple):
 def simulate(
     model: Instances,
     starts: tuple[Array, Array],
-    held: Array | None,
+    inputs: Array | None,
     table: Array,
-    asked: FixedStepRequest,
+    request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """From checked arguments, and whether it is whole, not cut off by Ctrl-C."""
-    made = _by_steps if asked.times is None else _at_times
-    return made(model, starts, held, table, asked)
+    run = _by_steps if request.times is None else _at_times
+    return run(model, starts, inputs, table, request)
 
 
 def _by_steps(
     model: Instances,
     starts: tuple[Array, Array],
-    held: Array | None,
+    inputs: Array | None,
     table: Array,
-    asked: FixedStepRequest,
+    request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """Rows after every so many steps, and the last."""
-    step, h, t0, steps, every, _, method, threads, progress, codes = asked
+    step, h, t0, steps, every, _, method, threads, progress, codes = request
     rows = 1 + steps // every + (steps % every > 0)
     (q, qd), (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), rows)
-    work = Work(model, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
+    work = Work(model, step, q, qd, h, t0, steps, every, inputs, table, q_rows, qd_rows, starts)
     work.leave(codes)
     whole = work.run(threads, progress)
     if steps % every:
@@ -114,11 +114,11 @@ def _by_steps(
             q_rows[k, completed:] = qd_rows[k, completed:] = np.nan
         if not whole:
             work.status[(work.status == 0) & short] = _CUT
-    given = None if held is None else _at_rows(held, np.arange(rows) * every, steps)
-    kept = held if held is not None and held.shape[1] > 1 and every > 1 else None
+    row_inputs = None if inputs is None else _at_rows(inputs, np.arange(rows) * every, steps)
+    step_inputs = inputs if inputs is not None and inputs.shape[1] > 1 and every > 1 else None
     run = BatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
-        given, method, None if kept is None else kept.copy(),
+        row_inputs, method, None if step_inputs is None else step_inputs.copy(),
     )  # fmt: skip
     return run, whole
 
@@ -126,35 +126,35 @@ def _by_steps(
 def _at_times(
     model: Instances,
     starts: tuple[Array, Array],
-    held: Array | None,
+    inputs: Array | None,
     table: Array,
-    asked: FixedStepRequest,
+    request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
     """Rows at the times that were asked for."""
-    h, t0, method, times = asked.h, asked.t0, asked.method, asked.times
+    h, t0, method, times = request.h, request.t0, request.method, request.times
     assert times is not None
-    places = parts(times, t0, h, asked.steps)
+    places = parts(times, t0, h, request.steps)
     both, (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), len(times))
-    stepper = BatchStepper(model, method, both, t0, h, held, table, starts)
-    stepper.work.leave(asked.codes)
-    whole = stepper.rows(places, (q_rows, qd_rows), asked.threads, asked.progress)
+    stepper = BatchStepper(model, method, both, t0, h, inputs, table, starts)
+    stepper.work.leave(request.codes)
+    whole = stepper.rows(places, (q_rows, qd_rows), request.threads, request.progress)
     work, last = stepper.work, int(places[0][-1])
     if not whole:
         work.status[(work.status == 0) & (work.done < last)] = _CUT
-    given = None if held is None else _at_rows(held, places[0], asked.steps)
+    row_inputs = None if inputs is None else _at_rows(inputs, places[0], request.steps)
     run = TimedBatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
-        given, method, None if held is None else held.copy(), _times=times,
+        row_inputs, method, None if inputs is None else inputs.copy(), _times=times,
         _begin=np.array(starts, model.dtype),
     )  # fmt: skip
     return run, whole
 
 
-def _at_rows(held: Array, begun: Array, steps: int) -> Array:
+def _at_rows(inputs: Array, step_indices: Array, steps: int) -> Array:
     """What is held from so many steps on; a copy, as the caller's table may change."""
-    if held.shape[1] == 1:
-        return held.copy()
-    return np.ascontiguousarray(held[:, np.minimum(begun, steps - 1)])
+    if inputs.shape[1] == 1:
+        return inputs.copy()
+    return np.ascontiguousarray(inputs[:, np.minimum(step_indices, steps - 1)])
 
 
 def _ends_and_rows(

@@ -44,12 +44,12 @@ class Instances(Model):
             q0, qd0 = initial_state_for_parameters(self, q0, qd0, table, many_values=True)
         q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
         qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
-        held = self._input_rows(u, steps)
+        inputs = self._input_rows(u, steps)
         sizes = {
             "q0": 1 if q.ndim == 1 else len(q),
             "qd0": 1 if qd.ndim == 1 else len(qd),
             "params": len(table),
-            "u": 1 if held is None else len(held),
+            "u": 1 if inputs is None else len(inputs),
         }
         if empty := [name for name, size in sizes.items() if not size]:
             raise ValueError(f"{empty[0]}: no instances")
@@ -59,7 +59,7 @@ class Instances(Model):
                 hint = ": a table over time for all is (1, steps, nu)" if name == "u" else ""
                 raise ValueError(f"{name}: {size} instances where {whose} has {count}{hint}")
 
-        if whose == "u" and held is not None and np.ndim(u) == 2 and len(held) == steps:
+        if whose == "u" and inputs is not None and np.ndim(u) == 2 and len(inputs) == steps:
             one, each = f"(1, {steps}, {self.nu})", f"({steps}, 1, {self.nu})"
             raise ValueError(
                 f"u: shape {np.shape(u)} may be a table over time or one row an instance: give "
@@ -71,15 +71,15 @@ class Instances(Model):
         codes = None
         if t0 is not None:
             q, qd, codes = self._assembled_rows(q, qd, table, t0)
-        return (q, qd), table, held, codes
+        return (q, qd), table, inputs, codes
 
-    def _rows_of(self, given: ArrayLike, name: str) -> Array:
+    def _rows_of(self, values: ArrayLike, name: str) -> Array:
         """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
-        if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == self.nq:
-            without_mask(given, name)
-            if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
-                return given
-        return self._array(given, name, self.nq)
+        if isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == self.nq:
+            without_mask(values, name)
+            if values.dtype in (self.dtype, np.float64) and values.flags.aligned:
+                return values
+        return self._array(values, name, self.nq)
 
     def _input_rows(self, u: Any, steps: int | None) -> Array | None:
         """(batch or 1, steps or 1, nu); steps None: inputs are held over the run."""

@@ -64,10 +64,10 @@ def fan(
     source = Source(run, wrap)
     curves = [source.curve(name) for name in ([*names] or source.coordinates)]
     if ax is None and axes is None:
-        made = new_axes(len(curves))
+        panels = new_axes(len(curves))
     else:
-        made = given_axes(ax, axes, len(curves))
-    for place, curve in zip(made, curves, strict=True):
+        panels = given_axes(ax, axes, len(curves))
+    for place, curve in zip(panels, curves, strict=True):
         if over is not None:
             _ends(place, curve, *_over(run, over), style)
         elif lines is not None:
@@ -79,25 +79,25 @@ def fan(
         if over is None:
             place.set_ylabel(with_unit(curve.text, curve.unit))
     if over is None:
-        made[-1].set_xlabel(with_unit(mathtext("t"), "s"))
-    return finished(made, file)
+        panels[-1].set_xlabel(with_unit(mathtext("t"), "s"))
+    return finished(panels, file)
 
 
 def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:
     """Between quantiles that lie as far from the middle, and the median."""
-    alive = ~np.isnan(curve.values).all(axis=0)  # rows that some instance has
-    t, values = t[alive], curve.values[:, alive]
-    found = np.nanquantile(values, quantiles, axis=0)
+    has_values = ~np.isnan(curve.values).all(axis=0)  # rows that some instance has
+    t, values = t[has_values], curve.values[:, has_values]
+    bands = np.nanquantile(values, quantiles, axis=0)
     colour = style.get("color", "C0")
     pairs = len(quantiles) // 2
     for k in range(pairs):
         low, high = quantiles[k], quantiles[-1 - k]
         axes.fill_between(
-            t, found[k], found[-1 - k], color=colour, alpha=0.15 + 0.35 * (k + 1) / (pairs + 1),
+            t, bands[k], bands[-1 - k], color=colour, alpha=0.15 + 0.35 * (k + 1) / (pairs + 1),
             linewidth=0, label=f"{100 * low:g} to {100 * high:g} %",
         )  # fmt: skip
     if len(quantiles) % 2:
-        axes.plot(t, found[pairs], **{"color": colour, "label": "median", **style})
+        axes.plot(t, bands[pairs], **{"color": colour, "label": "median", **style})
     axes.legend()
 
 

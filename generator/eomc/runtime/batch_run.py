@@ -79,8 +79,8 @@ class BatchRun(Values, Fans, Columns):
     @property
     def saturated(self) -> Array:
         """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
-        given = self._given
-        return np.asarray(np.abs(given - self._within(given)) > 0)
+        inputs = self._given
+        return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
 
     def _within(self, u: Array) -> Array:
         """Inputs (batch, n, nu) within the limits of their instances."""
@@ -91,9 +91,9 @@ class BatchRun(Values, Fans, Columns):
         """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
             return self._values(self._model.signal, (self._model.nu,))
-        found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
-        found[np.isnan(self.q[..., 0])] = np.nan
-        return found
+        inputs = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
+        inputs[np.isnan(self.q[..., 0])] = np.nan
+        return inputs
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
         """(q, qd) of all at any time within the run, t (...,): each (batch, ..., nq).
@@ -109,18 +109,18 @@ class BatchRun(Values, Fans, Columns):
 
     def _states(self, times: Array) -> Array:
         """(2, batch, n, nq) at ascending times within the run, from the last row before each."""
-        held, every = self._held if self._u is None else self._u, self.every
+        inputs, every = self._held if self._u is None else self._u, self.every
         whole, rest = parts(times, self.t0, self.h, self._wanted)
-        found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
+        rows = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         for row in np.unique(whole // every):
             own, first = (whole // every == row).nonzero()[0], int(row) * every
-            stepper = stepper_for(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
+            stepper = stepper_for(self, np.array([self.q[:, row], self.qd[:, row]]), inputs, first)
             stepper.work.status[self.steps < first] = STATUS.index(
                 "not finite"
             )  # who never came so far
             here = slice(own[0], own[-1] + 1)
-            stepper.rows((whole[own], rest[own]), found[:, :, here])
-        return found
+            stepper.rows((whole[own], rest[own]), rows[:, :, here])
+        return rows
 
     def __getattr__(self, name: str) -> Any:
         """A column that the scene names; of what one run alone has, where to find it."""
@@ -150,10 +150,11 @@ class BatchRun(Values, Fans, Columns):
     def message(self) -> str:
         """What happened, in a sentence."""
         names, counts = np.unique(self.status, return_counts=True)
-        found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
-        done = int(self.steps.sum())
-        wanted = len(self) * self._wanted
-        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
+        statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        step_count = int(self.steps.sum())
+        total_steps = len(self) * self._wanted
+        steps = f"{step_count} of {total_steps} steps of {self.h:g} s"
+        return f"{len(self)} instances, {steps}: {statuses}"
 
     @property
     def _no_convergence_message(self) -> str:
@@ -194,8 +195,8 @@ class BatchRun(Values, Fans, Columns):
         return (model.name, model.digest, self.t0, self.h, self.every, self._wanted, self.method)
 
     def _arrays(self) -> tuple[Array, ...]:
-        held = np.empty(0) if self._held is None else self._held
-        return self.q, self.qd, self.steps, self._codes, self._params, held
+        inputs = np.empty(0) if self._held is None else self._held
+        return self.q, self.qd, self.steps, self._codes, self._params, inputs
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -209,9 +210,9 @@ def initial_failures(run: BatchRun) -> Array:
     return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
-def stepper_for(run: BatchRun, both: Array, held: Array | None, first: int = 0) -> BatchStepper:
+def stepper_for(run: BatchRun, both: Array, inputs: Array | None, first: int = 0) -> BatchStepper:
     """A run's stepper again, from its states behind so many steps."""
     model: Any = run._model
-    stepper = BatchStepper(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+    stepper = BatchStepper(model, run.method, both, run.t0, run.h, inputs, run._params, None, first)
     stepper.work.leave(initial_failures(run))
     return stepper

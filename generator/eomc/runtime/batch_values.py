@@ -45,8 +45,8 @@ class Values:
         names = self._model.outputs
         if not names:
             return {}
-        found = self._driven(self._model.output, (len(names),))
-        return dict(zip(names, np.ascontiguousarray(np.moveaxis(found, 2, 0)), strict=True))
+        values = self._driven(self._model.output, (len(names),))
+        return dict(zip(names, np.ascontiguousarray(np.moveaxis(values, 2, 0)), strict=True))
 
     @property
     def constraints(self) -> Mapping[str, Array]:
@@ -83,28 +83,28 @@ class Values:
 
     def _values(
         self, function: Callable[..., Any], shape: tuple[int, ...],
-        held: Mapping[str, Array] | None = None,
+        inputs: Mapping[str, Array] | None = None,
     ) -> Array:  # fmt: skip
         """A function at all rows, (batch, n, ...), nan where these are; held: inputs, (..., nu)."""
         count, n = self.q.shape[:2]
-        found = np.full((count, n, *shape), np.nan, self._model.dtype)
+        results = np.full((count, n, *shape), np.nan, self._model.dtype)
         t, each = np.broadcast_to(self.t, (count, n)), {"params": self._params[:, None]}
-        each |= held or {}
+        each |= inputs or {}
         alike = {name: x.size == x.shape[-1] for name, x in each.items()}
         for first in range(0, count, many := max(1, _ROWS // max(n, 1))):
             at = slice(first, first + many)
             q, qd = self.q[at], self.qd[at]
             finite = np.isfinite(q).all(axis=-1) & np.isfinite(qd).all(axis=-1)
             here: Any = ... if finite.all() else finite
-            given = {
+            arguments = {
                 name: x[0, 0]
                 if alike[name]
                 else _rows(np.broadcast_to(x, (count, n, x.shape[-1]))[at][here])
                 for name, x in each.items()
             }
-            values = function(_rows(q[here]), _rows(qd[here]), t=t[at][here].ravel(), **given)
-            found[at][here] = values.reshape(found[at][here].shape)
-        return found
+            values = function(_rows(q[here]), _rows(qd[here]), t=t[at][here].ravel(), **arguments)
+            results[at][here] = values.reshape(results[at][here].shape)
+        return results
 
 
 def _rows(x: Array) -> Array:

@@ -28,14 +28,14 @@ class Work:
 
     def __init__(
         self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: Any,
-        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
+        steps: int, every: int, inputs: Array | None, table: Array, q_rows: Array | None,
         qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
         self.model, self.step, self.count = model, step, len(q)
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # the time of all, or of each
         self.first = 0  # the step that `run` begins with
-        self.held, self.table = held, table
+        self.held, self.table = inputs, table
         self.starts = starts
         self.rows = 0 if q_rows is None else q_rows.shape[1]
         self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
@@ -119,18 +119,18 @@ class Work:
         many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
         while first < self.steps and not self.stop:
             many = min(many, self.steps - first)
-            begun = perf_counter()
+            call_start = perf_counter()
             failed = self.step(
                 count, q, qd, begin, int(times), self.h, first, many,
                 u + first * u_step if u_step else u, u_instance, u_step, self.every,
                 q_rows, qd_rows, self.rows, table, 1 if each else 0, done, status,
             )  # fmt: skip
-            spent = perf_counter() - begun
+            duration = perf_counter() - call_start
             self.failed |= failed
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
-            model._paces[kind] = max(1e-10, spent / (many * count))
-            many = next_chunk(many, spent, _SECONDS)
+            model._paces[kind] = max(1e-10, duration / (many * count))
+            many = next_chunk(many, duration, _SECONDS)
             look()
 
 
@@ -139,12 +139,13 @@ class BatchStepper:
 
     def __init__(
         self, model: Instances, method: str | None, both: Any, t0: float, h: float,
-        held: Array | None, table: Array, starts: tuple[Array, Array] | None = None, first: int = 0,
+        inputs: Array | None, table: Array, starts: tuple[Array, Array] | None = None,
+        first: int = 0,
     ) -> None:  # fmt: skip
         self.model, self.method, self.state = model, method, both
         step = model._stepper(method, "batch")
         q, qd = both
-        self.work = Work(model, step, q, qd, h, t0, first, 0, held, table, None, None, starts)
+        self.work = Work(model, step, q, qd, h, t0, first, 0, inputs, table, None, None, starts)
 
     def rows(
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
@@ -166,12 +167,12 @@ class BatchStepper:
     def _between(self, rest: float) -> tuple[Array, Array]:
         """The states so many seconds behind the last step, nan of who can't go on."""
         work, (q, qd) = self.work, np.array(self.state)
-        good, held = work.status == 0, work.held
+        good, inputs = work.status == 0, work.held
         if not rest and not work.steps:
             return q, qd  # as they were given, also where they can't be assembled
         if rest:
             n = work.steps
-            u = None if held is None else held[:, min(n, held.shape[1] - 1)]
+            u = None if inputs is None else inputs[:, min(n, inputs.shape[1] - 1)]
             t, p, method = work.t0 + n * work.h, work.table, self.method
             good &= self.model.step_batch(q, qd, rest, t, u, p, method=method) == 0
         q[~good] = qd[~good] = np.nan
@@ -201,8 +202,8 @@ def run_groups(
     waiting: set[Future[None]] = {pool.submit(work._group, *group) for group in groups}
     try:
         while waiting:
-            ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
-            for future in ended:
+            finished, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
+            for future in finished:
                 future.result()
             look()
     except BaseException as fault:

@@ -32,23 +32,26 @@ class Columns:
 
     def _columns(self) -> dict[str, Callable[[], Array]]:
         """What makes each column, by name, in the order of `to_dict`."""
-        found: dict[str, Callable[[], Array]] = {"t": partial(getattr, self, "t"), **self._named()}
+        columns: dict[str, Callable[[], Array]] = {
+            "t": partial(getattr, self, "t"),
+            **self._named(),
+        }
         names = ("energy", "jacobi") if self._model.has_jacobi else ("energy",)
         for name in names:
-            found.setdefault(name, partial(getattr, self, name))  # a coordinate may be called so
-        return found
+            columns.setdefault(name, partial(getattr, self, name))  # a coordinate may be called so
+        return columns
 
     def _named(self) -> dict[str, Callable[[], Array]]:
         """Those that the scene names: coordinates, rates, inputs, outputs."""
         model = self._model
         rates = [f"{name}_dot" for name in model.coordinates]
         halves = (("q", model.coordinates), ("qd", rates), ("u", model.inputs))
-        found: dict[str, Callable[[], Array]] = {
+        columns: dict[str, Callable[[], Array]] = {
             name: partial(self._column, half, k)
             for half, names in halves
             for k, name in enumerate(names)
         }
-        return found | {name: partial(self._output, name) for name in model.outputs}
+        return columns | {name: partial(self._output, name) for name in model.outputs}
 
     def _output(self, name: str) -> Array:
         values: Array = self.outputs[name]

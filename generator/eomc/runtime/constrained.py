@@ -67,13 +67,13 @@ class Constrained(Frames):
         return self._of_rows("constraint_rates", q, qd, t, params)
 
     def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
-        found: Array = self._evaluate(name, q, qd, t, None, params)
-        return found
+        values: Array = self._evaluate(name, q, qd, t, None, params)
+        return values
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
         """A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
-        found: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
-        return found
+        jacobian: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
+        return jacobian
 
     def tangent(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
@@ -119,21 +119,21 @@ class Constrained(Frames):
 
         A constraint that says what others say has 0. Raises MotionError as `acceleration` does.
         """
-        found = self._multipliers(q, qd, t, u, params)
-        if not np.isfinite(found).all():
+        values = self._multipliers(q, qd, t, u, params)
+        if not np.isfinite(values).all():
             self.acceleration(q, qd, t, u, params)  # which says where, and why
-            at, k = np.argwhere(~np.isfinite(np.atleast_2d(found)))[0]
+            at, k = np.argwhere(~np.isfinite(np.atleast_2d(values)))[0]
             where = state_text(*(np.atleast_2d(x)[at] for x in (q, qd)))
             words = f"the multiplier of {self._rows.names[k]} is not finite there"
             raise MotionError(f"at {where}: {words}", "not finite")
-        return found
+        return values
 
     def _multipliers(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """The same, nan where there are none: of rows of runs."""
-        found: Array = self._evaluate("multipliers", q, qd, t, u, params)
-        return found
+        values: Array = self._evaluate("multipliers", q, qd, t, u, params)
+        return values
 
     def reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -146,8 +146,8 @@ class Constrained(Frames):
         """
         if not self._rows.loops:
             raise ValueError(f"reactions: {self.name} has no [[loop]]")
-        found = self._reactions_by(self.multipliers(q, qd, t, u, params), q, qd, t, params)
-        return ByName("reactions", self._rows.loops, np.moveaxis(found, -2, 0))
+        values = self._reactions_by(self.multipliers(q, qd, t, u, params), q, qd, t, params)
+        return ByName("reactions", self._rows.loops, np.moveaxis(values, -2, 0))
 
     def _reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -159,8 +159,8 @@ class Constrained(Frames):
         self, multipliers: Array, q: ArrayLike, qd: ArrayLike, t: float, params: Any
     ) -> Array:
         each = np.ascontiguousarray(multipliers)
-        found: Array = self._evaluate("reactions", q, qd, t, None, params, None, each)
-        return found
+        values: Array = self._evaluate("reactions", q, qd, t, None, params, None, each)
+        return values
 
     def project(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -183,40 +183,43 @@ class Constrained(Frames):
         return self._projected(q, qd, t, params, flags)
 
     def _projected(
-        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, held: Sequence[bool]
+        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array]:
         """The same; held: whether each of q and qd is, or empty."""
-        at, moving, codes = self._projected_rows(q, qd, t, params, held)
+        at, moving, codes = self._projected_rows(q, qd, t, params, fixed)
         if codes.any():
             k = int(codes.nonzero()[0][0])
-            said = STATUS[codes[k]]
+            status = STATUS[codes[k]]
             where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
-            kept = [n for n, h in zip(self._states, held, strict=False) if h]
-            kept = [n for n in kept if n.removesuffix("_dot") not in self.discrete_coordinates]
-            what = SAID[said] if said != "locked" else (
+            fixed_names = [n for n, h in zip(self._states, fixed, strict=False) if h]
+            fixed_names = [
+                n for n in fixed_names if n.removesuffix("_dot") not in self.discrete_coordinates
+            ]
+            what = SAID[status] if status != "locked" else (
                 "no state near that obeys the constraints"
-                + (f" with {', '.join(kept)} as given: leave one free" if kept else "")
+                + (f" with {', '.join(fixed_names)} as given: leave one free" if fixed_names
+                   else "")
             )  # fmt: skip
-            raise MotionError(f"from {where}: {what}", said)
+            raise MotionError(f"from {where}: {what}", status)
         return at, moving
 
     def _projected_rows(
-        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, held: Sequence[bool]
+        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array, Array]:
         """(q, qd, status): the same, with the status of each state; one that fails stays."""
         at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
-        flags = self._ffi.new("int[]", [int(x) for x in held]) if held else self._c[2]
+        flags = self._ffi.new("int[]", [int(x) for x in fixed]) if fixed else self._c[2]
         acts, n = StateArguments(self, at.shape[:-1], t, None, params), self.nq
         codes, first = np.zeros(at.size // n, "i"), 0
         from_q, from_qd = self._pointer(at), self._pointer(moving)
         while first < len(codes):
             now, _, p, own = acts.pointers(first)
-            found = self._lib.project(
+            result = self._lib.project(
                 len(codes) - first, from_q + n * first, from_qd + n * first, now, flags, p, own
             )
-            first += found >> 3
-            if found & 7:
-                codes[first] = found & 7
+            first += result >> 3
+            if result & 7:
+                codes[first] = result & 7
                 first += 1
         return at, moving, codes
 
@@ -260,24 +263,24 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
     ) -> tuple[Array, Array]:
         """A start on the rows, and its modes as the velocities say that these leave."""
-        held = self._rows.held
+        fixed = self._rows.held
         if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
-            return self._projected(q, qd, t0, params, held)
+            return self._projected(q, qd, t0, params, fixed)
         q = self._sliding(q)
         return self._projected(
-            *self._in_modes(*self._projected(q, qd, t0, params, held)), t0, params, held
+            *self._in_modes(*self._projected(q, qd, t0, params, fixed)), t0, params, fixed
         )
 
     def _project_starts(
         self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
         """The same of many states, with the status of each; one that fails stays as given."""
-        held = self._rows.held
+        fixed = self._rows.held
         if not self._rows.modes:
-            return self._projected_rows(q, qd, t0, params, held)
-        found_q, found_qd, first = self._projected_rows(self._sliding(q), qd, t0, params, held)
+            return self._projected_rows(q, qd, t0, params, fixed)
+        found_q, found_qd, first = self._projected_rows(self._sliding(q), qd, t0, params, fixed)
         found_q, found_qd = self._in_modes(found_q, found_qd)
-        found_q, found_qd, codes = self._projected_rows(found_q, found_qd, t0, params, held)
+        found_q, found_qd, codes = self._projected_rows(found_q, found_qd, t0, params, fixed)
         codes = np.where(first, first, codes)
         failed = (codes != 0)[:, None]
         return np.where(failed, q, found_q), np.where(failed, qd, found_qd), codes

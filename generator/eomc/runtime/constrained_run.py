@@ -45,8 +45,8 @@ class ConstrainedRun:
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint along the run, (n,), by name."""
         names = self._model.constraint_names
-        found = self._driven(self._model._multipliers).T if names else ()
-        return ByName("multipliers", names, np.ascontiguousarray(found))
+        values = self._driven(self._model._multipliers).T if names else ()
+        return ByName("multipliers", names, np.ascontiguousarray(values))
 
     @property
     def reactions(self) -> Mapping[str, Array]:
@@ -57,8 +57,8 @@ class ConstrainedRun:
         loops = self._model.loops
         if not loops:
             return ByName("reactions", (), ())
-        found = self._driven(self._model._reactions)
-        return ByName("reactions", loops, np.moveaxis(found, -2, 0))
+        values = self._driven(self._model._reactions)
+        return ByName("reactions", loops, np.moveaxis(values, -2, 0))
 
     @property
     def _broken(self) -> str:

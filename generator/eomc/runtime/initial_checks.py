@@ -17,10 +17,10 @@ def infinite_at_start(run: Trajectory) -> str:
     """
     if run.status != "not finite" or run.steps or not len(run):
         return ""
-    model, q, qd, held = run._model, run.q[0], run.qd[0], run._u
+    model, q, qd, inputs = run._model, run.q[0], run.qd[0], run._u
     at: dict[str, Any] = {"t": run.t0, "params": run._params}
     try:
-        model.acceleration(q, qd, u=None if held is None or not model.nu else run.u[0], **at)
+        model.acceleration(q, qd, u=None if inputs is None or not model.nu else run.u[0], **at)
         return ""
     except MotionError as lacking:
         if lacking.status != "not finite":
