@@ -75,8 +75,8 @@ def system(name: str, start: str = "assembled", redundant: bool = True) -> Syste
     coordinates = tuple(
         replace(
             c,
-            held=not from_guess or c.name in case["held"],
-            held_rate=not from_guess or c.name in case["held_rates"],
+            start_fixed=not from_guess or c.name in case["held"],
+            rate_fixed=not from_guess or c.name in case["held_rates"],
         )
         for c in made.coordinates
     )

@@ -57,7 +57,9 @@ def test_holonomic_rows_stand_first_in_their_order():
 
 
 def test_what_is_given_is_held_and_guesses_are_not():
-    held = {c.name: (c.held, c.held_rate) for c in from_scene(parse(SCENE + ROWS)).coordinates}
+    held = {
+        c.name: (c.start_fixed, c.rate_fixed) for c in from_scene(parse(SCENE + ROWS)).coordinates
+    }
     assert held == {
         "a": (True, True), "b": (False, False), "c": (False, False), "d": (True, False),
         "e1": (False, False), "e2": (False, False),
@@ -65,7 +67,7 @@ def test_what_is_given_is_held_and_guesses_are_not():
 
 
 def test_without_constraints_everything_is_held():
-    assert all(c.held and c.held_rate for c in from_scene(parse(SCENE)).coordinates)
+    assert all(c.start_fixed and c.rate_fixed for c in from_scene(parse(SCENE)).coordinates)
 
 
 def test_dependence_follows_definitions():
@@ -107,17 +109,20 @@ def test_constraints_in_python():
     (rod,) = system.constraints
     assert rod.formula == symbol("r") - symbol("l") ** 2
     assert (rod.name, rod.unit, rod.holonomic) == ("rod", "m^2", True)
-    assert [(c.held, c.held_rate) for c in system.coordinates] == [(True, False), (True, True)]
+    assert [(c.start_fixed, c.rate_fixed) for c in system.coordinates] == [
+        (True, False),
+        (True, True),
+    ]
 
 
 def test_guesses_in_python():
     x, y = sympy.symbols("x y")
     system = make(coordinates={x: None, y: -0.8}, guess=[y])
-    assert [(c.start, c.held) for c in system.coordinates] == [(0.0, False), (-0.8, False)]
+    assert [(c.start, c.start_fixed) for c in system.coordinates] == [(0.0, False), (-0.8, False)]
     system = make(coordinates={x: (None, 2.0), y: -0.8}, guess=["x"])
-    assert [(c.rate, c.held_rate) for c in system.coordinates] == [(2.0, False), (0.0, False)]
+    assert [(c.rate, c.rate_fixed) for c in system.coordinates] == [(2.0, False), (0.0, False)]
     free = make(coordinates=[x, y], constraints=None)
-    assert all(c.held and c.held_rate for c in free.coordinates)
+    assert all(c.start_fixed and c.rate_fixed for c in free.coordinates)
     assert not free.constraints
 
 

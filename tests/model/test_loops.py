@@ -243,7 +243,7 @@ offset = "c"
     (row,) = system.constraints
     assert str(row.formula) == "-c - n*phi + psi"
     assert (row.name, row.loop, row.holonomic) == ("mesh", "mesh", True)
-    assert [c.held for c in system.coordinates] == [True, False]
+    assert [c.start_fixed for c in system.coordinates] == [True, False]
     assert not system.reactions
 
 

@@ -20,7 +20,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
-from eomc.program.manifold import Manifold, Place
+from eomc.program.manifold import Configuration, Manifold
 from eomc.program.manifold_sampling import random_walk
 from eomc.scene.read import parse
 
@@ -66,8 +66,8 @@ def test_trusted_starts_are_found_from_their_guesses(name: str) -> None:
     np.testing.assert_allclose(q, q0, rtol=0, atol=2.3e-16 * max(1, np.max(np.abs(q0))))
     np.testing.assert_allclose(qd, qd0, rtol=0, atol=4.5e-16 * max(1, np.max(np.abs(qd0))))
     for before, after in zip(given.coordinates, made.coordinates, strict=True):
-        assert not before.held or before.start == after.start
-        assert not before.held_rate or before.rate == after.rate
+        assert not before.start_fixed or before.start == after.start
+        assert not before.rate_fixed or before.rate == after.rate
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, *SMALL))
@@ -406,7 +406,7 @@ def test_a_coordinate_without_inertia_is_assembled() -> None:
     made = replace(
         made,
         constraints=(Constraint("drive", s - x - sympy.cos(t)),),
-        coordinates=(made.coordinates[0], replace(made.coordinates[1], held=False)),
+        coordinates=(made.coordinates[0], replace(made.coordinates[1], start_fixed=False)),
     )
     assert start_of(assembled(made))[0][1] == 1.3
 
@@ -415,7 +415,7 @@ def test_a_coordinate_without_inertia_is_assembled() -> None:
 def test_a_walk_stays_on_the_rows(name: str) -> None:
     made = assembled_case(name)
     manifold = Manifold(made)
-    place = manifold.place(start_of(made)[0])
+    place = manifold.configuration(start_of(made)[0])
     assert place is not None
     found = list(random_walk(manifold, place, ranks.SAMPLE_COUNT))
     assert len(found) == (ranks.SAMPLE_COUNT if made.closure and made.closure.freedoms else 0)
@@ -433,7 +433,7 @@ def test_a_singular_mass_matrix_is_known_where_its_pivots_hide_it(seed: int) -> 
     across = np.eye(6) - np.outer(still, still) / (still @ still)
     B = random.normal(size=(6, 6))
     D = across @ (B @ B.T + np.eye(6)) @ across
-    place = Place(np.zeros(6), 0.0, np.zeros(1), np.ones((1, 6)), D)
+    place = Configuration(np.zeros(6), 0.0, np.zeros(1), np.ones((1, 6)), D)
     assert place.singular and np.all(np.linalg.eigvalsh(place.metric) > 0)
 
 

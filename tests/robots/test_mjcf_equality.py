@@ -136,7 +136,7 @@ def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
     hard = [e for e in hard if 'polycoef="0.2"' not in e and "0.01" not in e]
     system = scene_of(model(tmp_path, INSIDE, after=equality(*hard)))
     assert np.abs(rows(system)([c.start for c in system.coordinates])).max() < 1e-14
-    assert not any(c.held for c in system.coordinates)
+    assert not any(c.start_fixed for c in system.coordinates)
 
 
 @pytest.mark.parametrize(

@@ -281,7 +281,7 @@ def face(target: Target, extension: str) -> Face:
         tolerance=s.run.tolerance,
         events=tuple(e.name for e in s.events),
         constraints=tuple(c.name for c in s.constraints),
-        held=(*(c.held for c in s.coordinates), *(c.held_rate for c in s.coordinates)),
+        held=(*(c.start_fixed for c in s.coordinates), *(c.rate_fixed for c in s.coordinates)),
         holonomic=sum(c.holonomic for c in s.constraints),
         redundant=tuple(k for k, c in enumerate(s.constraints) if c.redundant),
         modes=tuple((m.at, m.of) for m in s.modes),

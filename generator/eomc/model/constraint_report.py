@@ -1,4 +1,4 @@
-"""What constraints leave: rank, freedoms, rows that others say, and how a start was assembled."""
+"""Summary of the constraints: rank, degrees of freedom, redundancy, assembled initial values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eomc.base.texts import listed, plural
 
 @dataclass(frozen=True)
 class Move:
-    """A coordinate, or a rate, that was assembled at another value than its guess."""
+    """A coordinate or velocity whose assembled initial value differs from its guess."""
 
     name: str
     guess: float
@@ -24,19 +24,18 @@ class Move:
 
 @dataclass(frozen=True)
 class ConstraintSummary:
-    """The constraints of a system, as found around its assembled start.
+    """Properties of the constraints of a system, computed near its assembled configuration.
 
-    rows: names of all. rank: of their Jacobian, almost everywhere on the positions they leave, so
-    that `freedoms` rates are left. redundant: rows left out, which the others imply. shared: rows
-    whose multipliers are not unique, since others could bear them. start_sigma, least_sigma: the
-    smallest singular value that counts over the largest one, at the start and at the worst of
-    `positions` positions; rows in units of their own inverse inertia, coordinates in the metric of
-    D: 0 at a singular position. weights: where D alone is singular, of each row r what makes
-    D + sum of weights[r] A_r^T A_r regular; else none. slopes: of each row the largest
-    A D^-1 A^T of these positions. sums: where rows depend on one another and no set of them does
-    everywhere, what is solved for in place of `shared`: the weights of all rows in each. moves,
-    rate_moves: what assembling changed. remarks: in words. made_for: what of the system all that
-    depends on.
+    rows: names of the constraint equations. rank: of their Jacobian, almost everywhere on the
+    constraint manifold. redundant: equations that the others imply, which are not solved for.
+    shared: equations whose multipliers are not unique. start_sigma, least_sigma: ratio of the
+    smallest nonzero singular value of the scaled Jacobian to the largest, at the start and at the
+    worst of `positions` sampled configurations; 0 at a singular configuration. weights: if D is
+    singular, weights with which D + sum_r weights[r] A_r^T A_r is regular; else empty. slopes:
+    largest A D^-1 A^T of each equation among these configurations. sums: weights of the linear
+    combinations of equations that are solved for in place of `shared`, where no subset of the
+    equations is independent everywhere. moves, rate_moves: changes of initial values by assembly.
+    remarks: messages. computed_from: the data of the system that all this depends on.
     """
 
     rows: tuple[str, ...]
@@ -53,16 +52,16 @@ class ConstraintSummary:
     moves: tuple[Move, ...] = ()
     rate_moves: tuple[Move, ...] = ()
     remarks: tuple[str, ...] = ()
-    made_for: tuple[Any, ...] = field(default=(), repr=False, compare=False)
+    computed_from: tuple[Any, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def freedoms(self) -> int:
-        """Rates that the rows leave."""
+        """Degrees of freedom: number of coordinates minus rank."""
         return self.coordinates - self.rank
 
     @property
     def ranks(self) -> str:
-        """The rank in words, and which forces are not unique."""
+        """The rank as text, with redundant equations and multipliers that are not unique."""
         text = f"rank {self.rank} of {len(self.rows)}"
         if self.redundant:
             text += (
@@ -70,8 +69,8 @@ class ConstraintSummary:
                 f"{'is' if len(self.redundant) == 1 else 'are'} redundant"
             )
         if self.sums:
-            of = "; {} of others" if self.redundant else ": {} of them"
-            text += of.format(f"{len(self.sums)} {plural('sum', len(self.sums))}")
+            template = "; {} of others" if self.redundant else ": {} of them"
+            text += template.format(f"{len(self.sums)} {plural('sum', len(self.sums))}")
             text += " stand for these"
         if self.shared:
             start = "; the" if self.redundant or self.sums else ": the"
@@ -79,7 +78,7 @@ class ConstraintSummary:
         return text
 
     def table(self) -> str:
-        """For people."""
+        """Return the summary as text."""
         n = len(self.rows)
         lines = [
             f"{n} {plural('row', n)} of constraints on {self.coordinates} "
@@ -94,7 +93,7 @@ class ConstraintSummary:
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the summary as a dict that can be written as JSON."""
         return {
             "rows": list(self.rows), "rank": self.rank, "freedoms": self.freedoms,
             "redundant": list(self.redundant), "not_unique": list(self.shared),

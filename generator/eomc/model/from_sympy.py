@@ -264,8 +264,8 @@ class Maker:
                 ends.append((None if x is None else api_arguments.number(x, role), follows))
             (start, follows), (rate, rate_follows) = ends
             yield replace(
-                c, start=start or 0.0, rate=rate or 0.0, held=start is not None,
-                held_rate=rate is not None, follows=follows, rate_follows=rate_follows,
+                c, start=start or 0.0, rate=rate or 0.0, start_fixed=start is not None,
+                rate_fixed=rate is not None, follows=follows, rate_follows=rate_follows,
             )  # fmt: skip
 
     def _held(
@@ -287,8 +287,8 @@ class Maker:
         return [
             replace(
                 c,
-                held=not rows or (c.held and not moves),
-                held_rate=not rows or (c.held_rate and not moves),
+                start_fixed=not rows or (c.start_fixed and not moves),
+                rate_fixed=not rows or (c.rate_fixed and not moves),
             )
             for c, moves in zip(made, free, strict=True)
         ]

@@ -62,7 +62,7 @@ def symbol(name: str) -> Symbol:
 class Coordinate:
     """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s.
 
-    held, held_rate: whether constraints leave them as they are when a start is assembled.
+    start_fixed, rate_fixed: whether the assembly of consistent initial values keeps them as given.
     follows, rate_follows: the formulas of start and rate where these are of parameters, else "".
     """
 
@@ -71,8 +71,8 @@ class Coordinate:
     start: float = 0.0
     rate: float = 0.0
     note: str = ""
-    held: bool = True
-    held_rate: bool = True
+    start_fixed: bool = True
+    rate_fixed: bool = True
     follows: str = ""
     rate_follows: str = ""
 

@@ -1,8 +1,9 @@
-"""The assembled start of a system with constraints, and the rows that are solved for.
+"""Consistent initial values of a system with constraints, and its independent constraints.
 
-What a scene gives is held; the rest moves least from its guess, in the metric of D, until the rows
-are zero. Newton's method goes there by small ways, so that a guess is closed on its own branch
-where it has one, and ends in forty digits.
+Initial values that a scene gives are fixed. The others change as little as possible from their
+guesses, in the metric of D, until the constraints are satisfied. Newton's method takes small steps,
+so that a loop closes on the branch of its guess where there is one. The result is refined to forty
+digits.
 """
 
 from __future__ import annotations
@@ -19,83 +20,98 @@ from eomc.model import coulomb_friction, discrete, loops
 from eomc.model.constraint_report import ConstraintSummary, Move
 from eomc.model.system import System
 from eomc.program import contradictions
-from eomc.program.manifold import AWAY, ROUNDED, Flags, Manifold, Place, Vector
+from eomc.program.manifold import (
+    HALF_TURN_RESIDUAL,
+    ROUNDING_FACTOR,
+    Configuration,
+    Flags,
+    Manifold,
+    Vector,
+)
 from eomc.program.ranks import Ranks, ranks
 
-NOTHING = 1e-25  # of all values together, as lengths: what forty digits leave of a zero
-BEGUN = 1e-3  # of a run: rows that hold no longer do not hold
-SHOWN = 1e-9  # of a value: a coordinate has moved
-ROUNDING = 1e-13  # of all values together: what a coordinate that is 0 may move by
-STARTS = 16  # random starts that are tried where the search from the guess ends nowhere
-NEAREST, FARTHEST = 0.1, 3.0  # how far they lie from the guess, in coordinates' own units or rad
-ROTATED = 0.5  # rad: rows of axes that hold all the same hold after some other rotation
+ZERO_TOLERANCE = 1e-25  # relative to the norm of all values: below it, only rounding
+MIN_SOLVABLE_TIME = 1e-3  # of a run: constraints must be solvable at least so long
+REPORTED_CHANGE = 1e-9  # relative to a value: larger changes are reported
+ROUNDING = 1e-13  # relative to the norm of all values: smaller changes are rounding
+RANDOM_STARTS = 16  # tried where the iteration from the guess does not converge
+MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # of random starts, in the units of the coordinates
+MAX_ROTATION_ERROR = 0.5  # rad: axis equations satisfied at more have a wrong rotation
 
 
 @dataclass(frozen=True)
 class Start:
-    """An assembled start: where it is, in doubles and forty digits, and its rates."""
+    """Consistent initial values: configuration in doubles, q in forty digits, velocities."""
 
-    place: Place
+    configuration: Configuration
     q: Sequence[Any]
     qd: Vector
-    strayed: bool  # small ways led to no position, and longer ones were taken
+    may_have_changed_branch: bool  # small steps did not converge, longer ones did
 
 
 def assembled(system: System) -> System:
-    """The system with its start assembled, rows that others imply marked, and its `closure`.
+    """Return the system with consistent initial values, redundant constraints marked and `closure`.
 
-    A system without constraints, or that has been assembled, is returned as it is. Raises
-    SceneError where held values contradict rows, or rows each other.
+    A system without constraints, or one that is assembled already, is returned unchanged. Raises
+    SceneError where fixed values violate constraints, or constraints contradict one another.
     """
     if not system.constraints:
         return system
-    if system.closure is not None and system.closure.made_for == _made_for(system):
+    if system.closure is not None and system.closure.computed_from == _dependencies(system):
         return system
     if system.modes or system.discrete:
         if system.modes:
-            made = coulomb_friction.with_modes(
+            combined = coulomb_friction.with_modes(
                 system, assembled(coulomb_friction.without_modes(system))
             )
         else:
-            made = discrete.with_parameters_as_states(
+            combined = discrete.with_parameters_as_states(
                 system, assembled(discrete.with_constant_parameters(system))
             )
-        assert made.closure is not None
-        return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
+        assert combined.closure is not None
+        closure = replace(combined.closure, computed_from=_dependencies(combined))
+        return replace(combined, closure=closure)
     manifold = Manifold(system)
     _refuse_idle(manifold)
     if flat := contradictions.powers(system):
         raise SceneError(list(contradictions.of_slopes(system, flat)))
     start = _start(manifold)
-    found = ranks(manifold, start.place)
-    if found.rank == 0:
-        raise SceneError(list(contradictions.of_slopes(system, found.flat)))
-    if found.loose:
-        raise SceneError([contradictions.of_inertia(manifold, found.loose, start.place)])
+    constraint_ranks = ranks(manifold, start.configuration)
+    if constraint_ranks.rank == 0:
+        raise SceneError(list(contradictions.of_slopes(system, constraint_ranks.flat)))
+    if constraint_ranks.massless_coordinates:
+        raise SceneError(
+            [
+                contradictions.of_inertia(
+                    manifold, constraint_ranks.massless_coordinates, start.configuration
+                )
+            ]
+        )
     constraints = tuple(
-        replace(c, redundant=k in found.left_out) for k, c in enumerate(system.constraints)
+        replace(c, redundant=k in constraint_ranks.left_out)
+        for k, c in enumerate(system.constraints)
     )
     coordinates = tuple(
         replace(c, start=q, rate=qd)
         for c, q, qd in zip(
-            system.coordinates, start.place.q.tolist(), start.qd.tolist(), strict=True
+            system.coordinates, start.configuration.q.tolist(), start.qd.tolist(), strict=True
         )
     )
-    closure = _closure(manifold, start, found)
-    made = replace(system, coordinates=coordinates, constraints=constraints)
-    _refuse_wrong_rotations(made)
+    closure = _closure(manifold, start, constraint_ranks)
+    changed = replace(system, coordinates=coordinates, constraints=constraints)
+    _refuse_wrong_rotations(changed)
     return replace(
-        made,
-        closure=replace(closure, made_for=_made_for(made)),
+        changed,
+        closure=replace(closure, computed_from=_dependencies(changed)),
         warnings=(
             *system.warnings,
-            *_warnings(manifold, found, closure),
+            *_warnings(manifold, constraint_ranks, closure),
         ),
     )
 
 
-def _made_for(system: System) -> tuple[Any, ...]:
-    """What the assembled start and the ranks depend on."""
+def _dependencies(system: System) -> tuple[Any, ...]:
+    """Return the data on which the assembled start and the ranks depend."""
     return (
         system.coordinates,
         system.constraints,
@@ -108,7 +124,7 @@ def _made_for(system: System) -> tuple[Any, ...]:
 
 
 def _refuse_idle(manifold: Manifold) -> None:
-    """Raise SceneError for rows that no coordinate moves."""
+    """Raise SceneError for constraints that depend on no coordinate."""
     system = manifold.system
     idle = [
         system.problem(contradictions.key(c), "depends on no coordinate: it can hold nothing")
@@ -120,113 +136,122 @@ def _refuse_idle(manifold: Manifold) -> None:
 
 
 def _start(manifold: Manifold) -> Start:
-    """The assembled start. Raises SceneError where there is none."""
+    """Compute consistent initial values. Raises SceneError where there are none."""
     system = manifold.system
-    free = np.array([not c.held for c in system.coordinates])
+    free = np.array([not c.start_fixed for c in system.coordinates])
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
     if not manifold.has_values(guess):
         raise SceneError(list(contradictions.of_values(manifold, guess)))
-    place, strayed = manifold.place(guess), False
+    configuration, strayed = manifold.configuration(guess), False
     q: Sequence[Any] = guess.tolist()
-    if place is None or _off(manifold, place, free):
-        found, held, strayed = _search(manifold, guess, free)
-        if found is None:
+    if configuration is None or _violates_constraints(manifold, configuration, free):
+        closest, converged, strayed = _search(manifold, guess, free)
+        if closest is None:
             raise SceneError(list(contradictions.of_values(manifold, guess)))
-        if not held:
-            if _half_turned(manifold, found):
+        if not converged:
+            if _half_turned(manifold, closest):
                 _refuse_wrong_rotations(system)
-            raise SceneError(list(contradictions.of_positions(manifold, free, found)))
-        found = manifold.nearest(found, guess, free)
-        q, _ = manifold.polished(found, free)
-        rounded = np.where(free, _rounded(found, q), guess)
-        place = manifold.place(rounded) or found
-    return Start(place, q, _rates(manifold, place, q, rates), strayed)
+            raise SceneError(list(contradictions.of_positions(manifold, free, closest)))
+        closest = manifold.closest_configuration(closest, guess, free)
+        q, _ = manifold.refine(closest, free)
+        rounded = np.where(free, _rounded(closest, q), guess)
+        configuration = manifold.configuration(rounded) or closest
+    return Start(configuration, q, _rates(manifold, configuration, q, rates), strayed)
 
 
-def _search(manifold: Manifold, guess: Vector, free: Flags) -> tuple[Place | None, bool, bool]:
-    """A place near a guess, whether the rows hold there, and whether it may be on another branch.
+def _search(
+    manifold: Manifold, guess: Vector, free: Flags
+) -> tuple[Configuration | None, bool, bool]:
+    """Return a configuration near a guess, whether it satisfies the constraints, and whether it may
+    be on another branch.
 
-    By small ways from the guess, by longer ones, and then from random starts around it, ever
-    further away: at the guess itself rows may have no slope, or rotations be half a turn off.
+    Tries small steps from the guess, then longer ones, then random starts at increasing distance:
+    at the guess itself gradients may vanish, or a rotation error be half a turn.
     """
-    first: Place | None = None
+    first: Configuration | None = None
     for strict in (True, False):
-        found, held = manifold.descend(guess, free, strict=strict)
-        if held:
-            return found, True, not strict
-        first = found or first
+        closest, converged = manifold.gauss_newton(guess, free, strict=strict)
+        if converged:
+            return closest, True, not strict
+        first = closest or first
     random = np.random.default_rng(41)
-    for reach in np.geomspace(NEAREST, FARTHEST, STARTS):
+    for reach in np.geomspace(MIN_DISTANCE, MAX_DISTANCE, RANDOM_STARTS):
         start = guess + np.where(free, reach * random.uniform(-1, 1, len(guess)), 0.0)
-        found, held = manifold.descend(start, free, strict=False)
-        if held:
-            return found, True, True
-        first = first or found
+        closest, converged = manifold.gauss_newton(start, free, strict=False)
+        if converged:
+            return closest, True, True
+        first = first or closest
     return first, False, True
 
 
-def _half_turned(manifold: Manifold, place: Place) -> bool:
-    """Whether some loop stands half a turn off at a place, and elsewhere too."""
+def _half_turned(manifold: Manifold, configuration: Configuration) -> bool:
+    """Whether some loop has a rotation error of half a turn at a configuration and near it."""
     axes = [k for rows in manifold.rotations for k in rows]
     random = np.random.default_rng(43)
-    beside = manifold.place(place.q + random.uniform(-1, 1, len(place.q)), place.t)
-    both = [p.phi[axes] >= AWAY for p in (place, beside) if p is not None]
+    nearby = manifold.configuration(
+        configuration.q + random.uniform(-1, 1, len(configuration.q)), configuration.t
+    )
+    both = [p.phi[axes] >= HALF_TURN_RESIDUAL for p in (configuration, nearby) if p is not None]
     return bool(np.any(np.all(both, axis=0)))
 
 
-def _off(manifold: Manifold, place: Place, free: Flags) -> bool:
-    """Whether some row is further from zero than doubles can tell: a rounding where it can move."""
-    q, axes = place.q, [k for rows in manifold.rotations for k in rows]
-    if np.any(np.abs(place.phi[axes]) > ROTATED):
+def _violates_constraints(manifold: Manifold, configuration: Configuration, free: Flags) -> bool:
+    """Whether some residual exceeds its rounding error, or a wrong rotation satisfies it."""
+    q, axes = configuration.q, [k for rows in manifold.rotations for k in rows]
+    if np.any(np.abs(configuration.phi[axes]) > MAX_ROTATION_ERROR):
         return True
-    exact = manifold.exactly("constraints", q.tolist(), [0.0] * len(q), 0.0)
+    exact = manifold.exact_value("constraints", q.tolist(), [0.0] * len(q), 0.0)
     off = np.abs([float(x) for x in exact])[manifold.holonomic]
     rounding = manifold.rounding(q, 0 * q, 0.0)[manifold.holonomic]
     moves = np.any(manifold.reads[:, free], axis=1)[manifold.holonomic]
-    return bool(np.any(off > np.where(moves, 1, ROUNDED) * rounding))
+    return bool(np.any(off > np.where(moves, 1, ROUNDING_FACTOR) * rounding))
 
 
-def _rates(manifold: Manifold, place: Place, q: Sequence[Any], rates: Vector) -> Vector:
-    """The assembled rates. Raises SceneError where held ones contradict rows."""
-    free = np.array([not c.held_rate for c in manifold.system.coordinates])
-    off = manifold.value("constraint_rates", place.q, rates, 0.0)
-    limit = ROUNDED * manifold.rounding(place.q, rates, 0.0, "constraint_rates")
+def _rates(
+    manifold: Manifold, configuration: Configuration, q: Sequence[Any], rates: Vector
+) -> Vector:
+    """Compute consistent velocities. Raises SceneError where fixed ones violate constraints."""
+    free = np.array([not c.rate_fixed for c in manifold.system.coordinates])
+    off = manifold.value("constraint_rates", configuration.q, rates, 0.0)
+    limit = ROUNDING_FACTOR * manifold.rounding(configuration.q, rates, 0.0, "constraint_rates")
     if np.all(np.abs(off) <= limit):
         return rates
-    found, held = manifold.rates(place, list(q), rates, free)
-    rounded = np.where(free, _rounded(place, found), rates)
-    if not held:
-        off = np.abs(manifold.value("constraint_rates", place.q, rounded, 0.0))
-        limit = ROUNDED * manifold.rounding(place.q, rounded, 0.0, "constraint_rates")
+    solution, converged = manifold.rates(configuration, list(q), rates, free)
+    rounded = np.where(free, _rounded(configuration, solution), rates)
+    if not converged:
+        off = np.abs(manifold.value("constraint_rates", configuration.q, rounded, 0.0))
+        limit = ROUNDING_FACTOR * manifold.rounding(
+            configuration.q, rounded, 0.0, "constraint_rates"
+        )
         if np.any(off > limit):
-            problems = contradictions.of_rates(manifold, free, place, list(q), rounded)
+            problems = contradictions.of_rates(manifold, free, configuration, list(q), rounded)
             raise SceneError(list(problems))
     return rounded
 
 
-def _rounded(place: Place, exact: Sequence[Any]) -> Vector:
-    """Numbers of forty digits as doubles; 0 of what is nothing beside the others."""
-    found = np.array([float(x) for x in exact])
-    sizes = np.sqrt(np.diag(place.metric)) * np.abs(found)
-    return np.where(sizes > NOTHING * np.linalg.norm(sizes), found, 0.0)
+def _rounded(configuration: Configuration, exact: Sequence[Any]) -> Vector:
+    """Convert numbers of forty digits to doubles; negligible ones become 0."""
+    values = np.array([float(x) for x in exact])
+    sizes = np.sqrt(np.diag(configuration.metric)) * np.abs(values)
+    return np.where(sizes > ZERO_TOLERANCE * np.linalg.norm(sizes), values, 0.0)
 
 
 def _moves(
-    names: Sequence[tuple[str, str]], before: Vector, after: Vector, place: Place
+    names: Sequence[tuple[str, str]], before: Vector, after: Vector, configuration: Configuration
 ) -> Iterator[Move]:
-    """What has moved, as far as that is something beside all values together, as lengths."""
-    sizes = np.sqrt(np.diag(place.metric))
+    """Yield the changes of initial values that exceed rounding, in the metric of D."""
+    sizes = np.sqrt(np.diag(configuration.metric))
     least = ROUNDING * np.linalg.norm(sizes * after) / sizes
-    far = np.maximum(SHOWN * np.maximum(np.abs(before), np.abs(after)), least)
-    told = (np.abs(after - before) > far).tolist()
+    far = np.maximum(REPORTED_CHANGE * np.maximum(np.abs(before), np.abs(after)), least)
+    changed = (np.abs(after - before) > far).tolist()
     for (name, unit), one, other, moved in zip(
-        names, before.tolist(), after.tolist(), told, strict=True
+        names, before.tolist(), after.tolist(), changed, strict=True
     ):
         if moved:
             yield Move(name, one, other, unit)
 
 
-def _closure(manifold: Manifold, start: Start, found: Ranks) -> ConstraintSummary:
+def _closure(manifold: Manifold, start: Start, constraint_ranks: Ranks) -> ConstraintSummary:
     system = manifold.system
     names = [c.name for c in system.constraints]
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
@@ -235,46 +260,49 @@ def _closure(manifold: Manifold, start: Start, found: Ranks) -> ConstraintSummar
     return ConstraintSummary(
         rows=tuple(names),
         coordinates=len(system.q),
-        rank=found.rank,
-        redundant=tuple(names[k] for k in found.left_out),
-        shared=tuple(names[k] for k in found.shared),
-        start_sigma=found.sigma[0],
-        least_sigma=found.sigma[1],
-        positions=found.positions,
-        weights=found.weights,
-        slopes=found.slopes,
-        sums=found.sums,
-        moves=tuple(_moves(units, guess, start.place.q, start.place)),
-        rate_moves=tuple(_moves(speeds, rates, start.qd, start.place)),
-        remarks=tuple(_remarks(manifold, start, found)),
+        rank=constraint_ranks.rank,
+        redundant=tuple(names[k] for k in constraint_ranks.left_out),
+        shared=tuple(names[k] for k in constraint_ranks.shared),
+        start_sigma=constraint_ranks.sigma[0],
+        least_sigma=constraint_ranks.sigma[1],
+        positions=constraint_ranks.positions,
+        weights=constraint_ranks.weights,
+        slopes=constraint_ranks.slopes,
+        sums=constraint_ranks.sums,
+        moves=tuple(_moves(units, guess, start.configuration.q, start.configuration)),
+        rate_moves=tuple(_moves(speeds, rates, start.qd, start.configuration)),
+        remarks=tuple(_remarks(manifold, start, constraint_ranks)),
     )
 
 
-def _remarks(manifold: Manifold, start: Start, found: Ranks) -> Iterator[str]:
-    """What is unusual, in words."""
-    rows = len(manifold.rows)
-    if start.strayed:
+def _remarks(manifold: Manifold, start: Start, constraint_ranks: Ranks) -> Iterator[str]:
+    """Yield messages on unusual properties of the constraints."""
+    rows, rank = len(manifold.rows), constraint_ranks.rank
+    if start.may_have_changed_branch:
         yield (
             "small ways from the guess lead to no position that the rows leave; longer ones led to "
             "this start, which may lie on another branch than was meant: look at it"
         )
-    if found.rank == len(manifold.system.q):
+    if constraint_ranks.rank == len(manifold.system.q):
         yield (
             "no freedom is left: the rows alone decide the motion in time"
             if manifold.timed
             else "no freedom is left, and nothing moves: a structure under its load"
         )
-    if manifold.timed and found.latest <= BEGUN * manifold.system.run.duration:
+    if (
+        manifold.timed
+        and constraint_ranks.latest <= MIN_SOLVABLE_TIME * manifold.system.run.duration
+    ):
         yield (
             "no position obeys the rows a little later: they contradict one another as time goes "
             "on, or the start is where the motion ends"
         )
-    elif not found.good:
+    elif not constraint_ranks.good:
         yield (
-            f"rank {found.rank} of {rows}, but no {found.rank} rows are far from singular at every "
+            f"rank {rank} of {rows}, but no {rank} rows are far from singular at every "
             "position: all are kept, and where a row depends on the others it is dropped"
         )
-    if found.sigma[0] == 0:
+    if constraint_ranks.sigma[0] == 0:
         yield (
             "the start is a singular position: rows depend on each other there, and the motion may "
             "go on in more ways than one"
@@ -282,9 +310,9 @@ def _remarks(manifold: Manifold, start: Start, found: Ranks) -> Iterator[str]:
 
 
 def _refuse_wrong_rotations(system: System) -> None:
-    """Raise SceneError for loops whose frames stand in a wrong rotation wherever they move."""
+    """Raise SceneError for loops that close only with a wrong relative rotation."""
     start = [c.start for c in system.coordinates]
-    found = [
+    problems = [
         system.problem(
             f"loop.{name}",
             "can't close as is meant: wherever its bodies move, the second frame stands in another "
@@ -292,17 +320,19 @@ def _refuse_wrong_rotations(system: System) -> None:
         )
         for name in loops.find_wrong_rotations(system)(start, 0.0, {})
     ]
-    if found:
-        raise SceneError(found)
+    if problems:
+        raise SceneError(problems)
 
 
-def _warnings(manifold: Manifold, found: Ranks, closure: ConstraintSummary) -> Iterator[Problem]:
-    """What a build says of it."""
+def _warnings(
+    manifold: Manifold, constraint_ranks: Ranks, closure: ConstraintSummary
+) -> Iterator[Problem]:
+    """Yield the warnings and notes that a build issues on the constraints."""
     system = manifold.system
     if closure.redundant or closure.sums:
         yield system.problem("constraints", closure.ranks, severity="warning")
     for remark in closure.remarks:
-        timely = manifold.timed and found.rank == len(system.q)
+        timely = manifold.timed and constraint_ranks.rank == len(system.q)
         severity = "note" if timely and remark.startswith("no freedom") else "warning"
         yield system.problem("constraints", remark, severity=severity)
     moves = [*closure.moves, *closure.rate_moves]

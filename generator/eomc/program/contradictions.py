@@ -14,7 +14,14 @@ from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
 from eomc.model.system import System
 from eomc.program.factors import has_only_repeated_factors
-from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import (
+    RANK_TOLERANCE,
+    Configuration,
+    Flags,
+    Manifold,
+    TangentSpace,
+    Vector,
+)
 
 VIOLATED_FRACTION = 0.01  # residuals below this fraction of the largest one are not reported
 MAX_RELEASED_VALUES = 12  # fixed values that are released one by one
@@ -22,8 +29,8 @@ MAX_PROPOSALS = 3  # values that a message proposes
 # Inconsistent constraints are reduced to a minimal set up to this number and system size.
 MAX_CONSTRAINTS, MAX_COORDINATES = 8, 24
 SAMPLE_COUNT = 6  # nearby configurations at which constraints are compared
-ALONE = "None changes alone: leave one out, or correct a formula or a parameter"
-BY_ITSELF = "each thing that is zero by itself, x and y for x**2 + y**2"
+NO_SINGLE_CHANGE = "None changes alone: leave one out, or correct a formula or a parameter"
+SEPARATE_TERMS = "each thing that is zero by itself, x and y for x**2 + y**2"
 MAX_FORMULA_LENGTH = 60  # characters of a formula in a message
 SAMPLE_DISTANCE = 0.1  # of these configurations, relative to the largest coordinate
 
@@ -33,15 +40,19 @@ def key(row: Constraint) -> str:
     return f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
 
 
-def of_positions(manifold: Manifold, free: Flags, configuration: Place) -> Iterator[Problem]:
-    """Report why the positions cannot be assembled. stuck: the configuration where assembly
-    ended.
-    """
+def of_positions(
+    manifold: Manifold, free: Flags, configuration: Configuration
+) -> Iterator[Problem]:
+    """Report why the positions cannot be assembled, from the configuration where assembly ended."""
     system = manifold.system
-    step = Frame(configuration, free, manifold.holonomic).exactly_onto(configuration.phi)
-    nearer = manifold.place(configuration.q + step, configuration.t)
+    step = TangentSpace(configuration, free, manifold.holonomic).truncated_correction(
+        configuration.phi
+    )
+    nearer = manifold.configuration(configuration.q + step, configuration.t)
     configuration = (
-        nearer if nearer is not None and nearer.off <= configuration.off else configuration
+        nearer
+        if nearer is not None and nearer.residual_norm <= configuration.residual_norm
+        else configuration
     )
     residuals = np.abs(configuration.phi / configuration.sizes)
     rows = [k for k in manifold.holonomic if residuals[k] > VIOLATED_FRACTION * np.max(residuals)]
@@ -91,7 +102,7 @@ def of_positions(manifold: Manifold, free: Flags, configuration: Place) -> Itera
 
 
 def of_rates(
-    manifold: Manifold, free: Flags, place: Place, q: Sequence[Any], rates: Vector
+    manifold: Manifold, free: Flags, place: Configuration, q: Sequence[Any], rates: Vector
 ) -> Iterator[Problem]:
     """Report initial velocities that violate the constraints; `rates` minimise the residual."""
     system = manifold.system
@@ -131,7 +142,7 @@ def of_rates(
     yield system.problem(key(row), message)
 
 
-def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Place) -> Problem:
+def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Configuration) -> Problem:
     """Report constraints that cannot be satisfied together near the start, whatever values are
     fixed.
     """
@@ -144,7 +155,7 @@ def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Place)
     if len(rows) > 1 and _alike(manifold, rows, configuration):
         message = (
             f"contradicts {_names(constraints, rows[1:])}: where they are least, {residuals}. "
-            f"{ALONE}"
+            f"{NO_SINGLE_CHANGE}"
         )
     else:
         leave = ", leave one out," if others else ""
@@ -156,12 +167,12 @@ def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Place)
     return manifold.system.problem(key(row), message)
 
 
-def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Place) -> Problem:
+def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Configuration) -> Problem:
     """Report constraints that no velocities satisfy, whatever values are fixed."""
     constraints = manifold.system.constraints
     row, others = constraints[rows[0]], _together_with(constraints, rows)
     if len(rows) > 1 and _alike(manifold, rows, place):
-        message = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {ALONE}"
+        message = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {NO_SINGLE_CHANGE}"
     else:
         message = (
             f"changes at the start{others}, and no rates mend it: the start is a singular "
@@ -170,7 +181,7 @@ def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Place) -
     return manifold.system.problem(key(row), message)
 
 
-def _needed(manifold: Manifold, rows: Sequence[int], configuration: Place) -> list[int]:
+def _needed(manifold: Manifold, rows: Sequence[int], configuration: Configuration) -> list[int]:
     """Reduce inconsistent constraints to those that are needed for the inconsistency."""
     system, free = manifold.system, np.ones(len(configuration.q), dtype=bool)
     if not 2 < len(rows) <= MAX_CONSTRAINTS or len(free) > MAX_COORDINATES:
@@ -196,11 +207,11 @@ def _fewest(rows: Sequence[int], hold: Callable[[Sequence[int]], bool]) -> list[
     return remaining
 
 
-def _inconsistent_set(manifold: Manifold, place: Place) -> list[int]:
+def _inconsistent_set(manifold: Manifold, place: Configuration) -> list[int]:
     """Return a minimal set of constraints that no velocities satisfy; empty if some velocities
     do.
     """
-    A = Frame(place, np.ones(len(place.q), dtype=bool), manifold.rows).B
+    A = TangentSpace(place, np.ones(len(place.q), dtype=bool), manifold.rows).B
     rates = manifold.value("constraint_rates", place.q, 0 * place.q, place.t) / place.sizes
 
     def is_consistent(rows: Sequence[int]) -> bool:
@@ -213,14 +224,14 @@ def _inconsistent_set(manifold: Manifold, place: Place) -> list[int]:
     return [] if is_consistent(manifold.rows) else _fewest(manifold.rows, is_consistent)
 
 
-def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
+def _alike(manifold: Manifold, rows: Sequence[int], place: Configuration) -> bool:
     """Return True if the constraints are also dependent at nearby configurations."""
     free, random = np.ones(len(place.q), dtype=bool), np.random.default_rng(5)
     distance = SAMPLE_DISTANCE * (float(np.max(np.abs(place.q))) or 1.0)
     for _ in range(SAMPLE_COUNT):
-        nearby = manifold.place(place.q + distance * random.normal(size=len(free)), place.t)
+        nearby = manifold.configuration(place.q + distance * random.normal(size=len(free)), place.t)
         if nearby is not None and len(rows) <= len(free):
-            if Frame(nearby, free, rows).parts[1][-1] > RANK_TOLERANCE:
+            if TangentSpace(nearby, free, rows).parts[1][-1] > RANK_TOLERANCE:
                 return False
     return True
 
@@ -253,9 +264,7 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
     """
     for row in [system.constraints[k] for k in flat]:
         base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
-        if power == 1 and has_only_repeated_factors(
-            row.formula, {*system.q}
-        ):  # of one that is written out
+        if power == 1 and has_only_repeated_factors(row.formula, {*system.q}):
             base, power = sqf_part(row.formula), Integer(2)
         simple = (
             power.is_number
@@ -263,21 +272,23 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
             and not base.is_Number
             and len(str(base)) < MAX_FORMULA_LENGTH
         )
-        alternative = f"{base} for {row.formula}" if simple else BY_ITSELF
+        alternative = f"{base} for {row.formula}" if simple else SEPARATE_TERMS
         message = f"has no slope where it holds, and so no force: write {alternative}"
         yield system.problem(key(row), message)
     if not flat:
-        message = f"have no slope where they hold, and so no force: write {BY_ITSELF}"
+        message = f"have no slope where they hold, and so no force: write {SEPARATE_TERMS}"
         yield system.problem("constraints", message)
 
 
-def of_inertia(manifold: Manifold, unresisted: Sequence[int], start: Place) -> Problem:
+def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration) -> Problem:
     """Report coordinates that move without inertia and without a constraint that fixes them."""
     system, random = manifold.system, np.random.default_rng(7)
-    names = [system.coordinates[k].name for k in unresisted]
-    nearby = manifold.place(start.q + SAMPLE_DISTANCE * random.normal(size=len(start.q)), start.t)
+    names = [system.coordinates[k].name for k in massless]
+    nearby = manifold.configuration(
+        start.q + SAMPLE_DISTANCE * random.normal(size=len(start.q)), start.t
+    )
     if nearby is not None and not nearby.singular:
-        at = _values_text(manifold, unresisted, start.q)
+        at = _values_text(manifold, massless, start.q)
         message = (
             f"the rows lead to {at}, where the mass matrix is singular, though it is not nearby: "
             "three angles of a spherical or free joint are singular at a pitch of pi/2. Turn the "
@@ -321,12 +332,12 @@ def _values_text(manifold: Manifold, indices: Iterable[int], q: Vector) -> str:
     return listed([f"{name} = {value:.6g}" for name, value in names])
 
 
-def _assemble_near(manifold: Manifold, free: Flags, configuration: Place) -> Place | None:
-    """Return a configuration close to `stuck` that satisfies the constraints with `free`
-    coordinates.
-    """
+def _assemble_near(
+    manifold: Manifold, free: Flags, configuration: Configuration
+) -> Configuration | None:
+    """Return a configuration nearby that satisfies the constraints, moving `free` coordinates."""
     for strict in (True, False):
-        result, converged = manifold.descend(configuration.q, free, configuration.t, strict)
+        result, converged = manifold.gauss_newton(configuration.q, free, configuration.t, strict)
         if converged and result is not None:
             return result
     return None

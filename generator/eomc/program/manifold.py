@@ -1,8 +1,9 @@
-"""The positions at which constraints hold, in numbers: values, steps onto them, forty digits.
+"""The constraint manifold in numbers: residuals, Newton steps onto it, refinement to 40 digits.
 
-Lengths are in the metric of D; a row is in units of sqrt(A D^-1 A^T), its own inverse inertia.
-Rows of a loop's axes are replaced by the rotation vector by which they are out: it has the same
-zero and slope where the joint is closed, no other zero, and a slope everywhere.
+Lengths are in the metric of D. Each constraint equation is scaled by sqrt(A D^-1 A^T), the root of
+its inverse effective mass. The axis equations of a loop are replaced by the components of the
+rotation error vector: it has the same zero and gradient where the joint is closed, no other zero,
+and a gradient that vanishes nowhere.
 """
 
 from __future__ import annotations
@@ -25,32 +26,32 @@ from eomc.program.lower import lower
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-RANK_TOLERANCE = 1e-7  # singular values below are zero, where rows hold to rounding
-HALF_TURN = 1e-8  # the square of the cosine of half an angle: it counts as half a turn
-AWAY = 4.0  # rad: what a row of axes lacks there
-LINEAR = 0.25  # of a step: what rows may differ by from their tangent at its end
-LEAP = 0.5  # of a coordinate or rad: a step, at most
-SHORTEST = 2.0**-13  # part of a step
-ROUNDED = 64  # roundings: what a row of held values may be
-SWEEPS = 400  # of Newton's method, damped
-NO_SLOPE = 1e-13  # of a loop's row, of its slope beside: it has none, but rounding
-NO_MASS = 1e-14  # the least eigenvalue of a D that is scaled to 1: it is singular
-BESIDE = 3  # places beside the start
-LEAST = 1e-14  # of the inverse inertia of a row: by so much it is always damped
+RANK_TOLERANCE = 1e-7  # singular values below it count as zero
+HALF_TURN_COSINE = 1e-8  # of cos(a/2)^2: a rotation error a below it counts as half a turn
+HALF_TURN_RESIDUAL = 4.0  # rad, assigned to the axis equations at half a turn
+MAX_NONLINEARITY = 0.25  # of a step: deviation of the residuals from their tangent
+MAX_STEP = 0.5  # of a Newton step, relative to a coordinate, or in rad
+MIN_STEP_FRACTION = 2.0**-13  # of the full Newton step
+ROUNDING_FACTOR = 64  # rounding errors that a residual of fixed values may have
+MAX_ITERATIONS = 400  # of the damped Newton method
+ZERO_GRADIENT_TOLERANCE = 1e-13  # relative to a nearby gradient: below it, only rounding
+SINGULAR_MASS_TOLERANCE = 1e-14  # of the least eigenvalue of D scaled to unit diagonal
+NEARBY_SAMPLES = 3  # configurations near the start
+MIN_DAMPING = 1e-14  # relative to a scaled equation: damping of every step
 EPS = 2.0**-52
-EXACT = 12  # sweeps in forty digits; each gains ten or more
-DEEP = 1e-32  # of the terms of a row: it holds in forty digits
+MAX_REFINEMENTS = 12  # in forty digits; each gains ten digits or more
+REFINED_TOLERANCE = 1e-32  # relative to the terms of an equation: satisfied in forty digits
 
 
-def _most(x: Vector) -> float:
+def _max_abs(x: Vector) -> float:
     return float(np.max(np.abs(x), initial=0))
 
 
 @dataclass(frozen=True)
-class Place:
-    """Rows at q (nq,) and t: phi (m,), 0 for rows of rates; A (m, nq); D (nq, nq).
+class Configuration:
+    """Constraints at q (nq,) and t: phi (m,), 0 for nonholonomic ones; A (m, nq); D (nq, nq).
 
-    Of rows that have rotation errors phi is the rotation vector, and A its slope.
+    For constraints with a rotation error, phi is the rotation vector and A its Jacobian.
     """
 
     q: Vector
@@ -61,20 +62,22 @@ class Place:
 
     @cached_property
     def singular(self) -> bool:
-        """Whether D is not positive definite by itself."""
+        """Whether D alone is not positive definite."""
         diagonal = np.diag(self.D)
         if np.all(diagonal > 0):
             scale = 1 / np.sqrt(diagonal)
             with suppress(np.linalg.LinAlgError):
                 D = scale[:, None] * (self.D + self.D.T) / 2 * scale
                 pivots = np.diag(np.linalg.cholesky(D))
-                # of a singular one the least pivot may be far above the least eigenvalue
-                return not (np.min(pivots) > 1e-6 and np.linalg.eigvalsh(D)[0] > NO_MASS)
+                # the least pivot of a singular matrix may be far above its least eigenvalue
+                return not (
+                    np.min(pivots) > 1e-6 and np.linalg.eigvalsh(D)[0] > SINGULAR_MASS_TOLERANCE
+                )
         return True
 
     @property
     def weights(self) -> Vector:
-        """(m,): of the rows in `metric`, where D is singular; powers of two."""
+        """Weights (m,) of the constraints in `metric` where D is singular; powers of two."""
         diagonal, size = np.diag(self.D), np.sum(self.A**2, axis=1)
         known = diagonal > 0
         mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
@@ -82,14 +85,14 @@ class Place:
 
     @cached_property
     def metric(self) -> Vector:
-        """D, with the rows' own weight where some coordinate has no inertia."""
+        """Return D, or D + sum_r weights[r] A_r^T A_r where D is singular."""
         return self.metric_of(range(len(self.A)))
 
     def metric_of(self, rows: Sequence[int]) -> Vector:
-        """The same with the weight of some rows.
+        """Return `metric` with the weights of the constraints `rows` only.
 
-        A least change with A d given for these rows is the same with and without their weight;
-        other rows would change it.
+        The minimum-norm d with A d prescribed for these constraints does not depend on their
+        weights; weights of other constraints would change it.
         """
         D, A = (self.D + self.D.T) / 2, self.A[rows]
         if not self.singular:
@@ -101,103 +104,105 @@ class Place:
 
     @cached_property
     def sizes(self) -> Vector:
-        """(m,): sqrt(A D^-1 A^T) of each row, 1 where that is 0."""
+        """Scale sqrt(A D^-1 A^T) (m,) of each constraint; 1 where that is 0."""
         B = np.linalg.solve(np.linalg.cholesky(self.metric), self.A.T)
         sizes = np.sqrt(np.sum(B**2, axis=0))
         return np.where(sizes > 0, sizes, 1.0)
 
     @property
     def slopes(self) -> Vector:
-        """(m,): sqrt(A D^-1 A^T) of each row."""
+        """Norm sqrt(A D^-1 A^T) (m,) of each constraint's gradient."""
         return np.where(np.any(self.A != 0, axis=1), self.sizes, 0.0)
 
     @cached_property
     def levels(self) -> Vector:
-        """(m,): how much a row changes where all coordinates change by themselves."""
+        """Change (m,) of each constraint when every coordinate changes by its own magnitude."""
         scale = np.sqrt(np.diag(self.metric))
         return self.sizes * float(np.linalg.norm(scale * self.q) + 1e-3 * np.max(scale))
 
     @cached_property
-    def off(self) -> float:
-        """How far the rows are from zero, as a length."""
+    def residual_norm(self) -> float:
+        """Norm of the scaled constraint residuals, as a length."""
         return float(np.linalg.norm(self.phi / self.sizes))
 
 
-class Frame:
-    """Directions at a place, of the coordinates `free`, along and across the rows `rows`."""
+class TangentSpace:
+    """The tangent space of the constraints `rows` over the coordinates `free`."""
 
-    def __init__(self, place: Place, free: Flags, rows: Sequence[int]) -> None:
-        self.place, self.free, self.rows = place, np.flatnonzero(free), list(rows)
-        metric = place.metric_of(self.rows)
+    def __init__(self, configuration: Configuration, free: Flags, rows: Sequence[int]) -> None:
+        self.configuration, self.free, self.rows = configuration, np.flatnonzero(free), list(rows)
+        metric = configuration.metric_of(self.rows)
         self.L = np.linalg.cholesky(metric[self.free][:, self.free])
-        A = place.A[self.rows][:, self.free] / place.sizes[self.rows, None]
+        A = configuration.A[self.rows][:, self.free] / configuration.sizes[self.rows, None]
         self.B = np.linalg.solve(self.L, A.T).T
 
     @cached_property
     def parts(self) -> tuple[Vector, Vector, Vector]:
-        """U, s and V^T of B = U diag(s) V^T."""
+        """Singular value decomposition (U, s, V^T) of B = U diag(s) V^T."""
         U, s, V = np.linalg.svd(self.B, full_matrices=False)
         return np.asarray(U), np.asarray(s), np.asarray(V)
 
     def _inverse(self, values: Vector, damping: float) -> Vector:
-        """(B B^T + damping)^-1 values; the little that is always damped leaves rows as they are."""
-        whole = self.B @ self.B.T + max(damping, LEAST) * np.eye(len(self.rows))
+        """Return (B B^T + damping)^-1 values, with a damping of MIN_DAMPING at least."""
+        whole = self.B @ self.B.T + max(damping, MIN_DAMPING) * np.eye(len(self.rows))
         return np.asarray(np.linalg.solve(whole, values))
 
-    def back(self, y: Vector) -> Vector:
-        """(nq,): the direction of which y is the coordinates' part in the metric."""
-        whole = np.zeros(len(self.place.q))
+    def _from_metric(self, y: Vector) -> Vector:
+        """Return the direction (nq,) with components y in an orthonormal basis of the metric."""
+        whole = np.zeros(len(self.configuration.q))
         whole[self.free] = np.linalg.solve(self.L.T, y)
         return whole
 
-    def onto(self, values: Vector, damping: float = 0.0) -> Vector:
-        """(nq,): the least direction along which the rows change by -values, nearly, damped."""
-        aim = values[self.rows] / self.place.sizes[self.rows]
-        return -self.back(self.B.T @ self._inverse(aim, damping))
+    def correction(self, values: Vector, damping: float = 0.0) -> Vector:
+        """Return the damped minimum-norm direction (nq,) that changes the residuals by -values."""
+        aim = values[self.rows] / self.configuration.sizes[self.rows]
+        return -self._from_metric(self.B.T @ self._inverse(aim, damping))
 
-    def exactly_onto(self, values: Vector) -> Vector:
-        """The same as far as they can, rows that depend on others left to these."""
+    def truncated_correction(self, values: Vector) -> Vector:
+        """Return the minimum-norm least-squares correction (nq,), by a truncated SVD."""
         U, s, V = self.parts
-        aim = values[self.rows] / self.place.sizes[self.rows]
-        return -self.back(V.T @ (U.T @ aim / np.where(s > RANK_TOLERANCE, s, np.inf)))
+        aim = values[self.rows] / self.configuration.sizes[self.rows]
+        return -self._from_metric(V.T @ (U.T @ aim / np.where(s > RANK_TOLERANCE, s, np.inf)))
 
-    def along(self, direction: Vector) -> Vector:
-        """(nq,): what of a direction leaves the rows as they are."""
+    def projected(self, direction: Vector) -> Vector:
+        """Return the projection (nq,) of a direction onto the tangent space."""
         y = self.L.T @ direction[self.free]
         for _ in range(2):
             y = y - self.B.T @ self._inverse(self.B @ y, 0.0)
-        return self.back(y)
+        return self._from_metric(y)
 
     def length(self, direction: Vector) -> float:
-        """Of a direction of free coordinates."""
+        """Return the length of a direction of the free coordinates, in the metric."""
         return float(np.linalg.norm(self.L.T @ direction[self.free]))
 
 
 class Manifold:
-    """The constraints of a system, at its parameters' defaults."""
+    """The constraints of a system, at the default values of its parameters."""
 
     def __init__(self, system: System) -> None:
         self.system = system
         derived = lagrange.derive(system)
-        made = {f.name: f for f in constrained.of_rows(derived)}
+        functions = {f.name: f for f in constrained.of_rows(derived)}
         e = derived.lagrange or derived.newton_euler
         assert e is not None
         D = lower("D", e.tape, [x for row in e.D for x in row], system.names)
-        self.functions = {**made, "D": D}
+        self.functions = {**functions, "D": D}
         self.parameters = {p.name: p.value for p in system.parameters}
         self._names = [x.name for x in (*system.q, *system.qd)]
         self._fixed = {**self.parameters, **dict.fromkeys((u.name for u in system.u), 0.0)}
         self.holonomic = [k for k, c in enumerate(system.constraints) if c.holonomic]
         self.rotations = system.rotations
         self.rows = range(len(system.constraints))
-        self.timed = any(t.name in made[name].uses for name in ("constraints", "constraint_rates"))
+        self.timed = any(
+            t.name in functions[name].uses for name in ("constraints", "constraint_rates")
+        )
         self._plain: dict[str, Callable[..., Any]] = {}
         self._exact: dict[str, Callable[..., Any]] = {}
         self._rounding: dict[str, Callable[..., list[float]]] = {}
 
     @cached_property
     def reads(self) -> Flags:
-        """(m, nq): which coordinates, or rates, a row depends on."""
+        """Whether each constraint depends on each coordinate, or its velocity (m, nq)."""
         outputs = self.functions["constraint_jacobian"].outputs
         return np.array([o.coefficient != 0 for o in outputs]).reshape(len(self.rows), -1)
 
@@ -206,7 +211,7 @@ class Manifold:
         return {**self._fixed, t.name: time, **moving}
 
     def value(self, name: str, q: Vector, qd: Vector, time: float) -> Vector:
-        """What a function gives, in doubles; nan where it has no value."""
+        """Evaluate a function in doubles; NaN where it has no value."""
         if name not in self._plain:
             self._plain[name] = evaluator(self.functions[name])
         try:
@@ -214,50 +219,52 @@ class Manifold:
         except (ArithmeticError, ValueError):
             return np.full(len(self.functions[name].outputs), np.nan)
 
-    def exactly(self, name: str, q: Sequence[Any], qd: Sequence[Any], time: float) -> list[Any]:
-        """The same in forty digits."""
+    def exact_value(self, name: str, q: Sequence[Any], qd: Sequence[Any], time: float) -> list[Any]:
+        """Evaluate a function in forty digits."""
         if name not in self._exact:
             self._exact[name] = exact_evaluator(self.functions[name])
-        found: list[Any] = self._exact[name](self._values(q, qd, time))
-        return found
+        values: list[Any] = self._exact[name](self._values(q, qd, time))
+        return values
 
     def has_values(self, q: Vector, time: float = 0.0) -> bool:
-        """Whether the constraints, their slopes and D are finite."""
+        """Whether the constraints, their Jacobian and D are finite."""
         names = ("constraints", "constraint_jacobian", "D")
         return all(np.all(np.isfinite(self.value(name, q, 0 * q, time))) for name in names)
 
-    def place(self, q: Vector, time: float = 0.0) -> Place | None:
-        """The rows there; None where something has no value."""
-        n, rest, phi = len(q), np.zeros(len(q)), self._off(q, time)
+    def configuration(self, q: Vector, time: float = 0.0) -> Configuration | None:
+        """Return the configuration at q and a time; None where a function has no value."""
+        n, rest, phi = len(q), np.zeros(len(q)), self._residuals(q, time)
         A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
         for rows, vector, slopes in self._rotation_vectors(q, time):
             phi[rows], A[rows] = vector, slopes
         D = self.value("D", q, rest, time).reshape(n, n)
         if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
             return None
-        level = self._of_loops & (np.linalg.norm(A, axis=1) <= NO_SLOPE * self.usual)
+        level = self._of_loops & (
+            np.linalg.norm(A, axis=1) <= ZERO_GRADIENT_TOLERANCE * self.typical_gradients
+        )
         A[level] = 0.0
-        return Place(q, time, phi, A, D)
+        return Configuration(q, time, phi, A, D)
 
     @cached_property
     def _of_loops(self) -> Flags:
-        """(m,): the rows of lengths and axes, which have slopes of one size."""
+        """Flags (m,) of the loop equations, whose gradients are of comparable size."""
         return np.array([bool(c.loop) for c in self.system.constraints])
 
     @cached_property
-    def usual(self) -> Vector:
-        """(m,): the length of each row's slope, over coordinates, beside the start."""
+    def typical_gradients(self) -> Vector:
+        """Largest Euclidean norm (m,) of each constraint's gradient near the start."""
         random, n = np.random.default_rng(3), len(self.system.q)
         start = np.array([c.start for c in self.system.coordinates])
-        found = np.zeros((BESIDE, len(self.rows)))
-        for k in range(BESIDE):
+        norms = np.zeros((NEARBY_SAMPLES, len(self.rows)))
+        for k in range(NEARBY_SAMPLES):
             q = start + random.uniform(-1, 1, n)
             A = self.value("constraint_jacobian", q, np.zeros(n), 0.0).reshape(-1, n)
-            found[k] = np.linalg.norm(np.nan_to_num(A, posinf=0, neginf=0), axis=1)
-        return np.asarray(np.max(found, axis=0))
+            norms[k] = np.linalg.norm(np.nan_to_num(A, posinf=0, neginf=0), axis=1)
+        return np.asarray(np.max(norms, axis=0))
 
-    def _off(self, q: Vector, time: float) -> Vector:
-        """(m,): what the rows of positions are there, 0 for the others."""
+    def _residuals(self, q: Vector, time: float) -> Vector:
+        """Return the residuals (m,) of the holonomic constraints, 0 for the others."""
         phi = self.value("constraints", q, np.zeros(len(q)), time)
         phi[len(self.holonomic) :] = 0
         for rows, vector, _ in self._rotation_vectors(q, time):
@@ -267,22 +274,22 @@ class Manifold:
     def _rotation_vectors(
         self, q: Vector, time: float
     ) -> Iterator[tuple[list[int], Vector, Vector]]:
-        """The rows of axes of each loop, the rotation vector a n that they lack, and its slopes.
+        """Yield, for each loop, the axis equations, the rotation error vector a n and its Jacobian.
 
-        From e = 2 tan(a/2) n, whose own slope along n grows as 1/cos(a/2)^2.
+        Computed from e = 2 tan(a/2) n, whose gradient along n grows as 1/cos(a/2)^2.
         """
         if not self.rotations:
             return
         count = sum(map(len, self.rotations))
-        found = self.value("rotation_errors", q, np.zeros(len(q)), time)
-        errors, halves, first = found[:count], found[count : 2 * count], 0
-        slopes = found[2 * count :].reshape(count, -1)
+        values = self.value("rotation_errors", q, np.zeros(len(q)), time)
+        errors, halves, first = values[:count], values[count : 2 * count], 0
+        slopes = values[2 * count :].reshape(count, -1)
         for rows in self.rotations:
             part = slice(first, first := first + len(rows))
             e, J = errors[part], slopes[part]
             tangent = float(np.linalg.norm(e)) / 2
-            if not halves[part.start] > HALF_TURN:  # no direction leads back
-                e, J = np.full(len(rows), AWAY), np.zeros_like(J)
+            if not halves[part.start] > HALF_TURN_COSINE:  # no direction reduces the error
+                e, J = np.full(len(rows), HALF_TURN_RESIDUAL), np.zeros_like(J)
             elif tangent > 0:
                 n, scale = e / (2 * tangent), np.arctan(tangent) / tangent
                 along = np.outer(n, n @ J)
@@ -291,7 +298,7 @@ class Manifold:
             yield list(rows), e, J
 
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
-        """(m,): the rounding error of each row, to first order; 0 where a row has no value."""
+        """Return the first-order rounding error (m,) of each residual; 0 where one has no value."""
         if name not in self._rounding:
             self._rounding[name] = rounding_evaluator(self.functions[name])
         try:
@@ -300,119 +307,149 @@ class Manifold:
             return np.zeros(len(self.rows))
         return EPS * np.array(bounds)
 
-    def descend(
+    def gauss_newton(
         self, q: Vector, free: Flags, time: float = 0.0, strict: bool = True
-    ) -> tuple[Place | None, bool]:
-        """Where small ways from q lead, free coordinates moving least, and whether rows hold there.
+    ) -> tuple[Configuration | None, bool]:
+        """Solve the holonomic constraints for the free coordinates by a damped Gauss-Newton method.
 
-        Newton's method, damped so that rows go to zero together as nearly as LINEAR (strict), or
-        so that they get less.
+        Steps are of minimum norm. strict: steps are shortened until the residuals follow their
+        tangent to MAX_NONLINEARITY; else until they decrease. Returns the last configuration, None
+        without values at q, and whether the iteration converged.
         """
-        place = self.place(q, time)
-        if place is None:
+        configuration = self.configuration(q, time)
+        if configuration is None:
             return None, False
-        for _ in range(SWEEPS):
-            if place.off == 0:
-                return place, True
-            frame = Frame(place, free, self.holonomic)
+        for _ in range(MAX_ITERATIONS):
+            if configuration.residual_norm == 0:
+                return configuration, True
+            frame = TangentSpace(configuration, free, self.holonomic)
             unit = float(np.sqrt(np.trace(frame.L @ frame.L.T) / max(1, len(frame.free))))
-            step = frame.onto(place.phi, 1e-2 * min(1.0, place.off / unit if unit else 0.0))
-            change = float(np.linalg.norm(place.A @ step / place.sizes))
-            tiny = np.max(np.abs(step) / (np.abs(place.q) + 1e-3 + np.max(np.abs(place.q))))
-            if change < 1e-4 * place.off:
-                return place, self.rounded(place)
-            found = self._shortened(place, step, strict, LEAP * (1 + _most(q)))
-            if found is None:
-                return place, self.rounded(place)
-            if tiny < 1e-13 and found.off > place.off / 4:
-                return (found if found.off < place.off else place), True
-            place = found
-        return place, False
+            step = frame.correction(
+                configuration.phi,
+                1e-2 * min(1.0, configuration.residual_norm / unit if unit else 0.0),
+            )
+            change = float(np.linalg.norm(configuration.A @ step / configuration.sizes))
+            tiny = np.max(
+                np.abs(step) / (np.abs(configuration.q) + 1e-3 + np.max(np.abs(configuration.q)))
+            )
+            if change < 1e-4 * configuration.residual_norm:
+                return configuration, self.rounded(configuration)
+            shorter = self._shortened(configuration, step, strict, MAX_STEP * (1 + _max_abs(q)))
+            if shorter is None:
+                return configuration, self.rounded(configuration)
+            if tiny < 1e-13 and shorter.residual_norm > configuration.residual_norm / 4:
+                return (
+                    shorter
+                    if shorter.residual_norm < configuration.residual_norm
+                    else configuration
+                ), True
+            configuration = shorter
+        return configuration, False
 
-    def rounded(self, place: Place) -> bool:
-        """Whether rows are as near to zero as doubles can tell."""
-        off, limit = np.abs(place.phi), EPS * place.levels
-        if not np.all(off <= ROUNDED * limit):
-            limit = np.maximum(self.rounding(place.q, 0 * place.q, place.t), limit)
-        return bool(np.all(off <= ROUNDED * limit))
+    def rounded(self, configuration: Configuration) -> bool:
+        """Whether the residuals are within the rounding errors of doubles."""
+        off, limit = np.abs(configuration.phi), EPS * configuration.levels
+        if not np.all(off <= ROUNDING_FACTOR * limit):
+            limit = np.maximum(
+                self.rounding(configuration.q, 0 * configuration.q, configuration.t), limit
+            )
+        return bool(np.all(off <= ROUNDING_FACTOR * limit))
 
-    def _shortened(self, place: Place, step: Vector, strict: bool, longest: float) -> Place | None:
-        # rows of sines hold again and again: a step across turns leads anywhere
-        part, change = min(1.0, longest / max(longest, _most(step))), place.A @ step
-        while part > SHORTEST:
-            q = place.q + part * step
-            phi, aim = self._off(q, place.t), place.phi + part * change
+    def _shortened(
+        self, configuration: Configuration, step: Vector, strict: bool, longest: float
+    ) -> Configuration | None:
+        # equations in sines have many roots: a step over several turns could reach any of them
+        part, change = min(1.0, longest / max(longest, _max_abs(step))), configuration.A @ step
+        while part > MIN_STEP_FRACTION:
+            q = configuration.q + part * step
+            phi, aim = self._residuals(q, configuration.t), configuration.phi + part * change
             aim[len(self.holonomic) :] = 0
-            bent = float(np.linalg.norm((phi - aim) / place.sizes))
-            less = float(np.linalg.norm(phi / place.sizes))
-            if less < (1 - part / 8) * place.off and (
-                not strict or bent <= LINEAR * part * place.off
+            nonlinearity = float(np.linalg.norm((phi - aim) / configuration.sizes))
+            norm = float(np.linalg.norm(phi / configuration.sizes))
+            if norm < (1 - part / 8) * configuration.residual_norm and (
+                not strict or nonlinearity <= MAX_NONLINEARITY * part * configuration.residual_norm
             ):
-                there = self.place(q, place.t)
+                there = self.configuration(q, configuration.t)
                 if there is not None:
                     return there
             part /= 2
         return None
 
-    def nearest(self, place: Place, guess: Vector, free: Flags) -> Place:
-        """The place at which the free coordinates have moved least from a guess, close by.
+    def closest_configuration(
+        self, configuration: Configuration, guess: Vector, free: Flags
+    ) -> Configuration:
+        """Return the configuration on the manifold that is locally closest to a guess.
 
-        Along the rows towards the guess and back onto them, until that leads no nearer.
+        Steps in the tangent space towards the guess, each corrected onto the manifold, until the
+        distance no longer decreases.
         """
         for _ in range(100):
-            frame = Frame(place, free, self.holonomic)
-            way = frame.along(guess - place.q)
-            far = frame.length(guess - place.q)
+            frame = TangentSpace(configuration, free, self.holonomic)
+            way = frame.projected(guess - configuration.q)
+            far = frame.length(guess - configuration.q)
             if frame.length(way) <= 1e-9 * far or far == 0:
-                return place
+                return configuration
             part = 1.0
-            while part > SHORTEST:
-                there, held = self.descend(place.q + part * way, free, place.t)
-                if held and there is not None and frame.length(guess - there.q) < far:
+            while part > MIN_STEP_FRACTION:
+                there, converged = self.gauss_newton(
+                    configuration.q + part * way, free, configuration.t
+                )
+                if converged and there is not None and frame.length(guess - there.q) < far:
                     break
                 part /= 2
             else:
-                return place
+                return configuration
             assert there is not None
-            place = there
-        return place
+            configuration = there
+        return configuration
 
-    def polished(self, place: Place, free: Flags) -> tuple[list[Any], bool]:
-        """q in forty digits, and whether all rows hold there. From a place good to rounding."""
-        rest = [0] * len(place.q)
+    def refine(self, configuration: Configuration, free: Flags) -> tuple[list[Any], bool]:
+        """Return q in forty digits and whether it converged, from a solution in doubles."""
+        rest = [0] * len(configuration.q)
 
         def phi(q: list[Any]) -> list[Any]:
-            found = self.exactly("constraints", q, rest, place.t)
-            return [*found[: len(self.holonomic)], *[0] * (len(found) - len(self.holonomic))]
+            values = self.exact_value("constraints", q, rest, configuration.t)
+            return [*values[: len(self.holonomic)], *[0] * (len(values) - len(self.holonomic))]
 
-        return _refined(place.q, phi, Frame(place, free, self.holonomic), place.levels)
+        return _refined(
+            configuration.q,
+            phi,
+            TangentSpace(configuration, free, self.holonomic),
+            configuration.levels,
+        )
 
-    def rates(self, place: Place, q: list[Any], qd: Vector, free: Flags) -> tuple[list[Any], bool]:
-        """qd in forty digits with the free rates moved least, and whether all rows hold there."""
+    def rates(
+        self, configuration: Configuration, q: list[Any], qd: Vector, free: Flags
+    ) -> tuple[list[Any], bool]:
+        """Return qd in forty digits, by the least change of the free velocities, and whether it
+        converged.
+        """
 
         def rates(qd: list[Any]) -> list[Any]:
-            return self.exactly("constraint_rates", q, qd, place.t)
+            return self.exact_value("constraint_rates", q, qd, configuration.t)
 
-        level = replace(place, q=qd).levels
-        return _refined(qd, rates, Frame(place, free, self.rows), level)
+        level = replace(configuration, q=qd).levels
+        return _refined(qd, rates, TangentSpace(configuration, free, self.rows), level)
 
 
 def _refined(
-    start: Vector, of: Callable[[list[Any]], list[Any]], frame: Frame, level: Vector
+    start: Vector, of: Callable[[list[Any]], list[Any]], frame: TangentSpace, level: Vector
 ) -> tuple[list[Any], bool]:
-    """Numbers that leave rows `of` them at zero in forty digits, and whether all do.
+    """Return a root of `of` in forty digits and whether it converged, from a start in doubles.
 
-    From doubles, by steps in doubles; level: of each row, what it is compared with.
+    Corrections are computed in doubles. level: the scale of each residual.
     """
     mp = context()
     x, best, last = [mp.mpf(value) for value in start.tolist()], None, np.inf
-    for _ in range(EXACT):
+    for _ in range(MAX_REFINEMENTS):
         off = np.array([float(row) for row in of(x)])
         size = float(np.max(np.abs(off) / level, initial=0))
         if not size < last:
             break
         best, last = x, size
-        if size < DEEP:
+        if size < REFINED_TOLERANCE:
             break
-        x = [a + mp.mpf(d) for a, d in zip(x, frame.exactly_onto(off).tolist(), strict=True)]
-    return best or x, last < DEEP
+        x = [
+            a + mp.mpf(d) for a, d in zip(x, frame.truncated_correction(off).tolist(), strict=True)
+        ]
+    return best or x, last < REFINED_TOLERANCE

@@ -6,14 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import Configuration, Flags, Manifold, TangentSpace, Vector
 
 STEPS, MAX_DIRECTIONS = 6, 4  # steps between samples; directions tried per sample
 INITIAL_STEP, MAX_STEP = 0.1, 0.3  # in the units of the coordinates
 MAX_CORRECTION = 0.1  # of the return to the manifold, relative to the step
 
 
-def random_walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Place]:
+def random_walk(
+    manifold: Manifold, start: Configuration, positions: int
+) -> Iterator[Configuration]:
     """Yield configurations that satisfy the constraints, by small steps in random directions."""
     random = np.random.default_rng(17)
     free = np.ones(len(start.q), dtype=bool)
@@ -23,9 +25,9 @@ def random_walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Pl
         direction = random.normal(size=len(start.q))
         has_moved, steps = False, 0
         for _ in range(8 * STEPS):
-            frame = Frame(configuration, free, manifold.holonomic)
+            frame = TangentSpace(configuration, free, manifold.holonomic)
             unit = np.sqrt(np.diag(configuration.metric))
-            tangent = frame.along(direction / unit)
+            tangent = frame.projected(direction / unit)
             size = float(np.max(np.abs(tangent), initial=0))
             drift = span / positions / STEPS * min(1.0, step / INITIAL_STEP)
             if size <= 1e-12 * float(np.max(1 / unit)) and not drift:
@@ -48,10 +50,11 @@ def random_walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Pl
         if not has_moved:  # at a singular configuration few directions are possible
             step = INITIAL_STEP
             continue
-        q, converged = manifold.polished(configuration, free)
+        q, converged = manifold.refine(configuration, free)
         if converged:
             configuration = (
-                manifold.place(np.array([float(x) for x in q]), configuration.t) or configuration
+                manifold.configuration(np.array([float(x) for x in q]), configuration.t)
+                or configuration
             )
         yield configuration
         count += 1
@@ -60,16 +63,16 @@ def random_walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Pl
 
 
 def trace_branch(
-    manifold: Manifold, start: Place, max_step: float = MAX_STEP, sign: int = 1
-) -> Iterator[Place]:
-    """Yield configurations along one branch, each a small step from the last. to: 1 or -1, the
-    direction.
+    manifold: Manifold, start: Configuration, max_step: float = MAX_STEP, sign: int = 1
+) -> Iterator[Configuration]:
+    """Yield configurations along one branch, each a small step from the last, in the direction
+    `sign` (1 or -1).
     """
     free, configuration, step = np.ones(len(start.q), dtype=bool), start, INITIAL_STEP
     tangent = np.random.default_rng(17).normal(size=len(start.q)) / np.sqrt(np.diag(start.metric))
     tangent = sign * tangent
     while step > 1e-9:
-        tangent = Frame(configuration, free, manifold.holonomic).along(tangent)
+        tangent = TangentSpace(configuration, free, manifold.holonomic).projected(tangent)
         size = float(np.max(np.abs(tangent), initial=0))
         if size == 0:
             return
@@ -84,19 +87,19 @@ def trace_branch(
 
 
 def step_on_manifold(
-    manifold: Manifold, place: Place, tangent: Vector, drift: float, free: Flags
-) -> Place | None:
+    manifold: Manifold, place: Configuration, tangent: Vector, drift: float, free: Flags
+) -> Configuration | None:
     """Return the configuration after a step; None where the step may be too long to stay on the
     branch.
     """
-    predicted = manifold.place(place.q + tangent, place.t + drift)
+    predicted = manifold.configuration(place.q + tangent, place.t + drift)
     if predicted is None:
         return None
-    frame = Frame(predicted, free, manifold.holonomic)
+    frame = TangentSpace(predicted, free, manifold.holonomic)
     length = frame.length(tangent) + 1e-9 * frame.length(np.ones(len(tangent)))
-    if not drift and frame.length(frame.onto(predicted.phi)) > MAX_CORRECTION * length:
+    if not drift and frame.length(frame.correction(predicted.phi)) > MAX_CORRECTION * length:
         return None
-    corrected, converged = manifold.descend(predicted.q, free, predicted.t)
+    corrected, converged = manifold.gauss_newton(predicted.q, free, predicted.t)
     if not converged or corrected is None:
         return None
     return (

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from eomc.program.interpret import context
-from eomc.program.manifold import NO_MASS, RANK_TOLERANCE, Frame, Manifold, Place, Vector
+from eomc.program.manifold import (
+    RANK_TOLERANCE,
+    SINGULAR_MASS_TOLERANCE,
+    Configuration,
+    Manifold,
+    TangentSpace,
+    Vector,
+)
 from eomc.program.manifold_sampling import random_walk, trace_branch
 
 SAMPLE_COUNT = 12  # configurations besides the start
@@ -65,7 +72,7 @@ class Ranks:
         Time of the last configuration, s.
     flat : tuple of int
         Constraints whose gradient vanishes wherever they hold.
-    loose : tuple of int
+    massless_coordinates : tuple of int
         Coordinates that neither inertia nor a constraint fixes.
     sums : tuple of tuple of float
         Where `good` is false for single constraints, weighted sums of `shared` that are
@@ -82,29 +89,29 @@ class Ranks:
     slopes: tuple[float, ...] = ()
     latest: float = 0.0
     flat: tuple[int, ...] = ()
-    loose: tuple[int, ...] = ()
+    massless_coordinates: tuple[int, ...] = ()
     sums: tuple[tuple[float, ...], ...] = ()
 
 
-def ranks(manifold: Manifold, start: Place) -> Ranks:
+def ranks(manifold: Manifold, start: Configuration) -> Ranks:
     """Compute the rank of the constraints around an assembled start."""
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
     slopes = np.max([place.slopes**2 for place in places], axis=0)
     scale = np.diag(start.metric) ** -0.5
-    slopes = np.where(slopes > 0, slopes, (manifold.usual * np.max(scale)) ** 2)
+    slopes = np.where(slopes > 0, slopes, (manifold.typical_gradients * np.max(scale)) ** 2)
     latest = max(place.t for place in places)
     return replace(
         found,
         weights=weights,
         slopes=tuple(slopes.tolist()),
         latest=latest,
-        loose=_unresisted(places),
+        massless_coordinates=_unresisted(places),
     )
 
 
-def _unresisted(places: Sequence[Place]) -> tuple[int, ...]:
+def _unresisted(places: Sequence[Configuration]) -> tuple[int, ...]:
     """Return coordinates that can move without inertia and without violating constraints,
     everywhere.
     """
@@ -121,26 +128,27 @@ def _unresisted(places: Sequence[Place]) -> tuple[int, ...]:
             null_space @ (scale[:, None] * place.D * scale) @ null_space.T
         )
         smallest = int(np.argmin(np.abs(values)))
-        if abs(values[smallest]) > NO_MASS:
+        if abs(values[smallest]) > SINGULAR_MASS_TOLERANCE:
             return ()
         direction = np.abs(vectors[:, smallest] @ null_space)
         indices = tuple(np.flatnonzero(direction > 1e-6 * np.max(direction)).tolist())
     return indices
 
 
-def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
+def _ranks(manifold: Manifold, start: Configuration) -> tuple[Ranks, list[Configuration]]:
     """Compute the ranks without weights and slopes. Returns them and the sampled configurations."""
     free = np.ones(len(start.q), dtype=bool)
-    first_frame = Frame(start, free, manifold.rows)
+    first_frame = TangentSpace(start, free, manifold.rows)
     full_rank = (
         len(first_frame.parts[1]) == len(manifold.rows)
         and first_frame.parts[1][-1] > RANK_TOLERANCE
     )
     positions = FEW_SAMPLES if full_rank and len(manifold.rows) > MANY_CONSTRAINTS else SAMPLE_COUNT
     others = [
-        Frame(place, free, manifold.rows) for place in random_walk(manifold, start, positions)
+        TangentSpace(place, free, manifold.rows)
+        for place in random_walk(manifold, start, positions)
     ]
-    frames, places = [first_frame, *others], [start, *(f.place for f in others)]
+    frames, places = [first_frame, *others], [start, *(f.configuration for f in others)]
     if flat := _flat(manifold, places):
         return Ranks(0, (), (), False, (0.0, 0.0), len(places), flat=flat), places
     counts = [int(np.sum(f.parts[1] > RANK_TOLERANCE)) for f in frames]
@@ -161,25 +169,25 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     left_out, score = _select_dropped([f.B for f in regular], rank, shared.tolist())
     result = Ranks(rank, (), tuple(shared.tolist()), True, sigma, len(places))
 
-    def is_good(nearly: bool) -> bool:
+    def is_good(allow_double: bool) -> bool:
         """Return True if the selected equations are independent and imply the others."""
-        samples = [f.place for f in regular[:3]]
+        samples = [f.configuration for f in regular[:3]]
         return score >= MIN_SINGULAR_RATIO and all(
-            _implied(manifold, x, left_out, nearly) for x in samples
+            _implied(manifold, x, left_out, allow_double) for x in samples
         )
 
-    if is_good(nearly=False):
+    if is_good(allow_double=False):
         return replace(result, left_out=left_out), places
     if sums := _sums(manifold, start, rank, shared.tolist()):
         idle = tuple(k for k in shared.tolist() if not any(row[k] for row in sums))
         return replace(result, left_out=idle, sums=sums), places
-    if is_good(nearly=True):
+    if is_good(allow_double=True):
         return replace(result, left_out=left_out), places
     return replace(result, good=False), places
 
 
 def _sums(
-    manifold: Manifold, start: Place, rank: int, shared: list[int]
+    manifold: Manifold, start: Configuration, rank: int, shared: list[int]
 ) -> tuple[tuple[float, ...], ...]:
     """Find weighted sums of the constraints `shared` that are independent along the motion.
 
@@ -199,11 +207,14 @@ def _sums(
     scales = np.where(scales > 0, scales, np.inf)
     free, spans = np.ones(len(start.q), dtype=bool), list[Vector]()
     for place in places:
-        B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / scales)[:, None]
+        B = (
+            TangentSpace(place, free, manifold.rows).B[shared]
+            * (place.sizes[shared] / scales)[:, None]
+        )
         U, s, _ = np.linalg.svd(B)
         if s[count - 1] > RANK_TOLERANCE * s[0]:
             U = U[:, :count]
-            if spans and np.linalg.det(spans[-1].T @ U) < 0:  # turned as the last one is
+            if spans and np.linalg.det(spans[-1].T @ U) < 0:  # same orientation as the last one
                 U[:, 0] *= -1
             spans.append(U)
     score, weights = _best(np.array(spans), np.random.default_rng(5))
@@ -243,7 +254,7 @@ def _best(spans: Vector, random: np.random.Generator) -> tuple[float, Vector]:
     return score, weights
 
 
-def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
+def _flat(manifold: Manifold, places: Sequence[Configuration]) -> tuple[int, ...]:
     """Return holonomic constraints whose gradient vanishes where they hold, compared with nearby
     gradients.
 
@@ -261,13 +272,15 @@ def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
             # Closer, nearby gradients would be as small as the remaining residual of a square.
             distance = max(distance, POSITION_TOLERANCE * float(np.max(np.abs(place.q))))
             q = [place.q + distance * random.normal(size=len(place.q)) for _ in range(NEARBY_COUNT)]
-            nearby = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
+            nearby = [p for p in (manifold.configuration(x, place.t) for x in q) if p is not None]
             gradients = np.max([p.slopes for p in nearby], axis=0, initial=0.0)
             flat = [k for k in flat if place.slopes[k] < ZERO_GRADIENT_RATIO * gradients[k]]
     return tuple(k for k in flat if not _is_implied_in_loop(manifold, start, k, flat))
 
 
-def _is_implied_in_loop(manifold: Manifold, start: Place, row: int, flat: Sequence[int]) -> bool:
+def _is_implied_in_loop(
+    manifold: Manifold, start: Configuration, row: int, flat: Sequence[int]
+) -> bool:
     """Return True if a constraint of a loop holds wherever the other constraints hold.
 
     A constraint written by the user is reported in any case, since it may be a mistake.
@@ -279,20 +292,23 @@ def _is_implied_in_loop(manifold: Manifold, start: Place, row: int, flat: Sequen
     if not others:
         return False
     reduced = Manifold(replace(system, constraints=others))
-    start_on_reduced = reduced.place(start.q, start.t)
+    start_on_reduced = reduced.configuration(start.q, start.t)
     if start_on_reduced is None:
         return False
     configurations = [
-        manifold.place(x.q, x.t) for x in random_walk(reduced, start_on_reduced, FEW_SAMPLES)
+        manifold.configuration(x.q, x.t)
+        for x in random_walk(reduced, start_on_reduced, FEW_SAMPLES)
     ]
     residuals = [abs(x.phi[row]) for x in configurations if x is not None]
-    return bool(residuals) and max(residuals) <= POSITION_TOLERANCE * float(manifold.usual[row])
+    return bool(residuals) and max(residuals) <= POSITION_TOLERANCE * float(
+        manifold.typical_gradients[row]
+    )
 
 
 def _select_dropped(
     matrices: Sequence[Vector], rank: int, removable: Sequence[int]
 ) -> tuple[tuple[int, ...], float]:
-    """Select the constraints of `some` to drop, and return them with the quality of the rest.
+    """Select the constraints of `removable` to drop, and return them with the quality of the rest.
 
     matrices: Jacobians (m, nq) with rows of length 1. The quality is the smallest singular value of
     the remaining rows over that of all rows, at the worst matrix. Among equally good sets, the last
@@ -327,19 +343,21 @@ def _select_dropped(
     return tuple(sorted(dropped)), score(dropped, True)
 
 
-def _implied(manifold: Manifold, place: Place, removed: Sequence[int], allow_double: bool) -> bool:
-    """Return True if the gradients of constraints `out` are linear combinations of the others, to
-    40 digits.
+def _implied(
+    manifold: Manifold, place: Configuration, removed: Sequence[int], allow_double: bool
+) -> bool:
+    """Return True if the gradients of the constraints `removed` are linear combinations of the
+    others, to 40 digits.
 
-    nearly: accept double precision where the constraints hold in double precision only.
+    allow_double: accept double precision where the constraints hold in double precision only.
     """
     mp, n = context(), len(place.q)
     free = np.ones(n, dtype=bool)
-    q, exact = manifold.polished(place, free)
+    q, exact = manifold.refine(place, free)
     if not exact and not (allow_double and manifold.rounded(place)):
         return False
     tolerance = EXACT_TOLERANCE if exact else DOUBLE_TOLERANCE
-    flat = manifold.exactly("constraint_jacobian", q, [0] * n, place.t)
+    flat = manifold.exact_value("constraint_jacobian", q, [0] * n, place.t)
     rows = [flat[k * n : (k + 1) * n] for k in manifold.rows]
     remaining = [k for k in manifold.rows if k not in removed]
     A = np.array([[float(x) for x in rows[k]] for k in remaining])

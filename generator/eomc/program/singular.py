@@ -12,7 +12,7 @@ import numpy as np
 
 from eomc.model import coulomb_friction, discrete
 from eomc.model.system import System
-from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import Configuration, Flags, Manifold, TangentSpace, Vector
 from eomc.program.manifold_sampling import step_on_manifold, trace_branch
 
 MAX_CONFIGURATIONS = 120  # in each direction from the start
@@ -56,7 +56,7 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
     rank = system.closure.rank if system.closure else 0
     if manifold.timed or not all(c.holonomic for c in rows) or len(system.q) - rank != 1:
         return None
-    start = manifold.place(np.array([c.start for c in system.coordinates], float))
+    start = manifold.configuration(np.array([c.start for c in system.coordinates], float))
     if start is None:
         return None
     branches = [
@@ -67,11 +67,11 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
     scales = np.where(scales > 0, scales, 1.0)
     free = np.ones(len(start.q), dtype=bool)
 
-    def sigma(place: Place | None) -> float:
+    def sigma(place: Configuration | None) -> float:
         """Return the ratio of singular values at a configuration."""
         if place is None:
             return np.inf
-        frame = Frame(place, free, manifold.rows)
+        frame = TangentSpace(place, free, manifold.rows)
         s = np.linalg.svd(frame.B * (place.sizes / scales)[:, None], compute_uv=False)
         return float(s[rank - 1] / s[0])
 
@@ -95,12 +95,12 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
 
 
 def _minimise(
-    manifold: Manifold, sigma: Callable[[Place | None], float], middle: Place,
+    manifold: Manifold, sigma: Callable[[Configuration | None], float], middle: Configuration,
     ends: tuple[Vector, Vector], free: Flags,
-) -> tuple[float, Place]:  # fmt: skip
+) -> tuple[float, Configuration]:  # fmt: skip
     """Minimise sigma between a configuration's neighbours by golden-section search."""
 
-    def configuration(s: float) -> Place | None:
+    def configuration(s: float) -> Configuration | None:
         """Return the configuration at s, from one neighbour (-1) over the middle (0) to the other
         (1).
         """

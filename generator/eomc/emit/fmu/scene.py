@@ -54,7 +54,7 @@ def view(target: Target, token: str) -> SceneCalls:
         values=asked["events"],
         jumps=asked["jumps"],
         project=public.project.call() if s.constraints else "",
-        held=tuple(int(x) for x in (*(c.held for c in rows), *(c.held_rate for c in rows))),
+        held=tuple(int(x) for x in (*(c.start_fixed for c in rows), *(c.rate_fixed for c in rows))),
         run="" if by_tolerance else public.run(method).call(
             h="(unitReal)unitStep", u_stride="0", every="0", q_rows="NULL", qd_rows="NULL",
             status="&status",
