@@ -349,7 +349,7 @@ def _print_summary(
     module: Any, run: Run, balance: Balance | None, summary: Mapping[str, Any]
 ) -> None:
     say(
-        f"{shown(module.title)}: {run.steps} steps of {summary['method']}, {run.told}, "
+        f"{shown(module.title)}: {run.steps} steps of {summary['method']}, {run.description}, "
         f"to t = {run.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))

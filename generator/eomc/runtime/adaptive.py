@@ -128,7 +128,7 @@ class AdaptiveRun(AdaptiveTrajectory):
             times = np.clip(np.where(np.isfinite(step), times - step, times), *ends)
         return self._at(times, np.array(self(times))).to_dict()
 
-    def _even(self) -> Run:
+    def _equidistant(self) -> Run:
         if (np.diff(self.t) == 0).any() or len(self) < 2:
             return self
         times = np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
@@ -147,7 +147,7 @@ class SteppedRun(AdaptiveRun):
     """
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """What steps they were, in words."""
         return f"h = {self.h:g} s"
 
@@ -257,14 +257,14 @@ def run(
             call_start = perf_counter()
             most, *to = rows.c_arguments(room, rows_per_step)
             code = call(
-                *place, acting.stop, tol, h_most, acting.at, most, *to,
+                *place, acting.stop, tol, h_most, acting.address, most, *to,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
             counters.add(work, bool(events))
             rows.filled += _take_rows(work, events)
             status = STATUS[code]
             ended, cut = code or (events and work.stopped), work.t < acting.stop
-            if ended or work.steps >= enough or not acting.on(work):
+            if ended or work.steps >= enough or not acting.advance(work):
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)

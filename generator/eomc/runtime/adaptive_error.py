@@ -11,7 +11,7 @@ import numpy as np
 from .adaptive_arguments import LEAST
 from .adaptive_trajectory import AdaptiveTrajectory
 from .arguments import Array
-from .estimate import Estimate, growth_of, moving, rounding_words, scales
+from .estimate import Estimate, growth_of, moving_mask, rounding_words, scales
 from .growth import mean_mass_matrix
 from .input_schedule import ZeroOrderHold
 from .status import FULL, REMEDY
@@ -52,7 +52,7 @@ def error_by_tighter_tolerance(
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
     finer, other = again.finer(begin, least)
-    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving(model)
+    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving_mask(model)
     moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0  # nor is what sticks moved
     x = x[again.beside]
 

@@ -81,7 +81,7 @@ class AdaptiveTrajectory(Run):
     @property
     def message(self) -> str:
         """What happened, in a sentence."""
-        progress = f"{self.steps} steps, {self.told}"
+        progress = f"{self.steps} steps, {self.description}"
         if self.status == "ok":
             return progress
         if self.status == "not finite" and self.stopped:
@@ -106,7 +106,7 @@ class AdaptiveTrajectory(Run):
         return ByName("events", names, logs)
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """How its steps were chosen, in words."""
         stiff = f", {self.stiff_steps} by Newton's method" if self.stiff_steps else ""
         return f"{self.rejected} rejected{stiff}, tolerance {self.tol:g}"
@@ -130,10 +130,10 @@ class AdaptiveTrajectory(Run):
         if self._held is not None:
             self._applied = sample_zero_order_hold(self._times, self.t0, self._period, self._held)
 
-    def _again(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
+    def _repeat(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
         raise ValueError("an adaptive run has no steps of one size")
 
-    def _kept(self) -> dict[str, Any]:
+    def _to_arrays(self) -> dict[str, Any]:
         own = {
             "tol": self.tol, "rejected": self.rejected, "stiff_steps": self.stiff_steps,
             "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
@@ -142,24 +142,25 @@ class AdaptiveTrajectory(Run):
             "period": self._period, "values": self._held, "by": self._by,
             "periods": self._periods,
         }  # fmt: skip
-        return super()._kept() | own
+        return super()._to_arrays() | own
 
     @classmethod
-    def _of_kept(cls, model: Stepping, kept: Mapping[str, Any], **own: Any) -> Self:
-        held, values = kept.get("held"), kept.get("values")
+    def _from_arrays(cls, model: Stepping, arrays: Mapping[str, Any], **own: Any) -> Self:
+        held, values = arrays.get("held"), arrays.get("values")
+        u = held if values is None or held is not None else LEFT_OUT
         made = cls(
-            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
-            kept["params"], 1, held if values is None or held is not None else LEFT_OUT,
-            kept["method"], kept["evaluations"],
-            tol=kept["tol"], rejected=kept["rejected"], stiff_steps=kept.get("stiff_steps", 0),
-            _times=kept["times"], _t_end=kept["t_end"],
+            model, arrays["t0"], (arrays["q"], arrays["qd"]), arrays["h"], arrays["steps"],
+            arrays["status"], arrays["params"], 1, u, arrays["method"], arrays["evaluations"],
+            tol=arrays["tol"], rejected=arrays["rejected"],
+            stiff_steps=arrays.get("stiff_steps", 0), _times=arrays["times"],
+            _t_end=arrays["t_end"],
         )  # fmt: skip
-        made._h_most, made._stiff = kept["h_most"], bool(kept.get("stiff", False))
-        made._by = kept.get("by", "")
-        made._begin, made._happened = kept["begin"], (kept["which"], kept["event_rows"])
-        made.stopped, made.limit = kept["stopped"], kept["limit"]
-        made._period, made._held = kept.get("period", 0.0), values
-        made._periods = kept.get("periods", 0 if values is None else len(values))
+        made._h_most, made._stiff = arrays["h_most"], bool(arrays.get("stiff", False))
+        made._by = arrays.get("by", "")
+        made._begin, made._happened = arrays["begin"], (arrays["which"], arrays["event_rows"])
+        made.stopped, made.limit = arrays["stopped"], arrays["limit"]
+        made._period, made._held = arrays.get("period", 0.0), values
+        made._periods = arrays.get("periods", 0 if values is None else len(values))
         made._told_inputs()
         return made
 

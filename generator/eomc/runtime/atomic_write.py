@@ -1,6 +1,6 @@
-"""Files that are written whole: what is there stays until the new one is complete.
+"""Write files atomically: an existing file stays until the new one is complete.
 
-A scene, or a file of another kind than its name says, is not replaced.
+A scene, or a file whose content does not match its suffix, is not replaced.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from threading import get_ident
 
 File = str | os.PathLike[str]
 
-# the first bytes of a file of each kind, behind white space
+# the first bytes of a file of each kind, after white space
 _BEGINNINGS: Mapping[str, bytes | tuple[bytes, ...]] = {
     ".fmu": b"PK", ".npz": b"PK", ".whl": b"PK", ".png": b"\x89PNG", ".gif": b"GIF8",
     ".pdf": b"%PDF", ".svg": b"<", ".html": b"<", ".json": (b"{", b"["),
@@ -26,20 +26,20 @@ _READ = 1 << 16  # bytes of an existing file that are looked at
 
 
 def check_replaceable(file: File) -> None:
-    """Raise FileExistsError where `file` is a scene, or no file of the kind that its name says.
+    """Raise FileExistsError if `file` is a scene, or its content does not match its suffix.
 
-    An empty file, a device or a pipe may be replaced or written.
+    An empty file may be replaced; a device or a pipe may be written.
     """
     path = Path(file)
     if not path.is_file():
         return
-    with path.open("rb") as there:
-        begin = there.read(_READ)
+    with path.open("rb") as exists:
+        head = exists.read(_READ)
     beginnings = _BEGINNINGS.get(path.suffix.lower(), b"")
     what = ""
-    if path.suffix != ".toml" and _SCENE.search(begin):
+    if path.suffix != ".toml" and _SCENE.search(head):
         what = "a scene"
-    elif begin and not begin.lstrip().startswith(beginnings):
+    elif head and not head.lstrip().startswith(beginnings):
         what = f"no {path.suffix} file"
     if what:
         raise FileExistsError(
@@ -50,27 +50,27 @@ def check_replaceable(file: File) -> None:
 
 @contextmanager
 def atomic_write(file: File, cached: bool = False) -> Iterator[Path]:
-    """A name beside `file`, with its suffix, for what takes its place when all is written.
+    """Yield the path of a temporary file in the same folder that replaces `file` at the end.
 
-    Where that fails or is interrupted the file is as it was, and nothing is beside it. Of a link
-    what it links to is replaced; a device or pipe is written itself. Raises OSError of `file`,
-    FileExistsError where that is a scene or a file of another kind (`check_replaceable`). cached:
-    whether it is a file that no user names, which is replaced whatever it is.
+    If writing fails or is interrupted, `file` is unchanged and the temporary file is removed. The
+    target of a symbolic link is replaced; a device or pipe is written directly. Raises OSError for
+    `file`, and FileExistsError as `check_replaceable` does. cached: skip that check, for files
+    that no user names.
     """
-    given = Path(file)
+    target = Path(file)
     if not cached:
-        check_replaceable(given)
-    if given.exists() and not given.is_file():
-        yield given
+        check_replaceable(target)
+    if target.exists() and not target.is_file():
+        yield target
         return
-    path = Path(os.path.realpath(given))
+    path = Path(os.path.realpath(target))
     new = path.with_name(f".{os.getpid()}.{get_ident()}{path.suffix}")
     try:
-        there = path.exists()
-        if there and not os.access(path, os.W_OK):
+        exists = path.exists()
+        if exists and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(file))
         yield new
-        if there:
+        if exists:
             os.chmod(new, stat.S_IMODE(path.stat().st_mode))
         os.replace(new, path)
     except OSError as fault:

@@ -171,7 +171,7 @@ def _held(run: Any) -> tuple[Array, Array]:
         if values is None:
             return unknown
         starts = run.t0 + run._period * np.arange(len(values))
-    elif (values := getattr(run, "_gave", None)) is not None:
+    elif (values := getattr(run, "_law_values", None)) is not None:
         starts = run.t0 + run.h * run._hold * np.arange(len(values))
     else:
         values = run._u if np.ndim(run._u) == 2 else run._applied
@@ -211,7 +211,7 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     run = with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
     if not len(jumps) or not run._model.has_power:
-        even = run if len(jumps) else run._even()
+        even = run if len(jumps) else run._equidistant()
         return even.t, even.q, even.qd
     firsts, lasts = np.array([0, *jumps]), np.array([*(jumps - 1), n - 1])
     times, grain = [], 16 * np.finfo(run._model.dtype).eps

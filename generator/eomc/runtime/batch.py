@@ -29,7 +29,7 @@ from .batch_run import BatchRun
 from .batch_work import WORTH, Work
 from .metadata import SOME
 from .model import RARELY
-from .output_times import as_asked
+from .output_times import as_times_and_steps
 from .package import warn
 from .plugins import with_events
 from .status import Interrupted
@@ -89,7 +89,7 @@ class BatchModel(Instances):
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         at = None
         if times is not None:
-            at, steps = as_asked(self, times, t0, h, duration, steps, every, None)
+            at, steps = as_times_and_steps(self, times, t0, h, duration, steps, every, None)
         steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
         u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at, 1)

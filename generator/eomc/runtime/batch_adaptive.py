@@ -149,16 +149,16 @@ class AdaptiveBatchRun(BatchRun):
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
-    def _kept(self) -> dict[str, Any]:
-        found = super()._kept() | {name: getattr(self, name) for name in _NAMES}
+    def _to_arrays(self) -> dict[str, Any]:
+        found = super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
         if self._happened is not None:
             found |= zip(_HAPPENED, self._happened, strict=True)
             found |= {"stopped": self._stopped, "limit": self._limit}
         return found
 
     @classmethod
-    def _of_kept(cls, model: Any, kept: Mapping[str, Any]) -> AdaptiveBatchRun:
-        made = BatchRun._of_kept(model, kept)._all()
+    def _from_arrays(cls, model: Any, kept: Mapping[str, Any]) -> AdaptiveBatchRun:
+        made = BatchRun._from_arrays(model, kept)._all()
         found = cls(*made, **{name: kept[name] for name in _NAMES if name in kept})
         if "which" in kept:
             found._happened = tuple(kept[name] for name in _HAPPENED)

@@ -48,12 +48,12 @@ class TimedBatchRun(BatchRun):
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
-    def _kept(self) -> dict[str, Any]:
-        return super()._kept() | {name: getattr(self, name) for name in _NAMES}
+    def _to_arrays(self) -> dict[str, Any]:
+        return super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
-    def _of_kept(cls, model: Any, kept: Mapping[str, Any]) -> TimedBatchRun:
-        made = BatchRun._of_kept(model, kept)._all()
+    def _from_arrays(cls, model: Any, kept: Mapping[str, Any]) -> TimedBatchRun:
+        made = BatchRun._from_arrays(model, kept)._all()
         own: Any = {name: kept.get(name) for name in _NAMES}
         return cls(*made, **own)
 

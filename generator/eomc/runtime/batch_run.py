@@ -74,12 +74,12 @@ class BatchRun(Values, Fans, Columns):
         They are the signals there, or what was held from there on; in the last row what was held
         over the last step.
         """
-        return self._within(self._given)
+        return self._within(self._requested_inputs)
 
     @property
     def saturated(self) -> Array:
         """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
-        inputs = self._given
+        inputs = self._requested_inputs
         return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
 
     def _within(self, u: Array) -> Array:
@@ -87,10 +87,10 @@ class BatchRun(Values, Fans, Columns):
         return self._model._within(u, self._params)
 
     @property
-    def _given(self) -> Array:
+    def _requested_inputs(self) -> Array:
         """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
-            return self._values(self._model.signal, (self._model.nu,))
+            return self._evaluate(self._model.signal, (self._model.nu,))
         inputs = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
         inputs[np.isnan(self.q[..., 0])] = np.nan
         return inputs
@@ -133,18 +133,18 @@ class BatchRun(Values, Fans, Columns):
         """Where and when each event happened, by its name; of scenes without events none."""
         return ByName("events", (), ())
 
-    def _kept(self) -> dict[str, Any]:
+    def _to_arrays(self) -> dict[str, Any]:
         """What a saved run keeps of it besides its columns; None: nothing."""
         return dict(zip(_KEPT, self._all()[1:], strict=True))
 
     @classmethod
-    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
+    def _from_arrays(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
         values: Any = map(kept.get, _KEPT)
         return cls(model, *values)
 
     @classmethod
     def _of_pickled(cls, kept: Mapping[str, Any]) -> BatchRun:
-        return cls._of_kept(own_model(), kept)
+        return cls._from_arrays(own_model(), kept)
 
     @property
     def message(self) -> str:
@@ -176,7 +176,7 @@ class BatchRun(Values, Fans, Columns):
     def __reduce__(self) -> tuple[Any, ...]:
         kind = type(self)
         path = f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_pickled"
-        return reduced(path, self._kept())
+        return reduced(path, self._to_arrays())
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(self))

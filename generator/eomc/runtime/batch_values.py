@@ -29,12 +29,12 @@ class Values:
     @property
     def energy(self) -> Array:
         """K + P, (batch, n), J. What is conserved may be `jacobi` instead."""
-        return self._values(self._model.energy, ())
+        return self._evaluate(self._model.energy, ())
 
     @property
     def jacobi(self) -> Array:
         """qd.dK/dqd - K + P, (batch, n), J: the energy, where K is purely quadratic."""
-        return self._values(self._model.jacobi, ())
+        return self._evaluate(self._model.jacobi, ())
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
@@ -45,7 +45,7 @@ class Values:
         names = self._model.outputs
         if not names:
             return {}
-        values = self._driven(self._model.output, (len(names),))
+        values = self._evaluate_with_inputs(self._model.output, (len(names),))
         return dict(zip(names, np.ascontiguousarray(np.moveaxis(values, 2, 0)), strict=True))
 
     @property
@@ -54,7 +54,7 @@ class Values:
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "constraints", names,
-            lambda: self._values(model.constraints, (len(names),)),
+            lambda: self._evaluate(model.constraints, (len(names),)),
         )  # fmt: skip
 
     @property
@@ -63,7 +63,7 @@ class Values:
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "multipliers", names,
-            lambda: self._driven(model._multipliers, (len(names),)),
+            lambda: self._evaluate_with_inputs(model._multipliers, (len(names),)),
         )  # fmt: skip
 
     @property
@@ -75,13 +75,15 @@ class Values:
         """
         model, loops = self._model, self._model.loops
         shape = (len(loops), 3 if model._plane else 6)
-        return _by_name("reactions", loops, lambda: self._driven(model._reactions, shape))
+        return _by_name(
+            "reactions", loops, lambda: self._evaluate_with_inputs(model._reactions, shape)
+        )
 
-    def _driven(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
+    def _evaluate_with_inputs(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
         """What a function of the state and the inputs gives at all rows."""
-        return self._values(function, shape, None if self._held is None else {"u": self._held})
+        return self._evaluate(function, shape, None if self._held is None else {"u": self._held})
 
-    def _values(
+    def _evaluate(
         self, function: Callable[..., Any], shape: tuple[int, ...],
         inputs: Mapping[str, Array] | None = None,
     ) -> Array:  # fmt: skip

@@ -23,8 +23,8 @@ class ConstrainedRun:
     """
 
     _model: Any
-    _values: Callable[..., Array]
-    _driven: Callable[..., Array]
+    _evaluate: Callable[..., Array]
+    _evaluate_with_inputs: Callable[..., Array]
     _params: Array
     q: Any
     qd: Any
@@ -38,14 +38,14 @@ class ConstrainedRun:
         """What each constraint lacks along the run, (n,), by name: rounding."""
         names = self._model.constraint_names
         return ByName(
-            "constraints", names, self._values(self._model.constraints).T if names else ()
+            "constraints", names, self._evaluate(self._model.constraints).T if names else ()
         )
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint along the run, (n,), by name."""
         names = self._model.constraint_names
-        values = self._driven(self._model._multipliers).T if names else ()
+        values = self._evaluate_with_inputs(self._model._multipliers).T if names else ()
         return ByName("multipliers", names, np.ascontiguousarray(values))
 
     @property
@@ -57,7 +57,7 @@ class ConstrainedRun:
         loops = self._model.loops
         if not loops:
             return ByName("reactions", (), ())
-        values = self._driven(self._model._reactions)
+        values = self._evaluate_with_inputs(self._model._reactions)
         return ByName("reactions", loops, np.moveaxis(values, -2, 0))
 
     @property

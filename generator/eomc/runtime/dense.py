@@ -52,13 +52,13 @@ def _state(run: Trajectory, n: int, rest: float) -> Any:
     model, row = run._model, min(n // run.every, len(run) - 1)
     q, qd, first = run.q[row], run.qd[row], row * run.every
     for k in range(first, n):
-        q, qd = model.step(q, qd, run.h, *_given(run, k), run._params, run.method)
+        q, qd = model.step(q, qd, run.h, *_time_and_inputs(run, k), run._params, run.method)
     if rest > 0:
-        q, qd = model.step(q, qd, rest, *_given(run, n), run._params, run.method)
+        q, qd = model.step(q, qd, rest, *_time_and_inputs(run, n), run._params, run.method)
     return q, qd
 
 
-def _given(run: Trajectory, n: int) -> tuple[float, Any]:
+def _time_and_inputs(run: Trajectory, n: int) -> tuple[float, Any]:
     """The time of the n-th step and the inputs over it."""
     t, u = run.t0 + n * run.h, run._u
     if u is None or (not callable(u) and not isinstance(u, str) and u.ndim == 1):

@@ -1,4 +1,4 @@
-"""How far a run may be trusted: its error by step doubling."""
+"""Error of a run by fixed steps, from step doubling."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from .trajectory_data import Trajectory
 
 Array = NDArray[Any]
 
-_FINEST = 16  # h/16 is the shortest step taken to see a run converge
-_LONG = 2_000_000  # steps of a run beyond which no more than h/4 is taken
-_ROWS = 200  # from which on a run's own rows show how large each coordinate becomes
-_TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
-_FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
-_SMOOTH = 1e6  # growth beyond which a difference may as well have met a jump of the forces
-_REST = 64.0  # roundings of a position: velocities that move it by less are none
-_WALK = 0.3  # rms of the rounding of a sum, in units of eps/2 times its size (1/sqrt(12) to 1/2)
+_MAX_REFINEMENT = 16  # the shortest step of the convergence test is h/16
+_MAX_STEPS = 2_000_000  # refinements of h beyond h/4 have at most so many steps
+_MIN_ROWS = 200  # runs with fewer rows are repeated to find the scale of each coordinate
+_UNRESOLVED = 0.1  # errors above this fraction of a coordinate's scale count as unresolved
+_SATURATION = 0.01  # differences above this fraction of the scale no longer grow linearly
+_MAX_SMOOTH_GROWTH = 1e6  # larger growth may come from a discontinuity of the forces
+_REST_ROUNDINGS = 64.0  # velocities that move a position by fewer ulp count as zero
+_ROUNDING_RMS = 0.3  # rms rounding error of a sum, relative to eps/2 times its size
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A run's own error, |q - exact| and |qd - exact| by step doubling, and what it is worth.
+    """Error estimate of a run, |q - exact| and |qd - exact| by step doubling, and its reliability.
 
     q, qd (n, nq): at every row, in the coordinates' units; inf where a finer run stopped before.
     end: of the last row, by name, velocities as theta_dot. digits: how many of each coordinate are
@@ -39,7 +39,7 @@ class Estimate:
     start at the end, in the norm |d|^2 = dqd' D dqd + (dq/T)' D (dq/T), with the mean mass matrix
     D and the times T = |dq|/|dqd| of such differences (docs/python.md): 1 of an oscillator. At
     least so large, where the difference becomes as large as the motion.
-    verdict: why the motion is not resolved, in words, or "".
+    verdict: the reasons why the motion is not resolved, or "".
     events: by name the error in time of each event of the run, (n,), s; inf where a finer run does
     not detect the event. missed: by name the times of events that a finer run detects and this one
     does not, (n,), s.
@@ -58,16 +58,16 @@ class Estimate:
 
     @property
     def resolved(self) -> bool:
-        """Whether nothing speaks against the figures."""
+        """True if the verdict is empty."""
         return not self.verdict
 
     @property
     def warning(self) -> str:
-        """What is to be said of a run that is not resolved, or ""."""
+        """Warning if the motion is not resolved, else ""."""
         return f"this motion is not resolved: {self.verdict}" if self.verdict else ""
 
     def __str__(self) -> str:
-        """The end in a line: errors, right digits, what the motion makes of a difference."""
+        """One line on the end: errors, correct digits, amplification of a difference."""
         ends = ", ".join(
             f"{name} {self.end[name]:.1g} ({digits:.0f} digits)"
             for name, digits in self.digits.items()
@@ -80,38 +80,38 @@ class Estimate:
 
 
 def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None) -> Estimate:
-    """The error of a run, from the same run at h/2 and h/4, and finer ones where they differ.
+    """Estimate the error of a run, from repetitions at h/2, h/4 and finer until they converge.
 
-    What the finest run leaves is taken from the last difference and the observed order, and
-    nothing falls below what rounding adds up to. Costs eight to twelve times the run, or forty
-    where it does not converge.
+    The error of the finest repetition follows from the last difference and the observed order. The
+    estimate is at least the accumulated rounding error. The cost is eight to twelve times that of
+    the run, or forty times if the repetitions do not converge.
     """
     if not run.steps:
-        return _nothing(run)
+        return _zero_error(run)
     model, own = run._model, run.x.astype(float)
-    order, again = model.orders[run.method], _Again(run, progress)
+    order, repeat = model.orders[run.method], _Repetition(run, progress)
     eps = float(np.finfo(model.dtype).eps) / 2
     counts = _counts(run, run.every, len(run))
-    scale, grown, amplification = _growth(run, own, eps, again)
-    rounding = eps * np.maximum(grown, np.abs(own))  # of one step, carried to each row
-    walk = _WALK * rounding * np.sqrt(counts)[:, None]
-    one = min(_size(rounding / scale), _SMOOTH * eps)
-    found, observed, stopped = _finer(run, own, scale, one, eps, again)
+    scale, grown, amplification = _growth(run, own, eps, repeat)
+    rounding = eps * np.maximum(grown, np.abs(own))  # of one step, propagated to each row
+    walk = _ROUNDING_RMS * rounding * np.sqrt(counts)[:, None]
+    one = min(_rms(rounding / scale), _MAX_SMOOTH_GROWTH * eps)
+    solutions, observed, stopped = _finer(run, own, scale, one, eps, repeat)
 
     with np.errstate(invalid="ignore"):
-        whole = np.abs(own - found[-1])
-        rest = np.abs(found[-2] - found[-1])
+        whole = np.abs(own - solutions[-1])
+        rest = np.abs(solutions[-2] - solutions[-1])
     sure = min(max(observed, 0.5), float(order)) if math.isfinite(observed) else float(order)
     error = whole + rest / (2**sure - 1)
-    # a difference may vanish for a moment where two roundings agree, but not for long
-    least = np.maximum(eps * np.abs(own), np.minimum(walk, _around(np.maximum(whole, rest))))
+    # two rounding errors may agree at a row by chance, so the largest difference nearby counts
+    least = np.maximum(eps * np.abs(own), np.minimum(walk, _local_maximum(np.maximum(whole, rest))))
     error = np.maximum(error, np.where(counts[:, None] > 0, least, 0.0))
     error[~np.isfinite(error)] = np.inf
 
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps)) + 0.0  # no -0
-    if (walk[-1] > _TENTH * scale).any() and _leaps(run, scale, eps, again):
+    if (walk[-1] > _UNRESOLVED * scale).any() and _is_discontinuous(run, scale, eps, repeat):
         walk *= 0.0
     words = _verdict(
         run, names, error / scale, walk / scale, observed, order, amplification, stopped
@@ -128,42 +128,46 @@ def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None
     )
 
 
-class _Again:
-    """The same run in shorter steps or from a moved start, and how far all of them have come."""
+class _Repetition:
+    """Repeat a run in shorter steps or from a perturbed start, and report the progress of all."""
 
     def __init__(self, run: Trajectory, progress: Callable[[int, int], None] | None) -> None:
         self.run, self.progress, self.spent = run, progress, 0
 
     def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Trajectory:
-        """In steps of h/parts, keeping every so many of them."""
+        """Repeat the run in steps of h/parts with rows after `every` steps; nudge: of x(t0)."""
         progress = None if self.progress is None else self._report
-        made: Trajectory = self.run._again(parts, every, nudge, progress)
+        refined: Trajectory = self.run._repeat(parts, every, nudge, progress)
         self.spent += parts * self.run.steps
-        if made.status == "interrupted":
+        if refined.status == "interrupted":
             raise KeyboardInterrupt
-        return made
+        return refined
 
-    def _report(self, done: int, _: int) -> None:
+    def _report(self, steps: int, _: int) -> None:
         total = 12 * self.run.steps
         if self.progress is not None:
-            self.progress(min(self.spent + done, total), total)
+            self.progress(min(self.spent + steps, total), total)
 
 
-def _growth(run: Trajectory, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
-    """The scales (2 nq,), what a start moved by one scale would become at each row if that were
-    little, (n, 2 nq), and the growth of a small difference until the end."""
+def _growth(
+    run: Trajectory, own: Array, eps: float, repeat: _Repetition
+) -> tuple[Array, Array, float]:
+    """Return the scales (2 nq,), the linearised differences (n, 2 nq) and their growth to the end.
+
+    The differences are those at each row after a perturbation of the start by one scale.
+    """
     model, every, base, times = run._model, run.every, own, run.t
-    if len(run) < _ROWS:
-        every = max(1, run.steps // _ROWS)
-        made = again(1, every)
-        base, times = made.x.astype(float), made.t
+    if len(run) < _MIN_ROWS:
+        every = max(1, run.steps // _MIN_ROWS)
+        refined = repeat(1, every)
+        base, times = refined.x.astype(float), refined.t
     scale = scales(base, float(np.ptp(run.t)), eps, len(model.discrete_coordinates))
-    moves = moving(model)
+    moves = moving_mask(model)
     signs = moves * np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
     def moved(nudge: Array) -> Array:
-        """The difference that a nudge of the start makes at each row, itself at the first."""
-        x = again(1, every, nudge).x.astype(float)
+        """Return the difference at each row after a perturbation of the start."""
+        x = repeat(1, every, nudge).x.astype(float)
         both = min(len(base), len(x))
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(x[:both] - base[:both])
@@ -171,13 +175,13 @@ def _growth(run: Trajectory, own: Array, eps: float, again: _Again) -> tuple[Arr
     walked = eps * math.sqrt(run.steps)
     size = max(20 * walked, 1e4 * eps)
     differences = [moved(size * scale * signs)]
-    grown = _around(np.abs(differences[0])) / size
-    full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > _FULL)
+    grown = _local_maximum(np.abs(differences[0])) / size
+    full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > _SATURATION)
     if full.any():
-        # moved by less, though rounding shows: where that fills the scale, rounding fills a tenth
+        # a smaller perturbation, though with more rounding error relative to it
         less = max(2 * walked, 30 * eps)
         differences.append(moved(less * scale * signs))
-        finer = _around(np.abs(differences[1])) / less
+        finer = _local_maximum(np.abs(differences[1])) / less
         both = min(len(grown), len(finer))
         grown = np.where(full[:both, None], np.maximum(grown[:both], finer[:both]), grown[:both])
     D = mean_mass_matrix(model, base[:, : model.nq], times, run._params)
@@ -192,25 +196,25 @@ def growth_of(
     model: Stepping, D: Array, differences: list[Array], duration: float, moves: Array,
     place: tuple[Array, float, Array], moved: Callable[[Array], Array],
 ) -> float:  # fmt: skip
-    """The growth of a small difference, from what is known and from other directions.
+    """Return the growth of a small difference, from given differences and further directions.
 
-    differences: along the motion, (rows, 2 nq) each, of which the first is the least rounded;
-    place: the start (2 nq,), its time and parameters. moved: finds another difference from a nudge
-    of the start, (2 nq,).
+    differences: along the motion, (rows, 2 nq) each; the first has the least rounding error.
+    place: the start (2 nq,), its time and parameters. moved: function from a perturbation of the
+    start, (2 nq,), to the difference along the motion.
     """
     n, (start, t0, p) = model.nq - len(model.discrete_coordinates), place
     free = [*range(n), *range(model.nq, model.nq + n)]
 
     def allowed(nudge: Array) -> Array:
-        """The nearest nudge that obeys the constraints."""
+        """Project a perturbation onto the constraints."""
         if not model.constraint_names:
             return nudge
         try:
             x = start + nudge
-            found = model.project(x[: model.nq], x[model.nq :], t=t0, params=p)
+            solutions = model.project(x[: model.nq], x[model.nq :], t=t0, params=p)
         except (ArithmeticError, ValueError):
             return nudge
-        return np.asarray(np.concatenate(found) - start, float)
+        return np.asarray(np.concatenate(solutions) - start, float)
 
     with np.errstate(all="ignore"):
         own = [x[:, free] for x in differences]
@@ -224,67 +228,67 @@ def growth_of(
             nudge = np.zeros(2 * model.nq)
             nudge[free] = d
             nudge = allowed(nudge)
-            found = moved(nudge)[:, free]
-            own.append(found)
-            first.append(found[0] if not model.constraint_names else nudge[free])
+            solutions = moved(nudge)[:, free]
+            own.append(solutions)
+            first.append(solutions[0] if not model.constraint_names else nudge[free])
         chosen = [0, *range(len(differences), len(first))]
         common = min(len(own[k]) for k in chosen) - 1
         ends = [first[k] for k in chosen], [own[k][common] for k in chosen]
         return max(*factors, growth(root, *(np.stack(x, axis=1) for x in ends)))
 
 
-def _leaps(run: Trajectory, scale: Array, eps: float, again: _Again) -> bool:
-    """Whether differences at the start are as large as they become however small they were.
+def _is_discontinuous(run: Trajectory, scale: Array, eps: float, repeat: _Repetition) -> bool:
+    """Return True if the final differences do not depend on the size of the initial ones.
 
-    Forces jump there, as by -sign(qd) at rest: what is moved chatters by what a step brings. That
-    says nothing of a run that comes to rest and stays; where a motion is chaotic a difference a
-    hundredth as large is, while it fills no scale, a hundredth as large.
+    Then forces are discontinuous, as -sign(qd) at rest: the perturbed state chatters with an
+    amplitude set by the step, which is no sign of chaos. In a chaotic motion a hundredth of the
+    initial difference yields a hundredth of the later one, until it reaches the scale.
     """
-    every = run.every if len(run) >= _ROWS else max(1, run.steps // _ROWS)
+    every = run.every if len(run) >= _MIN_ROWS else max(1, run.steps // _MIN_ROWS)
     size = max(20 * eps * math.sqrt(run.steps), 1e4 * eps)
-    nudges = (part * size * scale * moving(run._model) for part in (0.0, 1.0, 0.01))
-    base, *moved = (again(1, every, nudge).x.astype(float) for nudge in nudges)
+    nudges = (part * size * scale * moving_mask(run._model) for part in (0.0, 1.0, 0.01))
+    base, *moved = (repeat(1, every, nudge).x.astype(float) for nudge in nudges)
     rows = min(len(base), *map(len, moved))
     with np.errstate(over="ignore", invalid="ignore"):
         large, small = (np.max(np.abs(x[:rows] - base[:rows]) / scale, axis=1) for x in moved)
-    row = int(np.argmax(large > _FULL))
+    row = int(np.argmax(large > _SATURATION))
     return bool(small[row] > large[row] / 3)
 
 
 def _finer(
-    run: Trajectory, own: Array, scale: Array, one: float, eps: float, again: _Again
+    run: Trajectory, own: Array, scale: Array, one: float, eps: float, repeat: _Repetition
 ) -> tuple[list[Array], float, Trajectory | None]:
-    """The rows at h, h/2, h/4 and on until they converge; the order seen; a run that stopped.
+    """Return the rows at h, h/2, h/4, ... until they converge, the observed order, a stopped run.
 
-    one: the rounding of one step relative to the scales.
+    one: rounding error of one step relative to the scales.
     """
-    found, order = [own], run._model.orders[run.method]
+    solutions, order = [own], run._model.orders[run.method]
     stopped: Trajectory | None = None
     parts, last = 1, math.inf
     while True:
         parts *= 2
-        made = again(parts, run.every * parts)
-        if made.status != "ok":
-            stopped = stopped or made
-        found.append(_padded(made, len(run), parts * run.every))
-        now = _size((found[-1] - found[-2]) / scale)
+        refined = repeat(parts, run.every * parts)
+        if refined.status != "ok":
+            stopped = stopped or refined
+        solutions.append(_padded(refined, len(run), parts * run.every))
+        now = _rms((solutions[-1] - solutions[-2]) / scale)
         if parts > 2:
-            seen = min(now, last) > 0 and max(now, last) < math.inf
-            observed = math.log2(last / now) if seen else math.nan
+            has_differences = min(now, last) > 0 and max(now, last) < math.inf
+            observed = math.log2(last / now) if has_differences else math.nan
             count = run.steps * parts
-            # roundings walk; where they are all alike they drift, up to some last digits
+            # rounding errors add up as a random walk, or as a drift if all have the same sign
             least = max(10 * one * math.sqrt(count), min(one * count, math.sqrt(eps)))
             if observed > order - 1 or stopped:
-                return found, observed, stopped
+                return solutions, observed, stopped
             if now <= least:
-                return found, math.nan, None
-            if 2 * parts > _FINEST or 2 * count > _LONG:
-                return found, observed, None
+                return solutions, math.nan, None
+            if 2 * parts > _MAX_REFINEMENT or 2 * count > _MAX_STEPS:
+                return solutions, observed, None
         last = now
 
 
-def _nothing(run: Trajectory) -> Estimate:
-    """The start itself has no error."""
+def _zero_error(run: Trajectory) -> Estimate:
+    """Return the estimate of a run without steps: its only row, the start, has no error."""
     names = [*run._model.coordinates, *(f"{c}_dot" for c in run._model.coordinates)]
     none = np.zeros_like(run.q, dtype=float)
     full = -math.log10(float(np.finfo(run._model.dtype).eps) / 2)
@@ -294,30 +298,30 @@ def _nothing(run: Trajectory) -> Estimate:
 
 
 def _counts(run: Trajectory, every: int, rows: int) -> Array:
-    """The steps done at each row."""
+    """Return the number of steps completed at each row."""
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
-def moving(model: Stepping) -> Array:
-    """(2 nq,): 1 of what moves and is nudged, 0 of what jumps alone change."""
+def moving_mask(model: Stepping) -> Array:
+    """Return 1 for states that are perturbed, 0 for those that only jumps change, (2 nq,)."""
     return np.tile(np.arange(model.nq) < model.nq - len(model.discrete_coordinates), 2).astype(
         float
     )
 
 
-def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:
-    """The largest value of each column; those that only rounding moves count as a millionth of the
-    largest position, or velocity, or of the state where all of these are 0.
+def scales(x: Array, duration: float, eps: float, discrete: int = 0) -> Array:
+    """Return the scale of each column, its largest absolute value.
 
-    At rest, where velocities move no position beyond its rounding in that time, theirs is the one
-    that would move the largest by its own size. still: the number of last coordinates that jumps
-    alone change, which count by themselves.
+    A scale is at least a millionth of the largest position, or velocity, or of the largest state
+    if all of these are 0. At rest, where velocities change no position beyond its rounding error
+    during the run, the scale of velocities is the largest position divided by the duration.
+    discrete: the number of last coordinates that only jumps change, which have their own scales.
     """
     whole = np.max(np.abs(x), axis=0).reshape(2, -1)
-    n = whole.shape[1] - still
+    n = whole.shape[1] - discrete
     largest = whole[:, :n].ravel()
     most = np.max(largest.reshape(2, -1), axis=1)
-    if 0 < most[1] * duration <= _REST * eps * most[0]:
+    if 0 < most[1] * duration <= _REST_ROUNDINGS * eps * most[0]:
         largest[len(largest) // 2 :] = most[1] = most[0] / duration
     halves = np.repeat(most, n)
     rest = np.where(halves > 0, halves, np.max(largest))
@@ -326,8 +330,8 @@ def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:
     return scale.ravel()
 
 
-def _around(x: Array) -> Array:
-    """The largest value of each column within some hundredths of the rows before and behind."""
+def _local_maximum(x: Array) -> Array:
+    """Return the largest value of each column within a window of up to 7.5 % of the rows."""
     starts = np.unique(np.linspace(0, len(x), 40, endpoint=False).astype(int))
     blocks = np.maximum.reduceat(x, starts, axis=0)
     wide = blocks.copy()
@@ -337,29 +341,29 @@ def _around(x: Array) -> Array:
     return around
 
 
-def _size(x: Array) -> float:
-    """Root mean square over all rows, inf where there are gaps."""
+def _rms(x: Array) -> float:
+    """Return the root mean square over all rows, inf if a value is nan."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.nan_to_num(np.sqrt(np.mean(np.square(x))), nan=np.inf))
 
 
 def _padded(run: Trajectory, rows: int, every: int) -> Array:
-    """The states of a finer run at the run's own rows: nan from where it stopped."""
+    """Return the states of a finer run at the rows of the original; nan after it stopped."""
     out = np.full((rows, 2 * run._model.nq), np.nan)
-    kept = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
-    out[:kept] = run.x[:kept]
+    count = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
+    out[:count] = run.x[:count]
     return out
 
 
-def rounding_words(model: Stepping, amplification: float, lost: float) -> str:
-    """Why rounding is a tenth of the motion from the time `lost` on."""
+def rounding_words(model: Stepping, amplification: float, t_lost: float) -> str:
+    """Explain why rounding reaches a tenth of the motion at the time `t_lost`."""
     if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
         return (
             f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
-            f"rounding with it; no run in {model.dtype} means anything from t = {lost:.4g} s on"
+            f"rounding with it; no run in {model.dtype} means anything from t = {t_lost:.4g} s on"
         )
     return (
-        f"rounding of {model.dtype} is a tenth of the motion from t = {lost:.4g} s on, which is "
+        f"rounding of {model.dtype} is a tenth of the motion from t = {t_lost:.4g} s on, which is "
         "small beside its coordinates: measure these from a nearer origin"
     )
 
@@ -368,7 +372,7 @@ def _verdict(
     run: Trajectory, names: Sequence[str], relative: Array, walk: Array, observed: float,
     order: int, amplification: float, stopped: Trajectory | None,
 ) -> list[str]:  # fmt: skip
-    """What speaks against the run, one reason a string."""
+    """Return the reasons why the run is not resolved."""
     words = []
     if run.status != "ok":
         words.append(f"the run stopped at t = {run.t[-1]:.6g} s")
@@ -377,10 +381,10 @@ def _verdict(
             f"with steps of {abs(stopped.h):.3g} s it stops at t = {stopped.t[-1]:.6g} s "
             f"({stopped.status})"
         )
-    if (walk[-1] > _TENTH).any():
-        lost = run.t[int(np.argmax((walk > _TENTH).any(axis=1)))]
-        words.append(rounding_words(run._model, amplification, float(lost)))
-    wrong = relative > _TENTH
+    if (walk[-1] > _UNRESOLVED).any():
+        t_lost = run.t[int(np.argmax((walk > _UNRESOLVED).any(axis=1)))]
+        words.append(rounding_words(run._model, amplification, float(t_lost)))
+    wrong = relative > _UNRESOLVED
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))
         name = names[int(np.argmax(relative[row]))]

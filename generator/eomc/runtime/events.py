@@ -1,4 +1,4 @@
-"""Events of a run: where and when each happened, and the room in which C tells of them."""
+"""Events of a run: their times and states, and the buffers into which C writes them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from .arguments import Array
 from .metadata import ModelInfo
 from .package import reduced
 
-_EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
+# capacity of the buffers, in addition to one event of each kind: of a run, of each of a batch
+_EVENTS, _EVENTS_EACH = 1024, 64
 
 
 @dataclass(frozen=True, repr=False)
 class EventLog:
-    """Where an event happened: t (n,), s; q and qd (n, nq), before a jump."""
+    """Times and states at which one event occurred: t (n,), s; q and qd (n, nq), before a jump."""
 
     t: Array
     q: Array
@@ -34,7 +35,7 @@ class EventLog:
 
     @property
     def _times(self) -> str:
-        """How often and when, in words."""
+        """Number of occurrences and their time span as text."""
         if len(self) < 2:
             return f"once, at {self.t[0]:.6g} s" if len(self) else "never"
         return f"{len(self)} times, {self.t.min():.6g} s to {self.t.max():.6g} s"
@@ -42,13 +43,13 @@ class EventLog:
 
 @dataclass(frozen=True, repr=False)
 class BatchEventLog(EventLog):
-    """The same of many: instance (n,) tells which; they follow one another, each in its order."""
+    """An event's occurrences in all instances of a batch, sorted by `instance` (n,), then time."""
 
     instance: Array
     _batch: int
 
     def of(self, k: int) -> EventLog:
-        """Those of instance k, of the last where k is -1. Raises IndexError where there is none."""
+        """Return the occurrences in instance k; -1 is the last. Raises IndexError out of range."""
         try:
             at = index(k)
         except TypeError:
@@ -64,18 +65,18 @@ class BatchEventLog(EventLog):
 
 
 class BatchEventBuffer:
-    """All events of many instances, found in calls by any thread."""
+    """Events of all instances of a batch, collected from the calls of all threads."""
 
     def __init__(self, model: ModelInfo, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
     def room(self, count: int) -> GroupEventBuffer:
-        """Room for a call of so many instances."""
+        """Return the buffer for a call with `count` instances."""
         return GroupEventBuffer(self.model, count)
 
     def keep(self, room: GroupEventBuffer, first: int) -> None:
-        """Copy what a call has found of instances from `first` on."""
+        """Copy the events of a call whose first instance is `first`."""
         some = np.arange(room.which.shape[1]) < room.counts[:, None]
         if some.any():
             self.pieces.append((some.nonzero()[0] + first, room.which[some], room.rows[some]))
@@ -83,11 +84,11 @@ class BatchEventBuffer:
 
     @property
     def full(self) -> bool:
-        """Whether there is no memory for more."""
+        """Whether the memory limit is reached."""
         return self.count > self.most
 
     def all(self) -> tuple[Array, Array, Array]:
-        """Of each event its instance, which it is, and its row."""
+        """Return (instances, event indices, rows [t, q, qd]) of all events, sorted by instance."""
         none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.nq))
         parts = zip(*self.pieces, strict=True) if self.pieces else [[x] for x in none]
         instances, which, rows = (np.concatenate(list(x)) for x in parts)
@@ -96,7 +97,7 @@ class BatchEventBuffer:
 
 
 class GroupEventBuffer:
-    """Room for the events of a call of some instances."""
+    """Buffer for the events of one call with `count` instances."""
 
     def __init__(self, model: ModelInfo, count: int) -> None:
         self.counts = np.zeros(count, "l")
@@ -111,7 +112,7 @@ class GroupEventBuffer:
 
 
 class EventBuffer:
-    """Room for the events of a call, and all that were found."""
+    """Buffer for the events of a call, and the events of all calls so far."""
 
     def __init__(self, model: ModelInfo) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
@@ -119,19 +120,19 @@ class EventBuffer:
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
 
     def room(self) -> tuple[Any, ...]:
-        """What C is told of it."""
+        """Return the arguments of C: capacity, event indices, rows."""
         address, real, _ = self.model._c
         which = self.model._ffi.from_buffer("int[]", self.which)
         return len(self.which), which, address(real, self.rows)
 
     def keep(self, work: Any) -> None:
-        """Copy what the last call has found."""
+        """Copy the events of the last call."""
         if work.events:
             n, work.events = work.events, 0
             self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
 
     def all(self) -> tuple[Array, Array]:
-        """Of each event which it is, and its row."""
+        """Return (event indices, rows [t, q, qd]) of all events."""
         if not self.pieces:
             return self.which[:0], self.rows[:0]
         which, rows = zip(*self.pieces, strict=True)

@@ -1,4 +1,4 @@
-"""Inputs of adaptive steps: followed or held throughout, or set anew at each control period."""
+"""Inputs of adaptive runs: signals, constants, or a zero-order hold over control periods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, as_step_size, cut_table, machine_memory
-from .laws import SampledSignal, asked
+from .laws import SampledSignal, evaluate_law
 from .metadata import ModelInfo
 from .status import PART
 
@@ -18,32 +18,35 @@ NO_PERIOD = (
     "u: a function is asked once a control period, and steps that fit a tolerance don't tell how "
     "long that is: give control_period=, in s"
 )
-_VALUE = 200  # bytes of what is held over a period, as it is kept
+_VALUE = 200  # bytes of the stored inputs of one period
 
 
 @dataclass(frozen=True)
 class ZeroOrderHold:
-    """What is held over one period after another: by a function u(t, q, qd), or by rows (n, nu)."""
+    """Inputs that are constant over each control period: from a function u(t, q, qd) or rows."""
 
-    of: Callable[..., Any] | Array
+    source: Callable[..., Any] | Array  # rows: (n, nu)
     period: float  # s
     count: int  # of the run, the last of which may be shorter
 
 
 def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array) -> Array:
-    """Which of values (..., n, nu) are held at times (m,), (..., m, nu): at a start its own."""
+    """Return the row of `values` (..., n, nu) that applies at each of `times` (m,): (..., m, nu).
+
+    At the start of a period its own row applies.
+    """
     starts = np.asarray(t0 + period * np.arange(values.shape[-2]), times.dtype)
-    begun = np.searchsorted(starts, times, side="right") - 1
-    return np.asarray(values[..., np.maximum(begun, 0), :])
+    index = np.searchsorted(starts, times, side="right") - 1
+    return np.asarray(values[..., np.maximum(index, 0), :])
 
 
 def input_schedule(
     model: ModelInfo, u: Any, control_period: float | None, span: float, params: Any,
     duration: float | None = None,
 ) -> Array | ZeroOrderHold | None:  # fmt: skip
-    """The inputs of a run by a tolerance as `InputSchedule` takes them, or a ValueError.
+    """Check the inputs of an adaptive run and return them in the form for `InputSchedule`.
 
-    duration: which a table may cover instead of the span, s.
+    duration: a table may cover this time, s, instead of the span. Raises ValueError.
     """
     period = None
     if control_period is not None:
@@ -51,7 +54,7 @@ def input_schedule(
     if u is None:
         if period is None or not model.nu:
             return None
-        return _few(
+        return _check_memory(
             model, ZeroOrderHold(SampledSignal(model, params), period, count_periods(span, period))
         )
     if not model.nu:
@@ -80,32 +83,32 @@ def input_schedule(
         u = rows.copy()
     if period is None:
         raise ValueError(NO_PERIOD)
-    return _few(model, ZeroOrderHold(u, period, count_periods(span, period)))
+    return _check_memory(model, ZeroOrderHold(u, period, count_periods(span, period)))
 
 
-def _few(model: ModelInfo, made: ZeroOrderHold) -> ZeroOrderHold:
-    """The same, or a MemoryError where a run can't keep its rows."""
-    count = made.count
+def _check_memory(model: ModelInfo, hold: ZeroOrderHold) -> ZeroOrderHold:
+    """Return `hold`; raise MemoryError if the inputs of its periods do not fit in memory."""
+    count = hold.count
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
         raise MemoryError(
-            f"control_period: the rows of {count:.3g} periods of {made.period:g} s don't fit in "
+            f"control_period: the rows of {count:.3g} periods of {hold.period:g} s don't fit in "
             "memory: take a longer one, or a shorter duration"
         )
-    return made
+    return hold
 
 
 def count_periods(span: float, period: float) -> int:
-    """Periods in a span, the last of which may be shorter."""
+    """Return the number of periods in a span; the last one may be shorter."""
     return max(ceil(span / period * (1 - 1e-12)), 1)
 
 
 def period_end(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
-    """Where the k-th period of a run ends, as the module's numbers hold it."""
+    """Return the end of period k of a run, rounded to the module's number type."""
     return float(dtype.type(t0 + (k + 1) * period))
 
 
 class InputSchedule:
-    """The inputs of a run on its way: what C takes now, and the time until which that holds."""
+    """The inputs of a run in progress: the current values, and the time until which they apply."""
 
     def __init__(
         self,
@@ -118,18 +121,18 @@ class InputSchedule:
     ) -> None:
         self.model, self.t0, self.t_end, self.stop = model, t0, t_end, t_end
         self.periods = u if isinstance(u, ZeroOrderHold) else None
-        self.held: Any = None if self.periods else u
+        self.current: Any = None if self.periods else u
         self.values: list[Array] = []  # of each period
         if self.periods:
             self._next(t0, q, qd)
 
     @property
-    def at(self) -> Any:
-        """The address of what is held."""
-        return self.model._pointer(self.held)
+    def address(self) -> Any:
+        """Address of the current inputs; NULL for the signals."""
+        return self.model._pointer(self.current)
 
-    def on(self, work: Any) -> bool:
-        """Whether the run goes on at the state that it has reached, by the next inputs."""
+    def advance(self, work: Any) -> bool:
+        """Set the next inputs if a period has ended; return False at the end of the run."""
         if work.t < self.stop:
             return True
         if self.stop >= self.t_end:
@@ -139,20 +142,23 @@ class InputSchedule:
         return True
 
     def _next(self, t: float, q: Array, qd: Array) -> None:
-        """The inputs of the next period."""
+        """Set the inputs of the next period."""
         assert self.periods
-        done, of, model = len(self.values), self.periods.of, self.model
-        if callable(of):
-            self.held = asked(of, model._inputs, t, q, qd)
+        index, source, model = len(self.values), self.periods.source, self.model
+        if callable(source):
+            self.current = evaluate_law(source, model._inputs, t, q, qd)
         else:
-            self.held = of[min(done, len(of) - 1)]  # of a run that was interrupted
-        self.values.append(self.held)
+            # a run that was interrupted has fewer rows than periods
+            self.current = source[min(index, len(source) - 1)]
+        self.values.append(self.current)
         self.stop = self.t_end
-        if done + 1 < self.periods.count:
-            self.stop = min(period_end(done, self.t0, self.periods.period, model.dtype), self.t_end)
+        if index + 1 < self.periods.count:
+            self.stop = min(
+                period_end(index, self.t0, self.periods.period, model.dtype), self.t_end
+            )
 
     @property
     def u(self) -> Any:
-        """The inputs as a run keeps them: a function, or a copy of what was held."""
-        of = self.periods.of if self.periods else self.held
-        return of if of is None or callable(of) else of.copy()
+        """The inputs as a run stores them: a function, or a copy of the values."""
+        source = self.periods.source if self.periods else self.current
+        return source if source is None or callable(source) else source.copy()

@@ -62,7 +62,7 @@ class Model(Stepping):
             raise ValueError(
                 f"{file}: is a run of many at once: build the module with {option('batch')}"
             )
-        return of._of_kept(model, kept)
+        return of._from_arrays(model, kept)
 
     @property
     def _kinds(self) -> dict[str, Any]:
@@ -159,7 +159,7 @@ class Model(Stepping):
                 ):
                     return Run(self, t0, rows, h, steps, "ok", p, every, None, method, done)
         t0 = as_number(t0, "t0")
-        at, steps = output_times.as_asked(self, times, t0, h, duration, steps, every, out)
+        at, steps = output_times.as_times_and_steps(self, times, t0, h, duration, steps, every, out)
         steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
         u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at)

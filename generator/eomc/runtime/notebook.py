@@ -19,7 +19,7 @@ SHOWN = 12  # coordinates in the table, at most
 def html(run: Any) -> str:
     """A run as HTML; free text of the scene is escaped, no request leaves it."""
     model = run._model
-    words = [f"{run.steps} steps of {run.method}, {run.told}"]
+    words = [f"{run.steps} steps of {run.method}, {run.description}"]
     words += [f"to t = {run.t[-1]:g} s"] if len(run) else []
     words.append(f"status: {run.status}" if run.status == "ok" else run.message)
     if run.error is not None:

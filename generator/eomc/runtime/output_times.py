@@ -1,4 +1,7 @@
-"""Fixed steps with rows at given times: a row between two steps is a shorter one from the first."""
+"""Runs by fixed steps with rows at given output times.
+
+A row between two steps is reached by a shorter step from the first of them.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +24,23 @@ from .status import STATUS
 from .stepping import Stepping
 from .trajectory import Run
 
-_ROWS = 4096  # of the run whose error is estimated, at least, where it has as many steps
-_FIRST = 16_384  # steps times coordinates before the first look, some ms
-_RARELY = 2**48  # steps from row to row: C keeps the last one alone
+_ROWS = 4096  # minimum number of rows in the error estimate, if the run has as many steps
+_FIRST = 16_384  # steps times coordinates of the first call of C, some ms
+_RARELY = 2**48  # steps from row to row: C stores the last state only
 
 
 @dataclass(eq=False, repr=False)
 class TimedRun(Run):
-    """A run by fixed steps with rows at the times that were asked for.
+    """A run by fixed steps with rows at output times.
 
-    steps: those of size h. One that can't go on ends with its last good state. Everything else as
-    in a Run.
+    steps: number of steps of size h. A run that stops early ends with its last valid state. All
+    else is as in a Run.
     """
 
     _times: Array = field(kw_only=True)
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
-    _gave: Array | None = field(default=None, init=False)  # of a function, a row for each call
+    # the values of a function u(t, q, qd), a row for each call
+    _law_values: Array | None = field(default=None, init=False)
 
     @property
     def t(self) -> Array:
@@ -44,82 +48,83 @@ class TimedRun(Run):
         return self._times
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """(q, qd) at any time within the run, t (...,): each (..., nq), by the same steps again.
+        """Return (q, qd) at times t (...,) within the run, each (..., nq), by repeating the steps.
 
         Raises ValueError outside of the run.
         """
         times = within(self, t)
-        asked, place = np.unique(times, return_inverse=True)
-        made = self._whole(1, asked)
-        q, qd = (x[place.ravel()].reshape(*times.shape, -1) for x in (made.q, made.qd))
+        unique_times, place = np.unique(times, return_inverse=True)
+        result = self._repeat_all(1, unique_times)
+        q, qd = (x[place.ravel()].reshape(*times.shape, -1) for x in (result.q, result.qd))
         return q, qd
 
     @property
-    def _given(self) -> Array:
+    def _requested_inputs(self) -> Array:
         if self._applied is None and self._u is not None and self._u.ndim == 2 and len(self._u):
-            begun = parts(self._times, self.t0, self.h)[0]
-            rows: Array = self._u[np.minimum(begun, len(self._u) - 1)]
+            index = parts(self._times, self.t0, self.h)[0]
+            rows: Array = self._u[np.minimum(index, len(self._u) - 1)]
             return rows
-        return super()._given
+        return super()._requested_inputs
 
-    def _whole(self, every: int, at: Array | None = None) -> Run:
-        """The run of all steps, the last one whole; at: of those that reach these times."""
+    def _repeat_all(self, every: int, at: Array | None = None) -> Run:
+        """Repeat the run with rows after `every` steps, or at the times `at`."""
         model, (q, qd), pointer = self._model, self._begin, self._model._pointer
         whole = self.status == "ok" or at is not None
         steps = _count(self._times if at is None else at, self.t0, self.h) if whole else self.steps
-        u = self._u if at is None or self._gave is None else self._gave
+        u = self._u if at is None or self._law_values is None else self._law_values
         if isinstance(u, np.ndarray) and u.ndim == 2:
             u = u[: -(-steps // self._hold)]
-        made: Run = model._trajectory(
+        result: Run = model._trajectory(
             q, qd, pointer(q), pointer(qd), self.h, steps, every, u, self._params,
             pointer(self._params), self.method, self.t0, None, None, self._hold, at,
         )  # fmt: skip
-        return made
+        return result
 
-    def _even(self) -> Run:
-        return self._whole(1)
+    def _equidistant(self) -> Run:
+        return self._repeat_all(1)
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
-        """That of the steps, between these by lines."""
+        """Estimate the error after each step, and interpolate it linearly to the rows."""
         count = _count(self._times, self.t0, self.h)
-        whole = self._whole(max(1, count // _ROWS))
-        found = estimate(whole, progress)
+        whole = self._repeat_all(max(1, count // _ROWS))
+        error = estimate(whole, progress)
 
-        def at_rows(error: Array) -> Array:
-            return np.stack([np.interp(self.t, whole.t, column) for column in error.T], axis=1)
+        def at_rows(values: Array) -> Array:
+            return np.stack([np.interp(self.t, whole.t, column) for column in values.T], axis=1)
 
-        return replace(found, q=at_rows(found.q), qd=at_rows(found.qd))
+        return replace(error, q=at_rows(error.q), qd=at_rows(error.qd))
 
-    def _kept(self) -> dict[str, Any]:
-        own = {"times": self._times, "begin": self._begin, "values": self._gave}
-        return super()._kept() | own
+    def _to_arrays(self) -> dict[str, Any]:
+        own = {"times": self._times, "begin": self._begin, "values": self._law_values}
+        return super()._to_arrays() | own
 
     @classmethod
-    def _of_kept(cls, model: Stepping, kept: Mapping[str, Any], **own: Any) -> Self:
-        made = super()._of_kept(model, kept, _times=kept["times"], _begin=kept["begin"])
-        made._gave = kept.get("values")
-        return made
+    def _from_arrays(cls, model: Stepping, arrays: Mapping[str, Any], **own: Any) -> Self:
+        times, begin = arrays["times"], arrays["begin"]
+        result = super()._from_arrays(model, arrays, _times=times, _begin=begin)
+        result._law_values = arrays.get("values")
+        return result
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self._times.tolist())
 
 
-def as_asked(
+def as_times_and_steps(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, out: Any,
 ) -> tuple[Array | None, int | None]:  # fmt: skip
-    """Times (n,), and the steps to the last of them or beyond; where there are none (None, steps).
+    """Return the output times (n,) and the number of steps that cover them, or (None, steps).
 
-    Raises ValueError beside what else says where rows are.
+    Raises ValueError if `times` is combined with another argument that determines the rows.
     """
     if times is None:
         return None, steps
-    named = {"steps": steps is not None, "every": every != 1, "out": out is not None}
-    for name, given in named.items():
-        if given:
+    excluded = {"steps": steps is not None, "every": every != 1, "out": out is not None}
+    for name, is_given in excluded.items():
+        if is_given:
             raise ValueError(f"{name}: times say where rows are; give one or the other")
-    found = as_times(times, t0, np.dtype(float), duration)
-    return found, _count(found, t0, h)
+    rows = as_times(times, t0, np.dtype(float), duration)
+    return rows, _count(rows, t0, h)
 
 
 def run(
@@ -127,50 +132,50 @@ def run(
     acts: tuple[FeedbackLaw | None, Array | None, int, int], p: Array, method: str,
     progress: Callable[[int, int], None] | None,
 ) -> TimedRun:  # fmt: skip
-    """A run from checked arguments, whatever its status; times (n,) from t0 on.
+    """Run from checked arguments and return the run, whatever its status; times (n,) from t0 on.
 
-    acts: a law, held values, values from one step to the next, steps over which a law is held.
+    acts: feedback law, constant inputs, stride of the inputs from step to step, steps per period.
     """
-    way = _Way(model, q, qd, t0, h, steps, acts, p, method)
+    stepper = _IntervalStepper(model, q, qd, t0, h, steps, acts, p, method)
     rows = np.empty((2, len(times) + 1, model.nq), model.dtype)
     applied = np.full((len(times) + 1, model.nu), np.nan, model.dtype)
-    kept, said = 0, "ok"
+    count, status = 0, "ok"
     try:
         for n, rest in zip(*(x.tolist() for x in parts(times, t0, h)), strict=True):
-            said = way.to(n, progress)
-            if said == "ok":
-                rows[:, kept], said = way.between(rest)
-            if said != "ok":
+            status = stepper.step_to(n, progress)
+            if status == "ok":
+                rows[:, count], status = stepper.interpolate(rest)
+            if status != "ok":
                 break
-            if way.law and n < way.steps:  # else what was held over the last step
-                way.inputs()
-            applied[kept] = way.acts
-            kept += 1
+            if stepper.law and n < stepper.steps:  # else the inputs of the last step stay
+                stepper.inputs()
+            applied[count] = stepper.applied
+            count += 1
     except KeyboardInterrupt:
-        said = "interrupted"
-    stamps = times[:kept]
-    at = t0 + way.done * h
-    if said != "ok" and (not kept or stamps[-1] < at):  # the last good state
-        rows[:, kept], stamps = way.state, np.append(stamps, at)
-        applied[kept] = way.acts
-    made = TimedRun(
-        model, t0, rows[:, : len(stamps)], h, way.done, said, p, 1, way.given, method,
-        way.evaluations, _times=stamps, _begin=np.array([q, qd]),
+        status = "interrupted"
+    stamps = times[:count]
+    at = t0 + stepper.completed * h
+    if status != "ok" and (not count or stamps[-1] < at):  # the last valid state
+        rows[:, count], stamps = stepper.state, np.append(stamps, at)
+        applied[count] = stepper.applied
+    result = TimedRun(
+        model, t0, rows[:, : len(stamps)], h, stepper.completed, status, p, 1, stepper.u, method,
+        stepper.evaluations, _times=stamps, _begin=np.array([q, qd]),
     )  # fmt: skip
-    model._record_singular_steps(made, method, way.work)
-    if way.law:
-        made._hold, made._applied = way.hold, applied[: len(stamps)]
-        made._gave = np.reshape(way.values, (-1, model.nu)).astype(model.dtype)
-    return made
+    model._record_singular_steps(result, method, stepper.work)
+    if stepper.law:
+        result._hold, result._applied = stepper.hold, applied[: len(stamps)]
+        result._law_values = np.reshape(stepper.values, (-1, model.nu)).astype(model.dtype)
+    return result
 
 
 def _count(times: Array, t0: float, h: float) -> int:
-    """Steps to the last of these times or beyond it."""
+    """Return the number of steps up to or beyond the last of these times."""
     return ceil((float(times[-1]) - t0) / h * (1 - 1e-12))
 
 
-class _Way:
-    """A run on its way: the state behind `done` steps, and what goes from call to call of C."""
+class _IntervalStepper:
+    """A run in progress: the state after `completed` steps, and the workspace of C."""
 
     def __init__(
         self, model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int,
@@ -178,13 +183,14 @@ class _Way:
     ) -> None:  # fmt: skip
         self.model, self.t0, self.h, self.steps = model, t0, h, steps
         _, self.run, _, self.stages, self.work_type, self.counted = model._loops[method]
-        self.law, self.held, self.stride, self.hold = acts
-        copied = None if self.held is None or self.law else self.held.copy()
-        self.given = self.law.law if self.law else copied
+        self.law, self.current, self.stride, self.hold = acts
+        copied = None if self.current is None or self.law else self.current.copy()
+        self.u = self.law.law if self.law else copied
         self.p, self.work = p, model._ffi.new(self.work_type)
-        self.pair = np.array([[q, q], [qd, qd]], model.dtype)  # of C: where it starts, where it is
-        self.asked, self.between_them = -1, 0  # the step a law was called before; evaluations
-        self.values: list[Array] = []  # what it gave
+        self.pair = np.array([[q, q], [qd, qd]], model.dtype)  # start and current state
+        self.period = -1  # of the last call of the law
+        self.extra_evaluations = 0  # of accelerations, in steps to rows between two steps
+        self.values: list[Array] = []  # of the law
         self.chunk = max(1, _FIRST // (model.nq**3 if self.counted else model.nq))
 
     @property
@@ -192,63 +198,63 @@ class _Way:
         return self.pair[:, 1]
 
     @property
-    def done(self) -> int:
+    def completed(self) -> int:
         return int(self.work.done)
 
     @property
     def evaluations(self) -> int:
-        own = self.counted(self.work) if self.counted else self.stages * self.done
-        return int(own + self.between_them)
+        own = self.counted(self.work) if self.counted else self.stages * self.completed
+        return int(own + self.extra_evaluations)
 
-    def to(self, n: int, progress: Callable[[int, int], None] | None) -> str:
-        """On to the state behind n steps; the status."""
-        while self.done < n:
-            count = min(n - self.done, self.chunk)
+    def step_to(self, n: int, progress: Callable[[int, int], None] | None) -> str:
+        """Step until n steps are completed; return the status."""
+        while self.completed < n:
+            count = min(n - self.completed, self.chunk)
             if self.law:
-                count = min(count, self.hold - self.done % self.hold)
-            at_u, begun = self.inputs(), perf_counter()
-            said = self._call(self.pair, self.t0, self.h, count, at_u, self.work)
-            if said != "ok":
-                return said
+                count = min(count, self.hold - self.completed % self.hold)
+            at_u, start = self.inputs(), perf_counter()
+            status = self._call(self.pair, self.t0, self.h, count, at_u, self.work)
+            if status != "ok":
+                return status
             if count == self.chunk:
-                self.chunk = next_chunk(count, perf_counter() - begun)
+                self.chunk = next_chunk(count, perf_counter() - start)
             if progress is not None:
-                progress(self.done, self.steps)
+                progress(self.completed, self.steps)
         return "ok"
 
-    def between(self, rest: float) -> tuple[Array, str]:
-        """The state so many seconds behind the last step, and the status."""
+    def interpolate(self, rest: float) -> tuple[Array, str]:
+        """Return the state `rest` seconds after the last step, and the status."""
         if not rest:
             return self.state, "ok"
         work, pair = self.model._ffi.new(self.work_type), np.repeat(self.pair[:, 1:], 2, axis=1)
-        t = self.t0 + self.done * self.h
+        t = self.t0 + self.completed * self.h
         at_u = self.inputs()
-        if self.held is not None and self.stride:
-            at_u += self.stride * min(self.done, len(self.held) - 1)
-        said = self._call(pair, t, rest, 1, at_u, work)
-        self.between_them += self.counted(work) if self.counted else self.stages
-        return pair[:, 1], said
+        if self.current is not None and self.stride:
+            at_u += self.stride * min(self.completed, len(self.current) - 1)
+        status = self._call(pair, t, rest, 1, at_u, work)
+        self.extra_evaluations += self.counted(work) if self.counted else self.stages
+        return pair[:, 1], status
 
     def _call(self, pair: Array, t: float, h: float, count: int, at_u: Any, work: Any) -> str:
-        """So many steps on from a pair's first state, or from its last where steps were done."""
+        """Make `count` steps in C, from the last state of `pair`, or its first at the start."""
         pointer, stride = self.model._pointer, self.stride
         (q, qd), at_p = pair, pointer(self.p)
-        found = self.run(
+        code = self.run(
             pointer(q), pointer(qd), pointer(q[0]), pointer(qd[0]), t, h, count, at_u, stride,
             _RARELY, at_p, work,
         )  # fmt: skip
-        return STATUS[found & 7]
+        return STATUS[code & 7]
 
     def inputs(self) -> Any:
-        """The address of the inputs; those of a law over the next step."""
-        period = self.done // self.hold
-        if self.law and self.asked != period:
-            self.held = self.law(self.t0 + self.done * self.h, *self.state)
-            self.values.append(self.held)
-            self.asked = period
-        return self.model._pointer(self.held)
+        """Return the address of the next step's inputs; call the law if a period begins."""
+        period = self.completed // self.hold
+        if self.law and self.period != period:
+            self.current = self.law(self.t0 + self.completed * self.h, *self.state)
+            self.values.append(self.current)
+            self.period = period
+        return self.model._pointer(self.current)
 
     @property
-    def acts(self) -> Any:
-        """What a law gave last."""
-        return np.nan if not self.law or self.held is None else self.held
+    def applied(self) -> Any:
+        """Last values of the law; nan without one."""
+        return np.nan if not self.law or self.current is None else self.current

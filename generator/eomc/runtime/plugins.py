@@ -1,4 +1,4 @@
-"""What eomc does for a built module, where it is installed; all else here needs nothing of it."""
+"""Functions that need an installed eomc; the rest of a built module works without it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 from .package import no_argument
 
 
-def require_eomc(room: str, what: str = "runs are drawn") -> Any:
-    """The module `room` of eomc. Raises ImportError with the remedy where there is none.
+def require_eomc(module: str, what: str = "runs are drawn") -> Any:
+    """Import eomc.`module`. Raises ImportError with the remedy where eomc is not installed.
 
-    It is asked for by its name where a picture is wanted, or events that the scene has not.
+    Only pictures, and events that the scene does not define, need it.
     """
     try:
-        return import_module(f"eomc.{room}")
+        return import_module(f"eomc.{module}")
     except ModuleNotFoundError as fault:
         if not str(fault.name).startswith("eomc"):
             raise
@@ -26,24 +26,25 @@ def require_eomc(room: str, what: str = "runs are drawn") -> Any:
         ) from None
 
 
-def with_events(call: Callable[..., Any], given: dict[str, Any]) -> Any:
-    """The model in `given` with the events there besides its own, and the call's other arguments.
+def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """Return the model extended by the events in `arguments`, and the remaining arguments.
 
-    Of parameters the other has fewer where a jump sets some: what differs from the scene is given.
-    Raises TypeError of arguments that the call has not.
+    A parameter that a jump sets is a state of the extended model, not a parameter: only the
+    parameters that differ from the scene's values are passed on. Raises TypeError for unknown
+    arguments.
     """
-    model, events, unknown = (given.pop(name) for name in ("self", "events", "unknown"))
+    model, events, unknown = (arguments.pop(name) for name in ("self", "events", "unknown"))
     if unknown:
         raise no_argument(model, call, unknown)
     other = eventful(model, events)
-    if hasattr(params := given["params"], "_names"):
+    if hasattr(params := arguments["params"], "_names"):
         values = {name: getattr(params, name) for name in params._names}
-        given["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
-    return other, given
+        arguments["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
+    return other, arguments
 
 
 def eventful(model: Any, events: Any) -> Any:
-    """The model with events besides its own, built where it is not there yet."""
+    """Return the model extended by `events`; it is built at the first call."""
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = require_eomc("pipeline", "events of a run are compiled").with_events

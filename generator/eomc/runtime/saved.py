@@ -43,7 +43,7 @@ def write(run: Any, path: Path) -> None:
         arrays |= {"own": asked[0].digest, "asked": _text(asked[1])}
     if model.has_jacobi:
         arrays["jacobi"] = run.jacobi
-    arrays |= {name: value for name, value in run._kept().items() if value is not None}
+    arrays |= {name: value for name, value in run._to_arrays().items() if value is not None}
     made: Any = {name: np.asarray(value) for name, value in arrays.items()}
     with atomic_write(path) as new, new.open("wb") as file:
         np.savez(file, **made)

@@ -1,4 +1,4 @@
-"""Where a run starts: by name, and by the scene's formulas of parameters."""
+"""Initial states: values by name, and the scene's formulas of parameters."""
 
 from __future__ import annotations
 
@@ -28,77 +28,77 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def is_by_name(q0: Any, qd0: Any) -> bool:
-    """Whether positions or velocities are given by name."""
+    """Whether positions or velocities are mappings by name."""
     return hasattr(q0, "keys") or hasattr(qd0, "keys")
 
 
 def initial_state_for_parameters(
     model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
 ) -> tuple[Any, Any]:
-    """Complete a start: what is not given is where the scene starts at the parameters.
+    """Return the initial state; missing values are the scene's, evaluated at the parameters p.
 
-    q0, qd0: arrays, which are returned as they are, mappings from names of coordinates, or None.
-    p: (np,), or (n, np), for which the result has n rows; many_values: mappings may have (n,) then.
-    Raises ValueError for unknown names, and where a formula has no finite value.
+    q0, qd0: arrays, which are returned unchanged, mappings from names of coordinates, or None.
+    p: (np,), or (n, np), for which the result has n rows; many_values: values of the mappings may
+    be (n,). Raises ValueError for unknown names, and if a formula has no finite value.
     """
-    given = [values_by_name(model, x, half, many_values) for half, x in enumerate((q0, qd0))]
-    many = _instances(given, p.shape[:-1])
+    mappings = [values_by_name(model, x, half, many_values) for half, x in enumerate((q0, qd0))]
+    many = _instances(mappings, p.shape[:-1])
     p = np.broadcast_to(p, (*many, p.shape[-1]))
-    found = [
+    result = [
         x if named_values is None else np.tile(own, (*many, 1))
-        for x, own, named_values in zip((q0, qd0), model._start, given, strict=True)
+        for x, own, named_values in zip((q0, qd0), model._start, mappings, strict=True)
     ]
-    for x, named_values in zip(found, given, strict=True):
+    for x, named_values in zip(result, mappings, strict=True):
         for name, value in (named_values or {}).items():
             x[..., model.coordinates.index(name)] = value
     values = {name: p[..., k].astype(float) for k, name in enumerate(model.parameters)}
     for name, text in model._follows.items():
         half, at = divmod(model._states.index(name), model.nq)
-        named_values = given[half]
+        named_values = mappings[half]
         if named_values is None or model.coordinates[at] in named_values:
             continue
         tree = ast.parse(text, mode="eval").body
         own = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name)]
         which = [k for k, parameter in enumerate(model.parameters) if parameter in own]
-        moved = (p[..., which] != model._p0[which]).any(axis=-1)
+        changed = (p[..., which] != model._p0[which]).any(axis=-1)
         with np.errstate(all="ignore"):
             value = np.broadcast_to(_value(tree, values | {"pi": np.pi}), many)
-        if not np.isfinite(value[moved]).all():
+        if not np.isfinite(value[changed]).all():
             what = ("q0", "qd0")[half]
             raise ValueError(
                 f"params: the start of {name}, {text}, is not finite there: give {what}"
             )
-        found[half][..., at][moved] = value[moved]
-    return found[0], found[1]
+        result[half][..., at][changed] = value[changed]
+    return result[0], result[1]
 
 
 def _instances(
-    given: list[dict[str, Array] | None], of_parameters: tuple[int, ...]
+    mappings: list[dict[str, Array] | None], of_parameters: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """The shape of a start: that of the parameters, or of values by name of many instances."""
-    found = {of_parameters: "params"} if of_parameters != (1,) else {}
-    for what, values in zip(("q0", "qd0"), given, strict=True):
+    """Return the leading shape of the initial state, from the parameters or the values by name."""
+    result = {of_parameters: "params"} if of_parameters != (1,) else {}
+    for what, values in zip(("q0", "qd0"), mappings, strict=True):
         for name, value in (values or {}).items():
             if value.size > 1:
-                found.setdefault(value.shape, f"{what}: {name}")
-    if len(found) > 1:
-        (one, whose), (other, its) = list(found.items())[:2]
+                result.setdefault(value.shape, f"{what}: {name}")
+    if len(result) > 1:
+        (one, whose), (other, its) = list(result.items())[:2]
         raise ValueError(f"{its}: {other[0]} instances where {whose} has {one[0]}")
-    return next(iter(found), of_parameters)
+    return next(iter(result), of_parameters)
 
 
 def values_by_name(
     model: Constrained, x: Any, half: int, many: bool = False
 ) -> dict[str, Array] | None:
-    """The values of a mapping by coordinate; {} of None, and None of an array.
+    """Return the values of a mapping by coordinate; {} for None, and None for an array.
 
-    Velocities have the name of the coordinate, or that with _dot.
+    half: 0 for q, 1 for qd. Keys of velocities are names of coordinates, with or without _dot.
     """
     if x is None:
         return {}
     if not hasattr(x, "keys"):
         return None
-    what, found = ("q0", "qd0")[half], dict[str, Array]()
+    what, result = ("q0", "qd0")[half], dict[str, Array]()
     moving = [name for name in model.coordinates if name not in model.discrete_coordinates]
     known = moving if half else model.coordinates
     for key, value in by_name(x).items():
@@ -107,19 +107,19 @@ def values_by_name(
             if not half and key.removesuffix("_dot") in moving:
                 raise ValueError(f"q0: '{key}' is a velocity: give it in qd0")
             raise ValueError(not_one_of(what, key, known))
-        if name in found:
+        if name in result:
             raise ValueError(f"{what}: '{name}' is given twice, as '{name}' and as '{name}_dot'")
         if many and np.ndim(value) == 1:
-            found[name] = model._numbers(value, f"{what}: {name}")
-            if not np.isfinite(found[name]).all():
+            result[name] = model._numbers(value, f"{what}: {name}")
+            if not np.isfinite(result[name]).all():
                 raise ValueError(f"{what}: {name}: not all numbers are finite")
         else:
-            found[name] = np.array(as_number(value, f"{what}: {name}"))
-    return found
+            result[name] = np.array(as_number(value, f"{what}: {name}"))
+    return result
 
 
 def _value(node: ast.expr, values: Mapping[str, Any]) -> Any:
-    """A formula's value; eomc has compared each of its nodes with what formulas are made of."""
+    """Evaluate a formula; eomc has checked each of its nodes when the module was built."""
     match node:
         case ast.Constant(value=number):
             return np.float64(number)  # type: ignore[arg-type]

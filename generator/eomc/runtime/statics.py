@@ -16,7 +16,7 @@ from .starts import initial_state_for_parameters, values_by_name
 
 
 class Statics(Constrained):
-    """What is found by solving for forces or for a state."""
+    """A compiled scene with inverse problems: actuator forces of a motion, equilibria."""
 
     def drive_forces(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, drives: Sequence[str] | None = None,
@@ -36,11 +36,12 @@ class Statics(Constrained):
         force = force - self.tau(q, qd, t, np.zeros(self.nu) if self.nu else None, params)
         at, moving = self._state(q, qd)
         each = self._like(qdd, "qdd", (self.nq,), at)
-        tau, found = np.empty_like(at), np.empty((*at.shape[:-1], len(self._rows.names)), at.dtype)
-        motion = Motion.of(self, at, moving, each, force, t, params)
+        tau = np.empty_like(at)
+        multipliers = np.empty((*at.shape[:-1], len(self._rows.names)), at.dtype)
+        motion = Motion.from_states(self, at, moving, each, force, t, params)
         for k in np.ndindex(at.shape[:-1]):
-            tau[k], found[k] = drive_forces(self, which, motion.at(k))
-        return tau, found
+            tau[k], multipliers[k] = drive_forces(self, which, motion.state(k))
+        return tau, multipliers
 
     def equilibrium(
         self, q: Start = None, qd: Start = 0.0, t: float = 0.0, u: Any = None,
@@ -97,5 +98,5 @@ class Statics(Constrained):
         )
         moves = [name for name in self.coordinates if name not in self.discrete_coordinates]
         names = moves if free is None else tuple(free)
-        held = self._inputs(u)
-        return equilibrium(self, at, moving, held, names, as_number(t, "t"), params)
+        inputs = self._inputs(u)
+        return equilibrium(self, at, moving, inputs, names, as_number(t, "t"), params)

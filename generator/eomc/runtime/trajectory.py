@@ -16,7 +16,7 @@ from .by_name import ByName
 from .dense import states
 from .estimate import Estimate, estimate
 from .initial_checks import infinite_at_start
-from .laws import asked
+from .laws import evaluate_law
 from .notebook import html
 from .package import warn
 from .plot import plot
@@ -180,7 +180,7 @@ class Run(Trajectory):
         if isinstance(self._u, str):
             raise ValueError(f"estimate: {self._u}")
         if callable(self._u) and self._applied is not None and len(self) and self.t[0] == self.t0:
-            now = asked(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
+            now = evaluate_law(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
             if not np.array_equal(now, self._applied[0]):
                 raise ValueError(NOISE)
 

@@ -1,4 +1,4 @@
-"""The rows of a run by fixed steps, and what it was made with."""
+"""The rows of a run by fixed steps, and the arguments of the run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulat
 
 
 class _Half:
-    """q or qd of a run: a half of its rows, made when it is first asked for, and kept."""
+    """q or qd of a run: a half of its rows, computed at the first access and stored."""
 
     def __init__(self, index: int) -> None:
         self.index = index
@@ -31,7 +31,7 @@ class _Half:
 
     def __get__(self, run: Trajectory | None, owner: type) -> Array:
         if run is None:
-            return self  # type: ignore[return-value]  # on the class, as for help()
+            return self  # type: ignore[return-value]  # access on the class, as by help()
         half: Array = run._rows[self.index]
         run.__dict__[self.name] = half
         return half
@@ -39,7 +39,7 @@ class _Half:
 
 @dataclass(eq=False, repr=False)
 class Trajectory(ConstrainedRun, Columns):
-    """What `trajectory.Run` keeps, and what follows from that alone."""
+    """Data of a run by fixed steps, and quantities that follow from them."""
 
     _model: Stepping
     t0: float
@@ -53,13 +53,14 @@ class Trajectory(ConstrainedRun, Columns):
     method: str
     evaluations: int
     _energy: Array | None = field(default=None, init=False)
-    _applied: Array | None = field(default=None, init=False)  # where u is a function,
-    _hold: int = field(default=1, init=False)  # which is called every so many steps
+    # inputs at the rows, if u is a function, and steps from one call of it to the next
+    _applied: Array | None = field(default=None, init=False)
+    _hold: int = field(default=1, init=False)
 
     q, qd = _Half(0), _Half(1)
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """(q, qd) at any time within: each kind of run has its own way."""
+        """Return (q, qd) at any time within the run; subclasses implement it."""
         raise NotImplementedError
 
     @cached_property
@@ -69,22 +70,22 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def u(self) -> Array:
-        """The inputs as they acted at each row, (n, nu), so within their limits.
+        """The inputs applied at each row, (n, nu), within their limits.
 
-        They are the signals there, or what was held from there on; in the last row what was held
-        over the last step.
+        They are the signals at the row, or the inputs of the step that begins there; the last row
+        has the inputs of the last step.
         """
-        return self._model._within(self._given, self._params)
+        return self._model._within(self._requested_inputs, self._params)
 
     @property
     def saturated(self) -> Array:
-        """Whether each input was beyond its limits at each row, (n, nu)."""
-        given = self._given
-        return np.asarray(np.abs(given - self._model._within(given, self._params)) > 0)
+        """True for each input beyond its limits at each row, (n, nu)."""
+        requested = self._requested_inputs
+        return np.asarray(np.abs(requested - self._model._within(requested, self._params)) > 0)
 
     @property
-    def _given(self) -> Array:
-        """The inputs at each row, (n, nu), whatever their limits."""
+    def _requested_inputs(self) -> Array:
+        """The inputs at each row before saturation, (n, nu)."""
         if self._applied is not None:
             return self._applied
         shape = (len(self), self._model.nu)
@@ -93,56 +94,57 @@ class Trajectory(ConstrainedRun, Columns):
             return np.asarray(signal(self.q, self.qd, self.t, self._params))
         if self._u.ndim == 1:
             return np.broadcast_to(self._u, shape).copy()
-        if not len(self._u):  # no step, and so nothing held
+        if not len(self._u):  # no step, and so no inputs
             return np.full(shape, np.nan, self._u.dtype)
         rows: Array = self._u[np.minimum(np.arange(len(self)) * self.every, self.steps - 1)]
         return rows
 
     @property
     def energy(self) -> Array:
-        """K + P along the run, (n,), J. What is conserved may be `jacobi` instead."""
+        """K + P along the run, (n,), J. The conserved quantity may be `jacobi` instead."""
         if self._energy is None:
-            self._energy = self._values(self._model.energy)
+            self._energy = self._evaluate(self._model.energy)
         return self._energy
 
     @property
     def jacobi(self) -> Array:
-        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic.
+        """Jacobi's integral qd.dK/dqd - K + P along the run, (n,), J.
 
-        Else, as in a frame that is turned, this is what is conserved where there is no power.
+        It equals the energy if K is purely quadratic in qd. Otherwise, as in a rotating frame, it
+        is conserved instead of the energy if the power is zero.
         """
-        return self._values(self._model.jacobi)
+        return self._evaluate(self._model.jacobi)
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
         """The scene's outputs along the run by their names, (n,) each.
 
-        nan where one needs accelerations and D is singular.
+        nan where an output needs accelerations and D is singular.
         """
         model = self._model
         if not model.outputs:
             return {}
-        values = self._driven(model.output)
+        values = self._evaluate_with_inputs(model.output)
         return dict(zip(model.outputs, np.ascontiguousarray(values.T), strict=True))
 
-    def _driven(self, function: Callable[..., Any]) -> Array:
-        """What a function of the state and the inputs gives at each row."""
+    def _evaluate_with_inputs(self, function: Callable[..., Any]) -> Array:
+        """Evaluate a function of the state and the inputs at each row."""
         constant = self._u is None or (self._applied is None and self._u.ndim == 1)
-        return self._values(function, u=self._u if constant else self.u)
+        return self._evaluate(function, u=self._u if constant else self.u)
 
-    def _values(self, function: Callable[..., Any], **held: Any) -> Array:
-        """What a function of the state gives at each row, (n, ...)."""
-        return np.asarray(function(self.q, self.qd, t=self.t, params=self._params, **held))
+    def _evaluate(self, function: Callable[..., Any], **arguments: Any) -> Array:
+        """Evaluate a function of the state at each row, (n, ...)."""
+        return np.asarray(function(self.q, self.qd, t=self.t, params=self._params, **arguments))
 
-    def _even(self) -> Trajectory:
-        """With rows equally far apart, as many as there are steps, or enough to draw it."""
-        return self if self.every == 1 else self._again(1, 1, None, None)
+    def _equidistant(self) -> Trajectory:
+        """Return a run with equidistant rows, one for each step, or enough for a picture."""
+        return self if self.every == 1 else self._repeat(1, 1, None, None)
 
-    def _again(
+    def _repeat(
         self, parts: int, every: int, nudge: Array | None,
         progress: Callable[[int, int], None] | None,
     ) -> Any:  # fmt: skip
-        """The same motion in steps of h/parts, from a start moved by `nudge` (2 nq,)."""
+        """Repeat the run in steps of h/parts, from a start perturbed by `nudge` (2 nq,)."""
         model, x = self._model, self.x[0]
         if nudge is not None:
             x = (x + nudge).astype(model.dtype)
@@ -156,33 +158,34 @@ class Trajectory(ConstrainedRun, Columns):
             progress, self._hold * parts,
         )  # fmt: skip
 
-    def _kept(self) -> dict[str, Any]:
-        """What a saved run keeps of it besides its columns; None: nothing."""
-        held = None if callable(self._u) or isinstance(self._u, str) else self._u
+    def _to_arrays(self) -> dict[str, Any]:
+        """Return the arrays of a saved run in addition to its columns; None is not saved."""
+        u = None if callable(self._u) or isinstance(self._u, str) else self._u
         return {
             "q": self.q, "qd": self.qd, "t0": self.t0, "h": self.h, "steps": self.steps,
-            "status": self.status, "params": self._params, "every": self.every, "held": held,
+            "status": self.status, "params": self._params, "every": self.every, "held": u,
             "method": self.method, "evaluations": self.evaluations, "applied": self._applied,
             "singular_steps": self.singular_steps, "first_singular": self.first_singular,
         }  # fmt: skip
 
     @classmethod
-    def _of_kept(cls, model: Stepping, kept: Mapping[str, Any], **own: Any) -> Self:
-        applied = kept.get("applied")
-        u = kept.get("held") if applied is None else LEFT_OUT
+    def _from_arrays(cls, model: Stepping, arrays: Mapping[str, Any], **own: Any) -> Self:
+        applied = arrays.get("applied")
+        u = arrays.get("held") if applied is None else LEFT_OUT
         run = cls(
-            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
-            kept["params"], kept["every"], u, kept["method"], kept["evaluations"], **own,
+            model, arrays["t0"], (arrays["q"], arrays["qd"]), arrays["h"], arrays["steps"],
+            arrays["status"], arrays["params"], arrays["every"], u, arrays["method"],
+            arrays["evaluations"], **own,
         )  # fmt: skip
         run._applied = applied
         for name in ("singular_steps", "first_singular"):
-            setattr(run, name, kept.get(name, getattr(run, name)))
+            setattr(run, name, arrays.get(name, getattr(run, name)))
         return run
 
     def _state(self) -> dict[str, Any]:
-        """All but what is made when it is asked for."""
-        made = ("t", "q", "qd", "outputs")
-        return {name: value for name, value in self.__dict__.items() if name not in made}
+        """Return all attributes except cached ones."""
+        derived = ("t", "q", "qd", "outputs")
+        return {name: value for name, value in self.__dict__.items() if name not in derived}
 
     @classmethod
     def _of_state(cls, state: dict[str, Any]) -> Self:
@@ -198,7 +201,7 @@ class Trajectory(ConstrainedRun, Columns):
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = self._state()
-        del state["_model"]  # the build that reads it has its own
+        del state["_model"]  # the build that reads the pickle has its own
         if callable(self._u):
             state["_u"] = LEFT_OUT
         kind = type(self)
@@ -225,8 +228,8 @@ class Trajectory(ConstrainedRun, Columns):
         return np.hstack([self.q, self.qd])
 
     @property
-    def told(self) -> str:
-        """How its steps were chosen, in words."""
+    def description(self) -> str:
+        """The choice of the steps as text."""
         return f"h = {self.h:g} s"
 
     def __len__(self) -> int:
