@@ -14,8 +14,10 @@ from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.schema import BodyTable, Document, PointTable
 from eomc.scene.scope import Checker, Path, cycle_text, find_cycles
 from eomc.scene.validate_coordinates import FRICTION_WIDTH, check_width
-from eomc.scene.validate_joints import JointChecks
-from eomc.scene.validate_values import ORIGIN, ZERO
+from eomc.scene.validate_joints import JointChecker
+from eomc.scene.validate_loops import LoopChecker
+from eomc.scene.validate_springs import check_damper, check_force, check_spring
+from eomc.scene.validate_values import ORIGIN, ZERO, ValueChecker
 
 _JOINT_KEYS = (
     "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
@@ -48,16 +50,18 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     return _Bodies(check, doc, known).assembly()
 
 
-class _Bodies(JointChecks):
+class _Bodies:
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
-        super().__init__(check, doc, known)
+        self.check, self.doc = check, doc
+        self.values = ValueChecker(check, doc, known)
+        self.joints = JointChecker(self.values)
         self.bodies: dict[str, Body] = {}
 
     def assembly(self) -> Assembly:
         gravity = self._gravity()
-        self._names()
-        for name, path in self.names.items():
-            entry = self._entry(name)
+        self._check_names()
+        for name, path in self.values.names.items():
+            entry = self.joints.entry(name)
             if isinstance(entry, PointTable):
                 self._check_point(path, entry)
             elif entry.position is None:
@@ -67,12 +71,13 @@ class _Bodies(JointChecks):
         self._check_shared_coordinates()
         ordered = self._sorted_bodies()
         self._check_inertia(ordered)
-        springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
-        dampers = [self._damper(("damper", k), e) for k, e in self.doc.damper.items()]
-        forces = [self._force(("force", k), e) for k, e in self.doc.force.items()]
-        loops = [self._loop(("loop", k), e) for k, e in self.doc.loop.items()]
+        springs = [check_spring(self.values, ("spring", k), e) for k, e in self.doc.spring.items()]
+        dampers = [check_damper(self.values, ("damper", k), e) for k, e in self.doc.damper.items()]
+        forces = [check_force(self.values, ("force", k), e) for k, e in self.doc.force.items()]
+        loop_checker = LoopChecker(self.values)
+        loops = [loop_checker.loop(("loop", k), e) for k, e in self.doc.loop.items()]
         return Assembly(
-            plane=self.dimension == 2,
+            plane=self.values.dimension == 2,
             gravity=gravity,
             bodies=tuple(ordered),
             springs=tuple(springs),
@@ -87,7 +92,7 @@ class _Bodies(JointChecks):
         entries = self.doc.gravity
         if entries is None:
             if self.doc.body:
-                self.dimension = None
+                self.values.dimension = None
                 if ("gravity",) not in self.check.repaired:
                     self.check.report(
                         ("gravity",),
@@ -96,16 +101,16 @@ class _Bodies(JointChecks):
                     )
             return ORIGIN
         if len(entries) not in (2, 3):
-            self.dimension = None
+            self.values.dimension = None
             self.check.report(
                 ("gravity",),
                 f"has two entries in a plane scene and three in space, here {len(entries)}",
             )
             return ORIGIN
-        self.dimension = len(entries)
-        return self._vector(("gravity",), entries)
+        self.values.dimension = len(entries)
+        return self.values.vector(("gravity",), entries)
 
-    def _names(self) -> None:
+    def _check_names(self) -> None:
         entries = [(("body", label), entry.name) for label, entry in self.doc.body.items()]
         entries += [(("point", label), entry.name) for label, entry in self.doc.point.items()]
         for place, name in entries:
@@ -117,11 +122,11 @@ class _Bodies(JointChecks):
                     path, "'world' is the frame that does not move: name the body otherwise"
                 )
                 continue
-            elif name in self.names:
-                what = f"{self.names[name][0]} above"
+            elif name in self.values.names:
+                what = f"{self.values.names[name][0]} above"
                 self.check.report(path, f"'{name}' is the name of a {what}: rename one of the two")
                 continue
-            self.names[name] = place
+            self.values.names[name] = place
         for name in sorted(self.check.centers & {*self.check.tables}):
             body = name[:-2]
             self.check.report(
@@ -149,27 +154,31 @@ class _Bodies(JointChecks):
                 )
                 remedy = ", and let forces act through [forces]" if key == "actuator" else ""
                 self.check.report((*path, key), f"{why}: remove '{key}'{remedy}")
-        mass, inertia = self._mass(path, entry)
+        mass, inertia = self.values.mass(path, entry)
         self.bodies[entry.name] = Body(
             name=entry.name,
             mass=mass,
             inertia=inertia,
             center=ORIGIN,
-            rotation=self._rotation((*path, "rotation"), entry.rotation, self._position_formula),
-            position=self._vector((*path, "position"), entry.position, self._position_formula),
+            rotation=self.values.rotation(
+                (*path, "rotation"), entry.rotation, self.values.position_formula
+            ),
+            position=self.values.vector(
+                (*path, "position"), entry.position, self.values.position_formula
+            ),
             note=entry.note,
         )
 
     def _center_text(self, name: str) -> str:
-        point = self.names.get(name, ("body",))[0] == "point"
+        point = self.values.names.get(name, ("body",))[0] == "point"
         return f"point '{name}'" if point else f"the centre of mass of body '{name}'"
 
     def _check_point(self, path: Path, entry: PointTable) -> None:
         """Check a [[point]], which is a massless body on a fixed joint."""
-        place = self._vector((*path, "place"), entry.place)
-        rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
-        parent = self._parent((*path, "body"), entry.name, entry.body)
-        self.has_inertia[entry.name] = False
+        place = self.values.vector((*path, "place"), entry.place)
+        rotation = self.values.rotation((*path, "rotation"), entry.rotation, self.values.formula)
+        parent = self.joints.parent((*path, "body"), entry.name, entry.body)
+        self.values.has_inertia[entry.name] = False
         if parent is not None:
             self.bodies[entry.name] = Body(
                 name=entry.name,
@@ -187,25 +196,25 @@ class _Bodies(JointChecks):
     def _check_jointed_body(self, path: Path, entry: BodyTable) -> None:
         """Check a body on a joint."""
         check = self.check
-        joint = self._joint(path, entry)
-        parent = self._parent((*path, "parent"), entry.name, entry.parent)
-        mass, inertia = self._mass(path, entry)
-        center = self._vector((*path, "center"), entry.center)
-        offset = self._vector((*path, "offset"), entry.offset)
-        rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
+        joint = self.joints.kind(path, entry)
+        parent = self.joints.parent((*path, "parent"), entry.name, entry.parent)
+        mass, inertia = self.values.mass(path, entry)
+        center = self.values.vector((*path, "center"), entry.center)
+        offset = self.values.vector((*path, "offset"), entry.offset)
+        rotation = self.values.rotation((*path, "rotation"), entry.rotation, self.values.formula)
         if not joint:
             return
-        coordinates = self._coordinates((*path, "coordinates"), joint, entry)
-        axes = self._axes((*path, "axis"), joint, entry)
+        coordinates = self.joints.coordinates((*path, "coordinates"), joint, entry)
+        axes = self.joints.axes((*path, "axis"), joint, entry)
         per_coordinate: dict[str, Any] = {
-            key: self._per_coordinate((*path, key), joint, getattr(entry, key))
+            key: self.joints.per_coordinate((*path, key), joint, getattr(entry, key))
             for key in ("armature", "damping", "friction", "actuator")
         }
         width = None
         if per_coordinate["friction"]:
             width = FRICTION_WIDTH
         if entry.friction_width is not None:
-            width, value = self._value((*path, "friction_width"), entry.friction_width)
+            width, value = self.values.value((*path, "friction_width"), entry.friction_width)
             check_width(check, path, value, width, entry.friction)
         if parent is None or coordinates is None:
             return
@@ -227,14 +236,14 @@ class _Bodies(JointChecks):
 
     def _check_shared_coordinates(self) -> None:
         """Report joints that share a coordinate while another one is unused: likely a slip."""
-        taken = {*self.first_body, *self.check.used}
+        taken = {*self.joints.first_body, *self.check.used}
         idle = [c for c in self.doc.coordinates if not {c, f"{c}_dot"} & taken]
         for body in self.bodies.values() if idle else ():
             for text in (formula.text for formula in body.coordinates):
-                first = self.first_body.get(text, body.name)
+                first = self.joints.first_body.get(text, body.name)
                 if first != body.name:
                     self.check.report(
-                        (*self.names[body.name], "coordinates"),
+                        (*self.values.names[body.name], "coordinates"),
                         f"'{text}' moves the joint of '{first}' already, and '{idle[0]}' moves "
                         f"none; did you mean '{idle[0]}'?",
                         text=text,
@@ -246,7 +255,7 @@ class _Bodies(JointChecks):
         """Return the bodies, parents before children, else in their order; cycles are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
         for ring in islice(find_cycles(graph), MOST):
-            place = self.names[ring[0]]
+            place = self.values.names[ring[0]]
             self.check.report(
                 (*place, "body" if place[0] == "point" else "parent"),
                 f"the parents form a loop: {cycle_text(ring)}; let one of them be held by the "
@@ -277,22 +286,24 @@ class _Bodies(JointChecks):
         rows = self.doc.loop or self.doc.constraints
         if self.doc.energy.kinetic != 0.0 or rows or any(body.position for body in ordered):
             return
-        carries = dict(self.has_inertia)
+        carries = dict(self.values.has_inertia)
         for body in reversed(ordered):
             if body.parent in carries:
                 carries[body.parent] |= carries[body.name]
         reported: set[str] = set()
         heavy = [b for b in ordered if carries[b.name] or b.armature]
-        resisted = self._coordinates_in(formula for body in heavy for formula in body.coordinates)
+        resisted = self.joints.coordinates_in(
+            formula for body in heavy for formula in body.coordinates
+        )
         for body in ordered:
-            moved = self._coordinates_in(body.coordinates)
+            moved = self.joints.coordinates_in(body.coordinates)
             if body.parent in reported or not moved or moved.keys() & resisted:
                 continue
             reported.add(body.name)
             resisted |= moved  # once
             by = " and ".join(formula.text for formula in body.coordinates)
             self.check.report(
-                self.names[body.name],
+                self.values.names[body.name],
                 f"nothing that {by} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",
             )

@@ -8,28 +8,29 @@ from typing import Any
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import JOINT_ALIASES, JOINTS, Z
-from eomc.scene.schema import BodyTable, Document, PointTable
-from eomc.scene.scope import Checker, Path
-from eomc.scene.validate_loops import LoopChecks
-from eomc.scene.validate_values import ZERO
+from eomc.scene.schema import BodyTable, PointTable
+from eomc.scene.scope import Path
+from eomc.scene.validate_values import ZERO, ValueChecker
 
 
-class JointChecks(LoopChecks):
+class JointChecker:
     """Checks how bodies are attached and moved."""
 
-    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
-        super().__init__(check, doc, known)
+    def __init__(self, values: ValueChecker) -> None:
+        self.values = values
+        self.check, self.doc = values.check, values.doc
         self.first_body: dict[str, str] = {}  # first body that each coordinate moves
 
-    def _entry(self, name: str) -> BodyTable | PointTable:
-        array, label = self.names[name]
+    def entry(self, name: str) -> BodyTable | PointTable:
+        """Return the table of a body or point."""
+        array, label = self.values.names[name]
         entries: Mapping[str, BodyTable | PointTable] = getattr(self.doc, array)
         return entries[label]
 
-    def _joint(self, path: Path, entry: BodyTable) -> str:
+    def kind(self, path: Path, entry: BodyTable) -> str:
         """Return the kind of joint; "" if it is unknown, which is reported."""
         check, joint = self.check, entry.joint
-        known = [k for k, kind in JOINTS.items() if kind.plane or self.dimension != 2]
+        known = [k for k, kind in JOINTS.items() if kind.plane or self.values.dimension != 2]
         if joint is None:
             if {(*path, "joint"), (*path, "position")} & check.repaired:
                 return ""  # reported already
@@ -54,18 +55,18 @@ class JointChecks(LoopChecks):
             return ""
         return joint
 
-    def _parent(self, path: Path, name: str, parent: str | None) -> str | None:
+    def parent(self, path: Path, name: str, parent: str | None) -> str | None:
         """Return the parent of body `name`; None if it can't be a parent, which is reported."""
         if parent is None or parent == WORLD:
             return WORLD
-        if parent not in self.names:
-            remedy = suggest(parent, [WORLD, *self.names]) or ": declare it as a [[body]]"
+        if parent not in self.values.names:
+            remedy = suggest(parent, [WORLD, *self.values.names]) or ": declare it as a [[body]]"
             self.check.report(path, f"there is no body '{parent}'{remedy}", text=parent)
         elif parent == name:
             self.check.report(
                 path, f"'{parent}' is its own parent: name another body, or world", text=parent
             )
-        elif getattr(self._entry(parent), "position", None) is not None:
+        elif getattr(self.entry(parent), "position", None) is not None:
             self.check.report(
                 path,
                 f"'{parent}' is placed by formulas, and can't be a parent: give it a joint, "
@@ -76,7 +77,8 @@ class JointChecks(LoopChecks):
             return parent
         return None
 
-    def _coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[Formula, ...] | None:
+    def coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[Formula, ...] | None:
+        """Return the checked formulas of the joint's displacements; None after an error."""
         check, written, count = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
         if path in check.repaired:
             return None
@@ -92,7 +94,7 @@ class JointChecks(LoopChecks):
             return None
         checked = [self._coordinate(path, text) for text in written]
         sound = tuple(formula for formula in checked if formula)
-        for name in self._coordinates_in(sound):
+        for name in self.coordinates_in(sound):
             self.first_body.setdefault(name, entry.name)
         return sound if len(sound) == len(checked) else None
 
@@ -108,7 +110,7 @@ class JointChecks(LoopChecks):
             check.report(path, why, text=text)
             return None
         rule = "a joint moves by coordinates, or formulas of coordinates, parameters and constants"
-        formula = check.formula(path, text, {*self.known, *coordinates}, rule)
+        formula = check.formula(path, text, {*self.values.known, *coordinates}, rule)
         if formula is None:
             return None
         fault = ""
@@ -122,36 +124,36 @@ class JointChecks(LoopChecks):
         check.check_smooth(path, formula)
         return formula
 
-    def _coordinates_in(self, formulas_: Iterable[Formula]) -> dict[str, None]:
+    def coordinates_in(self, formulas_: Iterable[Formula]) -> dict[str, None]:
         """Return the coordinates that occur in formulas."""
         names_used = (node.id for formula in formulas_ for node in formula.names())
         return dict.fromkeys(name for name in names_used if name in self.doc.coordinates)
 
-    def _axes(
+    def axes(
         self, path: Path, joint: str, entry: BodyTable
     ) -> tuple[tuple[float, float, float], ...]:
         """Return the checked unit axes; the joint's defaults if none are given."""
         check, axis_count = self.check, JOINTS[joint].axis_count
-        if path in check.repaired or self.dimension is None:
+        if path in check.repaired or self.values.dimension is None:
             return ()
         written = entry.axis
         if written is None:
             if axis_count and not JOINTS[joint].defaults:
-                example = "[1, 0]" if self.dimension == 2 else "[1, 0, 0]"
+                example = "[1, 0]" if self.values.dimension == 2 else "[1, 0, 0]"
                 check.report(path, f"missing: a {joint} joint slides along one, axis = {example}")
                 return (Z,) * axis_count
             return JOINTS[joint].defaults
         if not axis_count:
             check.report(path, f"a {joint} joint has no axis to choose: remove it")
             return ()
-        if joint == "revolute" and self.dimension == 2:
+        if joint == "revolute" and self.values.dimension == 2:
             check.report(path, "in a plane scene joints turn about z: remove it")
             return ()
         if len(written) != axis_count:
             count = "one axis" if axis_count == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
             check.report(path, f"a {joint} joint has {count}, here {len(written)}")
             return ()
-        axes = [names_used for axis in written if (names_used := self._unit(path, axis))]
+        axes = [names_used for axis in written if (names_used := self.values.unit(path, axis))]
         if len(axes) < len(written):
             return ()
         if len(axes) == 2 and abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1 - 1e-9:
@@ -160,7 +162,7 @@ class JointChecks(LoopChecks):
             )
         return tuple(axes)
 
-    def _per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
+    def per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
         """Return one checked formula for each coordinate of the joint."""
         count, key = len(JOINTS[joint].motions), path[-1]
         if written is None:
@@ -175,7 +177,7 @@ class JointChecks(LoopChecks):
             return ()
         if key == "actuator":
             return tuple(self.check.formula(path, entry) or ZERO for entry in entries)
-        checked = [self._value(path, entry) for entry in entries]
+        checked = [self.values.value(path, entry) for entry in entries]
         for formula, value in checked:
             if value < 0 and key != "damping":
                 self.check.report(path, f"is {value:g}, and can't be negative", text=formula.text)

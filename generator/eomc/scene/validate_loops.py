@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from eomc.base import names
 from eomc.scene.assembly import WORLD, Loop, Vector
 from eomc.scene.formulas import nearest, suggest
 from eomc.scene.joints import CLOSING_ALIASES, CLOSINGS
-from eomc.scene.schema import Document, LoopTable
-from eomc.scene.scope import Checker, Path
+from eomc.scene.schema import LoopTable
+from eomc.scene.scope import Path
 from eomc.scene.validate_constraints import row_name_fault
-from eomc.scene.validate_springs import SpringChecks
-from eomc.scene.validate_values import ORIGIN, ZERO
+from eomc.scene.validate_values import ORIGIN, ZERO, ValueChecker
 
 _AXES_IN_WORDS = {
     1: "one axis, or one in each body's frame",
@@ -21,17 +19,18 @@ _AXES_IN_WORDS = {
 }
 
 
-class LoopChecks(SpringChecks):
-    """Checks the table [[loop]]."""
+class LoopChecker:
+    """Checks the entries of [[loop]]; the names of their constraint equations differ."""
 
-    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
-        super().__init__(check, doc, known)
-        self.rows = {*doc.constraints}  # names of constraint equations so far
+    def __init__(self, values: ValueChecker) -> None:
+        self.values = values
+        self.check, self.doc = values.check, values.doc
+        self.rows = {*values.doc.constraints}  # names of constraint equations so far
 
-    def _loop(self, path: Path, entry: LoopTable) -> Loop | None:
+    def loop(self, path: Path, entry: LoopTable) -> Loop | None:
         """Return the checked loop; None if its joint is unknown, which is reported."""
-        kind = self._closing(path, entry)
-        if not kind or self.dimension is None:
+        kind = self._kind(path, entry)
+        if not kind or self.values.dimension is None:
             return None
         if kind == "gear":
             parts = self._gear(path, entry)
@@ -41,7 +40,9 @@ class LoopChecks(SpringChecks):
                 "bodies": bodies,
                 "points": self._ends(path, entry),
                 "axes": self._axes_of_loop((*path, "axis"), kind, entry),
-                "rotation": self._rotation((*path, "rotation"), entry.rotation, self._formula),
+                "rotation": self.values.rotation(
+                    (*path, "rotation"), entry.rotation, self.values.formula
+                ),
                 "length": self._distance((*path, "length"), kind, entry),
             }
         self._report_foreign_keys(path, kind, entry)
@@ -49,11 +50,11 @@ class LoopChecks(SpringChecks):
         self._check_row_names(path, loop)
         return loop
 
-    def _closing(self, path: Path, entry: LoopTable) -> str:
+    def _kind(self, path: Path, entry: LoopTable) -> str:
         """Return the kind of joint; "" if there is no such kind, which is reported."""
         if (*path, "joint") in self.check.repaired:
             return ""
-        known = [k for k, kind in CLOSINGS.items() if kind.plane or self.dimension != 2]
+        known = [k for k, kind in CLOSINGS.items() if kind.plane or self.values.dimension != 2]
         joint = entry.joint
         if joint in known:
             return joint
@@ -79,12 +80,12 @@ class LoopChecks(SpringChecks):
                 what = 'missing: name the two that it joins, bodies = ["coupler", "rocker"]'
                 check.report((*path, "bodies"), what)
             return (WORLD, WORLD)
-        return self._two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
+        return self.values.two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
 
     def _ends(self, path: Path, entry: LoopTable) -> tuple[Vector, ...]:
         """Return the position of the joint in the frame of each body; the origin of a [[point]]."""
         if entry.points is not None:
-            one, other = (self._vector((*path, "points"), point) for point in entry.points)
+            one, other = (self.values.vector((*path, "points"), point) for point in entry.points)
             return one, other
         declared = {point.name for point in self.doc.point.values()}
         if (
@@ -92,7 +93,9 @@ class LoopChecks(SpringChecks):
             and not declared.issuperset(entry.bodies)
             and (*path, "points") not in self.check.repaired
         ):
-            example = '[[0, 0], ["l", 0]]' if self.dimension == 2 else '[[0, 0, 0], ["l", 0, 0]]'
+            example = (
+                '[[0, 0], ["l", 0]]' if self.values.dimension == 2 else '[[0, 0, 0], ["l", 0, 0]]'
+            )
             self.check.report(
                 (*path, "points"),
                 f"missing: add points = {example}, where the joint is in the frame of each body",
@@ -104,18 +107,18 @@ class LoopChecks(SpringChecks):
     ) -> tuple[tuple[float, float, float], ...]:
         """Return the axis in the frame of each body."""
         check, joint, written = self.check, CLOSINGS[kind], entry.axis
-        across = "u" in joint.rows(self.dimension == 2)
-        axis_count = joint.axes if self.dimension == 3 or across else 0
+        across = "u" in joint.rows(self.values.dimension == 2)
+        axis_count = joint.axes if self.values.dimension == 3 or across else 0
         if path in check.repaired:
             return ()
         if written is None:
             if axis_count and not joint.defaults:
-                example = "[1, 0]" if self.dimension == 2 else "[1, 0, 0]"
+                example = "[1, 0]" if self.values.dimension == 2 else "[1, 0, 0]"
                 why = f"missing: a {kind} joint slides along one, of the first body"
                 check.report(path, f"{why}: axis = {example}")
             return joint.defaults if axis_count else ()
         if not axis_count:
-            plane = joint.axes and self.dimension == 2
+            plane = joint.axes and self.values.dimension == 2
             why = (
                 "in a plane scene joints turn about z"
                 if plane
@@ -123,7 +126,7 @@ class LoopChecks(SpringChecks):
             )
             check.report(path, f"{why}: remove it")
             return ()
-        axes = [unit for axis in written if (unit := self._unit(path, axis))]
+        axes = [unit for axis in written if (unit := self.values.unit(path, axis))]
         if len(axes) < len(written):
             return ()
         single = not joint.defaults  # one axis, in the first body's frame
@@ -140,9 +143,9 @@ class LoopChecks(SpringChecks):
         if entry.length is None:
             self.check.report(path, 'missing: add length = "l", between the two points, m')
             return None
-        length, value = self._value(path, entry.length)
+        length, value = self.values.value(path, entry.length)
         if value <= 0:
-            meet = "revolute" if self.dimension == 2 else "spherical"
+            meet = "revolute" if self.values.dimension == 2 else "spherical"
             why = f"is {value:g}, and must be greater than zero: points that meet are '{meet}'"
             self.check.report(path, why, text=length.text)
         return length
@@ -165,19 +168,19 @@ class LoopChecks(SpringChecks):
             check.report((*path, "coordinates"), why)
         ratio = ZERO
         if entry.ratio is not None:
-            ratio, value = self._value((*path, "ratio"), entry.ratio)
+            ratio, value = self.values.value((*path, "ratio"), entry.ratio)
             if value == 0:
                 why = "is 0, so that the second coordinate does not move: give it no coordinate"
                 check.report((*path, "ratio"), why, text=ratio.text)
         elif (*path, "ratio") not in check.repaired:
             why = 'missing: add ratio = "n", of the second coordinate over the first'
             check.report((*path, "ratio"), why)
-        offset = self._formula((*path, "offset"), entry.offset) if entry.offset else ZERO
+        offset = self.values.formula((*path, "offset"), entry.offset) if entry.offset else ZERO
         return {"coordinates": coordinates, "ratio": ratio, "offset": offset}
 
     def _report_foreign_keys(self, path: Path, kind: str, entry: LoopTable) -> None:
         """Report keys that belong to other kinds of joints."""
-        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.dimension == 2))
+        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.values.dimension == 2))
         of_bodies = kind != "gear"
         belongs = {
             "bodies": of_bodies, "points": of_bodies, "axis": of_bodies, "rotation": turned,
@@ -203,7 +206,7 @@ class LoopChecks(SpringChecks):
             why = f"'{loop.name}' is a loop already: rename one of the two"
             check.report(path, why, text=loop.name)
         else:
-            for name in loop.rows(self.dimension == 2).values():
+            for name in loop.rows(self.values.dimension == 2).values():
                 why = row_name_fault(check, self.doc, name)
                 if not why and name in self.rows:
                     why = f"'{name}' is a row of another constraint"

@@ -10,8 +10,8 @@ from mpmath import mp
 
 from eomc.base import spatial
 from eomc.scene import formulas
-from eomc.scene.assembly import Turn, Vector
-from eomc.scene.formulas import Formula
+from eomc.scene.assembly import WORLD, Turn, Vector
+from eomc.scene.formulas import Formula, suggest
 from eomc.scene.schema import BodyTable, Document
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
 
@@ -21,7 +21,7 @@ ZERO = formulas.parse("0")
 ORIGIN: Vector = (ZERO, ZERO, ZERO)
 
 
-class ValueChecks:
+class ValueChecker:
     """Checks vectors, rotations, masses and inertias; errors are reported to `check`."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
@@ -31,24 +31,25 @@ class ValueChecks:
         self.names: dict[str, Path] = {}  # place of each body and point
         # 2 or 3 components of a vector; None if gravity is missing or faulty
         self.dimension: int | None = 2
-        self.values: dict[float | str, tuple[Formula, float]] = {}  # valid formulas by their text
+        self.checked: dict[float | str, tuple[Formula, float]] = {}  # valid formulas by their text
         self.has_inertia: dict[str, bool] = {}
 
-    def _value(self, path: Path, value: float | str) -> tuple[Formula, float]:
+    def value(self, path: Path, value: float | str) -> tuple[Formula, float]:
         """Return a checked formula of parameters and its default value; (0, nan) after an error."""
-        if value not in self.values:
+        if value not in self.checked:
             rule = f"'{path[-1]}' is made of numbers, constants and parameters"
             formula = self.check.formula(path, value, self.known, rule)
             number = self.check.number(path, formula, self.known)
             if formula is None or math.isnan(number):
                 return ZERO, math.nan
-            self.values[value] = formula, number
-        return self.values[value]
+            self.checked[value] = formula, number
+        return self.checked[value]
 
-    def _formula(self, path: Path, value: float | str) -> Formula:
-        return self._value(path, value)[0]
+    def formula(self, path: Path, value: float | str) -> Formula:
+        """Return a checked formula of parameters; 0 after an error."""
+        return self.value(path, value)[0]
 
-    def _position_formula(self, path: Path, value: float | str) -> Formula:
+    def position_formula(self, path: Path, value: float | str) -> Formula:
         """Return a checked formula of all names except inputs and velocities, without dot."""
         check = self.check
         formula = check.formula(path, value)
@@ -74,19 +75,21 @@ class ValueChecks:
         check.check_smooth(path, formula)
         return formula
 
-    def _vector(
+    def vector(
         self,
         path: Path,
         entries: Sequence[float | str] | None,
         formula: Callable[[Path, float | str], Formula] | None = None,
     ) -> Vector:
-        if entries is None or not self._fits(path, len(entries)):
+        """Return three checked formulas, by `formula` if it is given; zeros after an error."""
+        if entries is None or not self.fits(path, len(entries)):
             return ORIGIN
-        checked = [(formula or self._formula)(path, entry) for entry in entries]
+        checked = [(formula or self.formula)(path, entry) for entry in entries]
         x, y, z = (*checked, ZERO, ZERO, ZERO)[:3]
         return x, y, z
 
-    def _fits(self, path: Path, entries: int) -> bool:
+    def fits(self, path: Path, entries: int) -> bool:
+        """Return True if a vector has as many entries as the scene has dimensions."""
         if self.dimension is None or entries == self.dimension:
             return self.dimension is not None
         scene = "a plane scene" if self.dimension == 2 else "space"
@@ -98,9 +101,9 @@ class ValueChecks:
         )
         return False
 
-    def _unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
+    def unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
         """Return the axis normalised to length one; None after an error."""
-        if not self._fits(path, len(axis)):
+        if not self.fits(path, len(axis)):
             return None
         size = math.hypot(*axis)
         if size < 1e-9:
@@ -109,9 +112,21 @@ class ValueChecks:
         x, y, *third = (entry / size for entry in axis)
         return x, y, third[0] if third else 0.0
 
-    def _rotation(
+    def two_bodies(self, path: Path, bodies: tuple[str, ...], kind: str) -> tuple[str, str]:
+        """Check that two bodies, one of which may be the world, exist and differ."""
+        for name in bodies:
+            if name != WORLD and name not in self.names:
+                remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
+                self.check.report(path, f"there is no body '{name}'{remedy}", text=name)
+        first, second = bodies
+        if first == second:
+            self.check.report(path, f"{kind} between two bodies, here both are '{first}'")
+        return first, second
+
+    def rotation(
         self, path: Path, rotation: Any, formula: Callable[[Path, float | str], Formula]
     ) -> tuple[Turn, ...]:
+        """Return the checked turns of a rotation, whose angles are checked by `formula`."""
         if rotation is None:
             return ()
         if not isinstance(rotation, tuple):
@@ -126,9 +141,9 @@ class ValueChecks:
                 break
         return tuple(Turn(axis, formula(path, angle)) for axis, angle in rotation)
 
-    def _mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
+    def mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
         """Return the checked mass and inertia."""
-        mass, value = self._value((*path, "mass"), entry.mass)
+        mass, value = self.value((*path, "mass"), entry.mass)
         if value < 0:
             self.check.report(
                 (*path, "mass"), f"is {value:g} kg, and no mass is negative", text=mass.text
@@ -154,7 +169,7 @@ class ValueChecks:
                 f"[Ixx, Iyy, Izz, Ixy, Ixz, Iyz], here {here}",
             )
             return nothing, [math.nan]
-        checked = [self._value(path, entry) for entry in entries]
+        checked = [self.value(path, entry) for entry in entries]
         moments, numbers = [f for f, _ in checked], [v for _, v in checked]
         if self.dimension == 2:
             if numbers[0] < 0:
