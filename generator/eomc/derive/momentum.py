@@ -22,8 +22,8 @@ def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
     Raises SceneError if no moving body has mass. Returns the tape and the values.
     """
     tape = Tape(leaves(system, *system.qdd))
-    sweep = _Masses(tape, system, [f for f in system.frames if f.mass != 0])
-    parts = list(sweep.parts())
+    sweep = Sweep(tape, system, [f for f in system.frames if f.mass != 0])
+    parts = list(_parts(sweep))
     mass = sweep.add(*(m for m, *_ in parts))
     if mass is S.Zero:
         raise SceneError([system.problem("run.momentum", "no body that moves has a mass")])
@@ -33,37 +33,39 @@ def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
     return tape, (mass, *center[: sweep.d], *sweep.flat(linear, about))
 
 
-class _Masses(Sweep):
-    """Masses and momenta of the bodies."""
+# position, axes, velocity and angular velocity of a body, along the world's axes
+_Motion = tuple[Vector, Sequence[Vector], Vector, Vector]
 
-    def parts(self) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
-        """Yield mass, first moment, momentum and angular momentum about the world's origin of each
-        body.
-        """
-        for k, link in enumerate(self.links):
-            yield self.part(
-                self.origin[k], self.columns[k], self.velocity[k], self.spin[k],
-                self.define(link.mass), self.world(k, self.vector(link.moment)), link.inertia,
-            )  # fmt: skip
-        for f in self.frames:
-            frame_state = self.frame(f)
-            columns = list(zip(*frame_state.rotation, strict=True))
-            yield self.part(
-                frame_state.at, columns, *frame_state.velocity, self.define(f.mass), ZERO, f.inertia
-            )
 
-    def part(
-        self, at: Vector, columns: Sequence[Vector], v: Vector, omega: Vector, mass: Expr,
-        moment: Vector, inertia: Sequence[Expr],
-    ) -> tuple[Expr, Vector, Vector, Vector]:  # fmt: skip
-        """Return the same quantities for one body. `moment` (along the world's axes) and `inertia`
-        refer to the point `at`.
-        """
-        tensor = [[S.Zero] * 3 for _ in range(3)]
-        for (i, j), entry in zip(ENTRIES, inertia, strict=True):
-            tensor[i][j] = tensor[j][i] = self.define(entry)
-        spin_in_body = self.apply(tensor, self.apply(columns, omega))
-        spin = self.plus(*(self.scaled(c, x) for c, x in zip(columns, spin_in_body, strict=True)))
-        linear = self.plus(self.scaled(v, mass), self.cross(omega, moment))
-        angular = self.plus(spin, self.cross(moment, v), self.cross(at, linear))
-        return mass, self.plus(self.scaled(at, mass), moment), linear, angular
+def _parts(sweep: Sweep) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
+    """Yield the mass, first moment, momentum and angular momentum of each body.
+
+    The moments are about the world's origin.
+    """
+    for k, link in enumerate(sweep.links):
+        motion = sweep.origin[k], sweep.columns[k], sweep.velocity[k], sweep.spin[k]
+        moment = sweep.world(k, sweep.vector(link.moment))
+        yield _part(sweep, motion, sweep.define(link.mass), moment, link.inertia)
+    for f in sweep.frames:
+        frame = sweep.frame(f)
+        columns = list(zip(*frame.rotation, strict=True))
+        motion = frame.at, columns, *frame.velocity
+        yield _part(sweep, motion, sweep.define(f.mass), ZERO, f.inertia)
+
+
+def _part(
+    sweep: Sweep, motion: _Motion, mass: Expr, moment: Vector, inertia: Sequence[Expr]
+) -> tuple[Expr, Vector, Vector, Vector]:
+    """Return the same quantities for one body.
+
+    `moment` (along the world's axes) and `inertia` refer to the position in `motion`.
+    """
+    at, columns, v, omega = motion
+    tensor = [[S.Zero] * 3 for _ in range(3)]
+    for (i, j), entry in zip(ENTRIES, inertia, strict=True):
+        tensor[i][j] = tensor[j][i] = sweep.define(entry)
+    spin_in_body = sweep.apply(tensor, sweep.apply(columns, omega))
+    spin = sweep.plus(*(sweep.scaled(c, x) for c, x in zip(columns, spin_in_body, strict=True)))
+    linear = sweep.plus(sweep.scaled(v, mass), sweep.cross(omega, moment))
+    angular = sweep.plus(spin, sweep.cross(moment, v), sweep.cross(at, linear))
+    return mass, sweep.plus(sweep.scaled(at, mass), moment), linear, angular
