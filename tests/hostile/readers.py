@@ -38,7 +38,7 @@ with atheris.instrument_imports(include=["eomc"]):
     from eomc.base.errors import EomcError
     from eomc.cli.main import COMMANDS, main
     from eomc.model.from_scene import from_scene
-    from eomc.robots import edit, scene_text, stops, urdf
+    from eomc.robots import edit, joint_stops, scene_text, urdf
     from eomc.robots.mjcf import read as mjcf
     from eomc.scene import formulas
     from eomc.scene.read import parse
@@ -96,7 +96,7 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     path.write_bytes(data)
 
     def stopped(robot: Any) -> Any:
-        return edit.stopped(robot) if stops.stops(robot) else robot
+        return edit.stopped(robot) if joint_stops.joint_stops(robot) else robot
 
     def made() -> None:
         robot = reader(path)

@@ -16,14 +16,14 @@ from eomc.base.errors import EomcError
 from eomc.report import animation
 from eomc.report.drawing import drawing
 from eomc.report.labels import html_name
-from eomc.report.reel import Reel, part, which
 from eomc.report.system_of_run import system_of
+from eomc.report.timeline import Timeline, instance_numbers, select_instances
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
 
 def page(made, title="", **how):
-    return animation.page([Reel(system(made, title), motion(made, **how))])
+    return animation.page([Timeline(system(made, title), motion(made, **how))])
 
 
 def data(text):
@@ -48,7 +48,9 @@ def test_nothing_is_asked_of_a_network():
 
 
 def test_titles_are_text():
-    text = animation.page([Reel(system(scene("cartpole"), EVIL), motion(scene("cartpole")))] * 2)
+    text = animation.page(
+        [Timeline(system(scene("cartpole"), EVIL), motion(scene("cartpole")))] * 2
+    )
     assert "<img" not in text and text.count("</script>") == 2
     assert "&lt;img" in text
     assert "<img" not in page(scene("cartpole"), title=EVIL)
@@ -58,14 +60,14 @@ def test_names_in_the_data_are_text():
     run = motion(scene("cartpole"))
     odd = system(scene("cartpole"))
     odd.coordinates = [SimpleNamespace(name="x", unit=EVIL), SimpleNamespace(name="y", unit="a<b")]
-    text = animation.page([Reel(odd, run)])
+    text = animation.page([Timeline(odd, run)])
     assert "<img" not in text and data(text)
 
 
 def test_positions_are_those_of_the_run_to_the_stated_resolution():
     made = scene("cartpole")
     run = motion(made)
-    given = data(animation.page([Reel(system(made), run)]))["runs"][0]
+    given = data(animation.page([Timeline(system(made), run)]))["runs"][0]
     shown = drawing(system(made), run.t, run.q)
     d = given["drawing"]
     moving = values(d["moving"], (len(run.t), d["count"], 2))
@@ -106,7 +108,7 @@ def test_it_plays_in_real_time_unless_that_would_be_nothing_to_see():
 def test_a_run_of_one_row_and_what_is_not_finite():
     text = page(scene("cartpole"), rows=1)
     assert len(times(data(text)["runs"][0])) == 1
-    packed = animation._packed(np.array([1.0, np.nan, 3.0]))
+    packed = animation._quantize(np.array([1.0, np.nan, 3.0]))
     assert np.frombuffer(base64.b64decode(packed["data"]), "<i2").tolist() == [
         -32767,
         -32768,
@@ -117,7 +119,7 @@ def test_a_run_of_one_row_and_what_is_not_finite():
 def test_without_a_drawing_there_are_the_curves():
     made = system(scene("cartpole"))
     made.scene, made.definitions = None, ()
-    text = animation.page([Reel(made, motion(scene("cartpole")))])
+    text = animation.page([Timeline(made, motion(scene("cartpole")))])
     assert 'class="stage"' not in text and text.count('class="panel"') == 3
 
 
@@ -245,8 +247,8 @@ def test_instances_that_are_not_there_are_named(batch, wrong):
 
 def test_too_many_instances_and_unknown_curves_are_refused():
     with pytest.raises(EomcError, match="at most 24 can be told apart, here 25"):
-        which(100, 25)
-    assert which(3, 24) == [0, 1, 2] and which(3, np.array([2, 2])) == [2]
+        instance_numbers(100, 25)
+    assert instance_numbers(3, 24) == [0, 1, 2] and instance_numbers(3, np.array([2, 2])) == [2]
 
 
 def test_unknown_curves_of_a_batch_are_refused(batch):
@@ -269,7 +271,7 @@ def test_a_batch_by_tolerance_moves_at_its_times(modules):
 def test_a_batch_as_a_film(batch, tmp_path):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
-    short = part(batch, [0, 5])
+    short = select_instances(batch, [0, 5])
     short.q, short.qd = short.q[:, :11], short.qd[:, :11]
     short.animate(tmp_path / "b.gif")
     with image.open(tmp_path / "b.gif") as made:
@@ -286,7 +288,7 @@ def test_a_batch_as_a_film(batch, tmp_path):
 def film(made, file, **how):
     from eomc.report import film
 
-    film.write([Reel(system(made), motion(made, **how))], file, None)
+    film.write([Timeline(system(made), motion(made, **how))], file, None)
 
 
 @pytest.mark.slow
@@ -312,10 +314,10 @@ def test_of_a_film_what_stands_is_drawn_once_and_all_is_in_view(monkeypatch):
     monkeypatch.setattr(
         matplotlib.axis.Axis, "draw", lambda self, r: drawn.append(self) or draw(self, r)
     )
-    reel = Reel(system(scene("suspension")), motion(scene("suspension"), seconds=0.5))
-    rows = np.arange(0, len(reel.t), len(reel.t) // 8)
-    pictures = Pictures([reel], [reel.drawing(rows)], reel.t[rows], None)
-    shown = [pictures.at(k) for k in (*range(len(rows)), 0)]
+    timeline = Timeline(system(scene("suspension")), motion(scene("suspension"), seconds=0.5))
+    rows = np.arange(0, len(timeline.t), len(timeline.t) // 8)
+    pictures = Pictures([timeline], [timeline.drawing(rows)], timeline.t[rows], None)
+    shown = [pictures.picture(k) for k in (*range(len(rows)), 0)]
     assert len(drawn) == 2  # an axis to the right, one upwards
     assert (shown[0] == shown[-1]).all() and (shown[0] != shown[1]).any()
     (axes,), (moving,) = pictures.figure.axes, pictures.moving
@@ -348,7 +350,7 @@ def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
     from eomc.report.film import write
 
     with pytest.raises(EomcError, match="says nothing about its shape"):
-        write([Reel(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
+        write([Timeline(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
 
 
 def test_without_matplotlib_a_film_says_what_to_do(tmp_path, monkeypatch):

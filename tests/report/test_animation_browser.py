@@ -12,8 +12,8 @@ import pytest
 from report.pictures import chain, humanoid, motion, scene, system
 
 from eomc.report import animation
-from eomc.report.reel import Instances, Reel
 from eomc.report.system_of_run import system_of
+from eomc.report.timeline import BatchTimeline, Timeline
 
 pytestmark = [
     pytest.mark.slow,
@@ -35,9 +35,11 @@ def opened(window, tmp_path):
     """Opens a page of scenes, and sees afterwards that nothing was logged or asked for."""
     file = tmp_path / "motion.html"
 
-    def open_(*scenes, width=1000, seconds=2.0, rows=1201, title=None, reels=()):
-        reels = reels or [Reel(system(made), motion(made, seconds, rows)) for made in scenes]
-        file.write_text(animation.page(reels, title), encoding="utf-8")
+    def open_(*scenes, width=1000, seconds=2.0, rows=1201, title=None, timelines=()):
+        timelines = timelines or [
+            Timeline(system(made), motion(made, seconds, rows)) for made in scenes
+        ]
+        file.write_text(animation.page(timelines, title), encoding="utf-8")
         window.open(file, width)
         window.wait("return document.documentElement.dataset.frames > 0")
         return window
@@ -183,11 +185,11 @@ def poles(count):
     module = batches.module("cartpole")
     q0 = np.column_stack([0.1 * np.arange(count), np.linspace(0.5, 3.0, count)])
     runs = module.simulate_batch(q0, steps=400)
-    return [Instances(system_of(runs), runs, (), count)]
+    return [BatchTimeline(system_of(runs), runs, (), count)]
 
 
 def test_instances_of_a_batch_move_in_their_own_colours(opened):
-    page = opened(reels=poles(3))
+    page = opened(timelines=poles(3))
     stop(page, 0.0)
     first = tip(page)
     assert pixel(page, first) == (0, 0x72, 0xB2)
@@ -208,7 +210,7 @@ def test_instances_of_a_batch_move_in_their_own_colours(opened):
 
 
 def test_two_dozen_instances_have_two_dozen_colours_and_sixty_frames(opened):
-    page = opened(reels=poles(24))
+    page = opened(timelines=poles(24))
     keys = page.run("return [...document.querySelectorAll('.key')].map(k => k.style.background)")
     assert len({*keys}) == 24
     page.wait("return document.documentElement.dataset.rate > 55", 10.0)
@@ -263,7 +265,7 @@ def test_everything_has_a_name_for_those_who_listen(opened):
 def test_axe_finds_nothing(opened, window, width, scheme, many):
     """Labels, contrast, order: what those need who read by ear, or on little glass."""
     window.media(prefers_color_scheme=scheme)
-    given = {"reels": poles(many)} if many else {}
+    given = {"timelines": poles(many)} if many else {}
     page = opened(scene("furuta_pendulum"), width=width, **given)
     page.run(AXE.read_text(encoding="utf-8") + "; window.axe = axe;")
     page.run("axe.run().then(r => { window.found = r; })")

@@ -17,9 +17,9 @@ from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.robots.edit import cut, lock
+from eomc.robots.joint_stops import joint_stops
 from eomc.robots.robot import Law, Robot
 from eomc.robots.scene_text import finished, scene_text
-from eomc.robots.stops import stops
 from eomc.scene.read import parse
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
@@ -251,7 +251,7 @@ def test_stops_take_what_servos_and_tendons_give(tmp_path: Path) -> None:
     after = """<tendon><fixed name="t"><joint joint="j" coef="-0.5"/><joint joint="k" coef="3"/>
       </fixed></tendon><actuator><position joint="j" gear="2" kp="9" forcerange="-7 5"/>
       <motor tendon="t" gear="10" ctrlrange="-1 1"/></actuator>"""
-    found = stops(model(tmp_path, inside, after=after))
+    found = joint_stops(model(tmp_path, inside, after=after))
     assert [stop.effort for stop in found] == [2 * 7 + 0.5 * 10, 3 * 10]
 
 

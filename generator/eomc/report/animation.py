@@ -1,4 +1,4 @@
-"""The motion of runs as one page without a network, that plays it in real time, or as a film."""
+"""Animations of runs: one self-contained page that plays them in real time, or a film."""
 
 from __future__ import annotations
 
@@ -21,21 +21,24 @@ from eomc.base.errors import EomcError, writing
 from eomc.emit.render import environment
 from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
-from eomc.report.reel import Instances, Panel, Reel
 from eomc.report.system_of_run import Source, system_of
+from eomc.report.timeline import BatchTimeline, Panel, Timeline
 from eomc.runtime.atomic_write import atomic_write
 
 Array = NDArray[np.float64]
 
-FRAMES = 60  # rows a second of playing, at most
-INTERPOLATED = 600  # rows of an adaptive run, at least
-SMOOTH = 25  # rows a second of playing from which positions are interpolated linearly between rows
+FRAMES_PER_SECOND = 60  # of playing, at most
+MIN_INTERPOLATED_ROWS = 600  # for an adaptive run
+SMOOTH_ROWS_PER_SECOND = 25  # of playing: from here on positions are interpolated linearly
 PANEL_HEIGHT = 9.5  # em, of a panel of curves with its caption
-BYTES = 650_000  # of positions and curves before they are written as text, at most
-LEVELS = 32_767  # of a quantity from its middle to its ends
+MAX_BYTES = 650_000  # of positions and curves, before encoding as text
+LEVELS = 32_767  # quantisation levels on either side of the middle of a range
 FILMS = (".gif", ".mp4")
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 25, 100, 500)
-SHORT, LONG = 1.0, 60.0  # s that the motion is played in, where not in real time
+MIN_PLAYING_SECONDS, MAX_PLAYING_SECONDS = (
+    1.0,
+    60.0,
+)  # s that the motion is played in, where not in real time
 
 
 @dataclass(frozen=True)
@@ -69,14 +72,16 @@ def animate(
     scene: Source | None = None,
     title: str | None = None,
 ) -> Animation | None:
-    """The motion of runs, side by side.
+    """Animate runs, side by side.
 
-    file: .html, .gif or .mp4; None: nothing is written. scene: of the first run, as in system_of.
-    Returns the page, None of a film. Raises EomcError where it can't be drawn or written.
+    file: .html, .gif or .mp4; None: no file is written. scene: of the first run, as in system_of.
+    Returns the page, or None for a film. Raises EomcError if it can't be drawn or written.
     """
     _check(file)
-    reels = [Reel(system_of(run, scene if k == 0 else None), run) for k, run in enumerate(runs)]
-    return shown(reels, file, title)
+    timelines = [
+        Timeline(system_of(run, scene if k == 0 else None), run) for k, run in enumerate(runs)
+    ]
+    return shown(timelines, file, title)
 
 
 def instances(
@@ -88,13 +93,13 @@ def instances(
     scene: Source | None = None,
     title: str | None = None,
 ) -> Animation | None:
-    """The motion of instances of a batch, over each other.
+    """Animate instances of a batch, superimposed.
 
-    names: of the curves. chosen: how many instances, or which. Else as `animate`; raises KeyError
-    for unknown names too.
+    names: of the curves. chosen: how many instances, or their numbers. Other arguments and errors
+    as in `animate`; also raises KeyError for unknown names.
     """
     _check(file)
-    return shown([Instances(system_of(batch, scene), batch, names, chosen)], file, title)
+    return shown([BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title)
 
 
 def _check(file: str | os.PathLike[str] | None) -> None:
@@ -105,74 +110,84 @@ def _check(file: str | os.PathLike[str] | None) -> None:
 
 
 def shown(
-    reels: Sequence[Reel], file: str | os.PathLike[str] | None, title: str | None
+    timelines: Sequence[Timeline], file: str | os.PathLike[str] | None, title: str | None
 ) -> Animation | None:
-    """The page of what is shown, None of a film; written where there is a file."""
+    """Return the page of the timelines, or None for a film; write it if there is a file."""
     if file is not None and Path(file).suffix.lower() in FILMS:
         from eomc.report import film
 
-        film.write(reels, Path(file), title)
+        film.write(timelines, Path(file), title)
         return None
-    count = max(len(list(reel.panels(np.zeros(1, dtype=int)))) for reel in reels)
-    made = Animation(page(reels, title), count)
+    count = max(len(list(timeline.panels(np.zeros(1, dtype=int)))) for timeline in timelines)
+    animation = Animation(page(timelines, title), count)
     if file is not None:
-        made.save(file)
-    return made
+        animation.save(file)
+    return animation
 
 
-def page(reels: Sequence[Reel], title: str | None = None) -> str:
-    """The text of the page."""
-    shown = [_Shown(reel, len(reels)) for reel in reels]
-    named = title or " and ".join(dict.fromkeys(reel.title for reel in reels))
-    lasting = max(one.rows[-1] - one.rows[0] for one in shown)
-    data = {"speed": _speed(lasting), "speeds": SPEEDS, "runs": [one.data() for one in shown]}
+def page(timelines: Sequence[Timeline], title: str | None = None) -> str:
+    """Return the HTML of the page."""
+    pages = [_RunOnPage(timeline, len(timelines)) for timeline in timelines]
+    heading = title or " and ".join(dict.fromkeys(timeline.title for timeline in timelines))
+    seconds = max(page_run.rows[-1] - page_run.rows[0] for page_run in pages)
+    data = {
+        "speed": _speed(seconds),
+        "speeds": SPEEDS,
+        "runs": [page_run.data() for page_run in pages],
+    }
     text = json.dumps(data, separators=(",", ":"))
     safe = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
     return (
         environment()
         .get_template("report/animation.html.jinja")
         .render(
-            title=texts.html(named),
+            title=texts.html(heading),
             data=Markup(safe),
-            runs=[one.words() for one in shown],
+            runs=[page_run.words() for page_run in pages],
             speeds=[f"{speed:g}" for speed in SPEEDS],
-            travels=any(one.drawing and one.drawing.travels for one in shown),
+            travels=any(page_run.drawing and page_run.drawing.travels for page_run in pages),
         )
     )
 
 
 def _speed(seconds: float) -> float:
-    """Real time, unless the motion would then be over at once or not for a long while."""
-    if SHORT <= seconds <= LONG or not seconds:
+    """Return the playing speed: 1 (real time), unless the motion is very short or very long."""
+    if MIN_PLAYING_SECONDS <= seconds <= MAX_PLAYING_SECONDS or not seconds:
         return 1.0
-    wanted = seconds / (SHORT if seconds < SHORT else LONG / 2)
-    return min(SPEEDS, key=lambda speed: abs(math.log(speed / wanted)))
+    target_speed = seconds / (
+        MIN_PLAYING_SECONDS if seconds < MIN_PLAYING_SECONDS else MAX_PLAYING_SECONDS / 2
+    )
+    return min(SPEEDS, key=lambda speed: abs(math.log(speed / target_speed)))
 
 
-class _Shown:
-    """One run on the page."""
+class _RunOnPage:
+    """One run on the page: its rows, drawing and panels."""
 
-    def __init__(self, reel: Reel, count: int) -> None:
-        made = reel.drawing(np.zeros(1, dtype=int))
-        width = made.points[0].size if made else 0
-        most = max(BYTES // (2 * (width + reel.curves + 4) * count), 2)  # rows; a time has 8 bytes
-        lasting = float(reel.t[-1] - reel.t[0])
-        self.speed = _speed(lasting)
-        even = min(max(int(FRAMES / self.speed * lasting) + 1, INTERPOLATED), most)
-        resampled = reel.resample(even)
-        self.reel, t = reel, reel.t
+    def __init__(self, timeline: Timeline, count: int) -> None:
+        drawing = timeline.drawing(np.zeros(1, dtype=int))
+        width = drawing.points[0].size if drawing else 0
+        max_rows = max(
+            MAX_BYTES // (2 * (width + timeline.curves + 4) * count), 2
+        )  # rows; a time has 8 bytes
+        seconds = float(timeline.t[-1] - timeline.t[0])
+        self.speed = _speed(seconds)
+        row_count = min(
+            max(int(FRAMES_PER_SECOND / self.speed * seconds) + 1, MIN_INTERPOLATED_ROWS), max_rows
+        )
+        resampled = timeline.resample(row_count)
+        self.timeline, t = timeline, timeline.t
         last = len(t) - 1
-        spacing = lasting / last if last else 1.0
-        step = max(round(self.speed / (FRAMES * spacing)), 1) if spacing > 0 else 1
-        step = 1 if resampled else max(step, -(-last // most))
+        spacing = seconds / last if last else 1.0
+        step = max(round(self.speed / (FRAMES_PER_SECOND * spacing)), 1) if spacing > 0 else 1
+        step = 1 if resampled else max(step, -(-last // max_rows))
         self.index = np.unique(np.append(np.arange(0, last + 1, step), last))
         self.rows = t[self.index]
-        self.drawing = reel.drawing(self.index)
-        self.panels = list(reel.panels(self.index))
+        self.drawing = timeline.drawing(self.index)
+        self.panels = list(timeline.panels(self.index))
 
     @property
     def rate(self) -> float:
-        """Rows a second."""
+        """Rows per second of the motion."""
         lasting = self.rows[-1] - self.rows[0]
         return (len(self.rows) - 1) / lasting if lasting else 0.0
 
@@ -180,40 +195,41 @@ class _Shown:
         return {
             "t": [float(self.rows[0]), float(self.rows[-1])],
             "rows": base64.b64encode(self.rows.astype("<f8").tobytes()).decode("ascii"),
-            "smooth": bool(self.rate * self.speed >= SMOOTH),
-            "drawing": _drawn(self.drawing) if self.drawing else None,
-            "many": len(self.reel.key),
+            "smooth": bool(self.rate * self.speed >= SMOOTH_ROWS_PER_SECOND),
+            "drawing": _drawing_data(self.drawing) if self.drawing else None,
+            "many": len(self.timeline.key),
             "panels": [
-                [_packed(line.values) | {"stairs": line.stairs} for line in p.lines]
+                [_quantize(line.values) | {"stairs": line.stairs} for line in p.lines]
                 for p in self.panels
             ],
         }
 
     def words(self) -> dict[str, Any]:
-        """What the page says of the run."""
-        made = self.drawing
-        scale = np.ptp(made.points, axis=(0, 1)).max() / (2 * LEVELS) if made else 0.0
+        """Return the texts on the page that describe the run."""
+        drawing = self.drawing
+        scale = np.ptp(drawing.points, axis=(0, 1)).max() / (2 * LEVELS) if drawing else 0.0
         resolution = f"{len(self.rows)} rows, {self.rate:.3g} a second of the motion"
-        if made:
-            resolution += f"; positions to {scale:.1g} {made.unit}".rstrip()
-        kinds = dict.fromkeys(_KINDS[m.kind] for m in made.marks) if made else {}
-        many = len(self.reel.key)
+        if drawing:
+            resolution += f"; positions to {scale:.1g} {drawing.unit}".rstrip()
+        kinds = dict.fromkeys(_KINDS[m.kind] for m in drawing.marks) if drawing else {}
+        many = len(self.timeline.key)
+        space = "in the plane" if drawing and drawing.is_planar else "in space"
         return {
-            "title": texts.html(self.reel.title),
-            "drawn": bool(made),
-            "plane": bool(made and made.is_planar),
+            "title": texts.html(self.timeline.title),
+            "drawn": bool(drawing),
+            "plane": bool(drawing and drawing.is_planar),
             "description": texts.html(
-                f"{self.reel.title}, {'in the plane' if made and made.is_planar else 'in space'}: "
+                f"{self.timeline.title}, {space}: "
                 + ", ".join([*kinds, *([f"of {many} instances"] if many else [])])
             ),
-            "key": [texts.html(words) for words in self.reel.key],
+            "key": [texts.html(words) for words in self.timeline.key],
             "resolution": resolution,
             "panels": [*map(_caption, self.panels)],
         }
 
 
 def _caption(panel: Panel) -> dict[str, Any]:
-    """What stands above curves: the name of each, or that of the quantity that all are of."""
+    """Return the caption of a panel: the names of its curves, or that of their common quantity."""
     names = [panel.name] if panel.name else [line.name for line in panel.lines]
     return {
         "names": [Markup(html_name(n.removesuffix("_dot"), n.endswith("_dot"))) for n in names],
@@ -231,8 +247,8 @@ _KINDS = {
 }  # fmt: skip
 
 
-def _packed(values: Array) -> dict[str, Any]:
-    """Values as 16 bits each between the least and the largest; what is not finite is -32768."""
+def _quantize(values: Array) -> dict[str, Any]:
+    """Quantise values to 16 bits between their minimum and maximum; -32768 if not finite."""
     finite = np.isfinite(values)
     low = float(values[finite].min()) if finite.any() else 0.0
     high = float(values[finite].max()) if finite.any() else 0.0
@@ -244,28 +260,28 @@ def _packed(values: Array) -> dict[str, Any]:
     return {"data": text, "middle": middle, "scale": scale}
 
 
-def _drawn(made: Drawing) -> dict[str, Any]:
-    """Points that move and points that stand, and the marks on them."""
-    points = made.points
+def _drawing_data(drawing: Drawing) -> dict[str, Any]:
+    """Return the data of a drawing: moving points, static points, and the marks on them."""
+    points = drawing.points
     moves = np.ptp(np.nan_to_num(points, nan=1e300), axis=0).max(axis=1) > 0
     order = np.argsort(~moves, kind="stable")
     place = np.empty(len(order), dtype=int)
     place[order] = np.arange(len(order))
     moving = points[:, moves]
     return {
-        "axes": made.axes,
-        "labels": [name.replace("_", " ") for name in made.labels],
-        "unit": made.unit,
-        "up": made.up,
-        "follow": made.max_extent if made.travels else 0,
+        "axes": drawing.axes,
+        "labels": [name.replace("_", " ") for name in drawing.labels],
+        "unit": drawing.unit,
+        "up": drawing.up,
+        "follow": drawing.max_extent if drawing.travels else 0,
         "count": int(moves.sum()),
-        "moving": _packed(moving) if moving.size else None,
+        "moving": _quantize(moving) if moving.size else None,
         "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
                   for p in points[0, ~moves]],
-        "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in made.marks],
-        "whose": [mark.instance for mark in made.marks if mark.instance is not None],
+        "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in drawing.marks],
+        "whose": [mark.instance for mark in drawing.marks if mark.instance is not None],
         "paths": [
             [p.name.replace("_", " "), int(place[p.point]), k if p.instance is None else p.instance]
-            for k, p in enumerate(made.paths)
+            for k, p in enumerate(drawing.paths)
         ],
     }  # fmt: skip

@@ -10,6 +10,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import has_nearest, indefinite, nearest, principal, shown, unbalanced
+from eomc.robots.joint_stops import joint_stops
 from eomc.robots.robot import (
     LACK,
     Robot,
@@ -22,7 +23,6 @@ from eomc.robots.robot import (
     without_dust,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
-from eomc.robots.stops import stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
 
@@ -79,7 +79,7 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 def stopped(robot: Robot) -> Robot:
     """The robot with stops where its joints have limits. Raises EomcError where none has."""
-    found = stops(robot)
+    found = joint_stops(robot)
     if not found:
         raise EomcError("--stops: no joint of this robot has limits")
     told = [

@@ -10,9 +10,11 @@ from dataclasses import replace
 from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
-from eomc.robots import acting
+from eomc.robots import actuation
 from eomc.robots.formulas import angle, length, less, number, total, vector
+from eomc.robots.ineffective_constraints import without_ineffective_constraints
 from eomc.robots.inertias import has_nearest, indefinite, unbalanced
+from eomc.robots.joint_stops import DAMPING, DEPTHS, Stop, joint_stops
 from eomc.robots.masses import inertia_text, parameters
 from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
@@ -28,8 +30,6 @@ from eomc.robots.robot import (
 )
 from eomc.robots.rotations import SNAP, turns_of
 from eomc.robots.stiffness import with_stable_steps
-from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
-from eomc.robots.void import without_void_constraints
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
 
@@ -43,7 +43,7 @@ def finished(robot: Robot) -> Robot:
     Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
     tensor that is not positive semi-definite; one that breaks the triangle inequality is noted.
     """
-    robot = without_void_constraints(robot)
+    robot = without_ineffective_constraints(robot)
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
     robot = _with_points(replace(robot, bodies=bodies))
     if not robot.motions:
@@ -125,7 +125,7 @@ def _named(robot: Robot) -> Robot:
     )
     along = coordinates | lengths
     drives = tuple(
-        replace(d, name=fit(d.name, "", *acting.law_names(d)), coordinate=along[d.coordinate])
+        replace(d, name=fit(d.name, "", *actuation.law_names(d)), coordinate=along[d.coordinate])
         for d in robot.drives
     )
     bodies = {WORLD: WORLD}
@@ -204,17 +204,17 @@ def scene_text(robot: Robot) -> str:
         _table("", about),
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
-    found = stops(robot) if robot.stopped else []
-    numbers = parameters(robot) | acting.gains(robot)
+    found = joint_stops(robot) if robot.stopped else []
+    numbers = parameters(robot) | actuation.gains(robot)
     for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in found)):
         deep, soft = _stop_names(unit)
         numbers[deep] = _depth(unit)
         numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
     tables = {
-        "[inputs]": acting.inputs(robot),
+        "[inputs]": actuation.inputs(robot),
         "[parameters]": numbers,
-        "[definitions]": acting.definitions(robot),
-        "[energy]": acting.energies(robot),
+        "[definitions]": actuation.definitions(robot),
+        "[energy]": actuation.energies(robot),
         "[forces]": {s.coordinate: _stop(s) for s in found},
     }
     parts += [_table(head, entries) for head, entries in tables.items() if entries]
@@ -336,7 +336,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
             entry[key] = values[0] if len(set(values)) == 1 else _each(values)
     if width := max((m.friction_width for m in body.motions), default=0.0):
         entry["friction_width"] = number(width)
-    forces = [acting.force(m.name, robot) for m in body.motions]
+    forces = [actuation.force(m.name, robot) for m in body.motions]
     if any(force != "0" for force in forces):
         entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])
     if body.note:

@@ -15,7 +15,7 @@ ZERO = 1e-10  # of an entry of a Jacobian, relative to the distances of bodies: 
 OPEN = 1e-6  # m: a larger gap is reported
 
 
-def without_void_constraints(robot: Robot) -> Robot:
+def without_ineffective_constraints(robot: Robot) -> Robot:
     """Return the robot without loops and couplings that no motion changes, which are reported.
 
     MuJoCo gives such an equality no rows.

@@ -32,7 +32,7 @@ class Stop:
     known: bool
 
 
-def stops(robot: Robot) -> list[Stop]:
+def joint_stops(robot: Robot) -> list[Stop]:
     """Of all coordinates that have limits."""
     carried: dict[str, tuple[float, float]] = {}  # by a body: mass, and moment at most
     held: dict[str, float] = {}  # by a coordinate: what holds that against gravity

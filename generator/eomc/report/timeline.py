@@ -1,0 +1,201 @@
+"""Timelines: the drawing and the curves of a run, or of some instances of a batch, at its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.base.errors import EomcError
+from eomc.model.system import System
+from eomc.report.drawing import drawing, drawings
+from eomc.report.marks import Drawing
+from eomc.runtime.plot import Source
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+MAX_CURVES_PER_PANEL = 4  # at most, where each curve has its own panel
+MAX_PANELS = 6
+MAX_INSTANCES = 24  # that can be told apart in one drawing
+MAX_KEY_PARAMETERS = 2  # that differ between the instances, in the key
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve: its name and its values at the rows that are shown.
+
+    stairs: whether it is an input that is held constant from one row to the next.
+    """
+
+    name: str
+    values: Array
+    stairs: bool = False
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves that share axes, and their unit. name: the quantity, if all curves show the same."""
+
+    unit: str
+    lines: tuple[Line, ...]
+    name: str = ""
+
+
+class Timeline:
+    """The drawing and the curves of one run of a system."""
+
+    key: tuple[str, ...] = ()  # a label for each instance of a batch
+
+    def __init__(self, system: Any, run: Any) -> None:
+        self.system, self.run = system, run
+        self.t = np.asarray(run.t, dtype=float)
+        self.title: str = system.title or system.name
+
+    @property
+    def curves(self) -> int:
+        """Approximate number of curves to draw."""
+        return 2 * len(self.system.q) + 1
+
+    def resample(self, count: int) -> bool:
+        """Replace the rows of an adaptive run by `count` equidistant, interpolated ones.
+
+        Returns False, and changes nothing, if the run has fixed steps.
+        """
+        run = self.run
+        if not (hasattr(run, "_evenly") and len(run) > 1 and run.t[-1] > run.t[0]):
+            return False
+        self.run = run._evenly(count)
+        self.t = np.asarray(self.run.t, dtype=float)
+        return True
+
+    def drawing(self, rows: Rows) -> Drawing | None:
+        """Return the drawing at some rows; None if the scene does not describe its shape."""
+        return drawing(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
+
+    def panels(self, rows: Rows) -> Iterator[Panel]:
+        """Yield panels of coordinates, outputs and inputs, then the energy.
+
+        Few curves have a panel each; otherwise all curves of a unit share one.
+        """
+        system, run = self.system, self.run
+        q = np.asarray(run.q, dtype=float)[rows]
+        lines = [(c.unit, Line(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
+        lines += [
+            (o.unit, Line(o.name, np.asarray(run.outputs[o.name], dtype=float)[rows]))
+            for o in system.outputs
+        ]
+        u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
+        is_held_constant = getattr(run, "_u", None) is not None
+        lines += [
+            (i.unit, Line(i.name, u[:, k], is_held_constant)) for k, i in enumerate(system.inputs)
+        ]
+        units = dict.fromkeys(unit for unit, _ in lines)
+        separate = len(lines) <= MAX_PANELS - 1 and len(lines) <= MAX_CURVES_PER_PANEL
+        for unit in units:
+            curves = tuple(line for curve_unit, line in lines if curve_unit == unit)
+            for group in [(line,) for line in curves] if separate else [curves]:
+                yield Panel(unit, group)
+        known = "J" if any(c.unit for c in system.coordinates) else ""
+        yield Panel(known, (Line("energy", np.asarray(run.energy, dtype=float)[rows]),))
+
+
+class BatchTimeline(Timeline):
+    """The drawing and the curves of some instances of a batch, superimposed."""
+
+    def __init__(self, system: System, batch: Any, names: Sequence[str], chosen: Any) -> None:
+        numbers = instance_numbers(len(batch), chosen)
+        super().__init__(system, select_instances(batch, numbers))
+        self.names = tuple(names) or self._default()
+        table = np.broadcast_to(self.run._params, (len(numbers), len(system.parameters)))
+        self.systems = [
+            system.at(dict(zip(batch._model.parameters, map(float, row), strict=True)))
+            for row in table
+        ]
+        self.key = tuple(
+            _instance_label(k, table, n, self.run, system) for n, k in enumerate(numbers)
+        )
+        self.numbers = [str(k) for k in numbers]
+        self.q = _hold_last_finite(np.asarray(self.run.q, dtype=float))
+
+    def _default(self) -> tuple[str, ...]:
+        coordinates: tuple[str, ...] = self.run._model.coordinates
+        return (
+            (*coordinates, "energy") if len(coordinates) < MAX_PANELS else coordinates[:MAX_PANELS]
+        )
+
+    @property
+    def curves(self) -> int:
+        """Number of curves to draw."""
+        return len(self.names) * len(self.numbers)
+
+    def drawing(self, rows: Rows) -> Drawing | None:
+        """Return the drawing of all instances; one that has stopped keeps its last position."""
+        return drawings(self.systems, self.t[rows], self.q[:, rows], self.numbers)
+
+    def panels(self, rows: Rows) -> Iterator[Panel]:
+        """Yield one panel for each name, with a curve for each instance."""
+        source = Source(self.run)
+        for curve in map(source.curve, self.names):
+            lines = (Line(n, x[rows]) for n, x in zip(self.numbers, curve.values, strict=True))
+            yield Panel(curve.unit, tuple(lines), curve.name)
+
+
+def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:
+    """Return the numbers of the instances to show, out of `count`. Raises EomcError.
+
+    chosen: how many, spread over the batch, or a list of their numbers.
+    """
+    requested: Any = chosen
+    if isinstance(chosen, (int, np.integer)) and not isinstance(chosen, bool) and chosen > 0:
+        requested = np.linspace(0, count - 1, min(chosen, count)).astype(int)
+    try:
+        array = np.asarray(requested)
+        numbers = [*dict.fromkeys(array.tolist())]
+        valid = array.ndim == 1 and array.dtype.kind in "iu" and 0 <= array.min() <= array.max()
+    except (TypeError, ValueError):
+        valid, numbers = False, []
+    if not valid or max(numbers) >= count:
+        raise EomcError(
+            f"instances: give how many, or a list of some from 0 to {count - 1}, here {chosen!r}"
+        )
+    if len(numbers) > MAX_INSTANCES:
+        raise EomcError(
+            f"instances: at most {MAX_INSTANCES} can be told apart, here {len(numbers)}"
+        )
+    return numbers
+
+
+def select_instances(batch: Any, numbers: Sequence[int]) -> Any:
+    """Return a batch of the instances `numbers` only."""
+    fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "_codes")}
+    for name in ("_params", "_held"):  # one row if all instances share it
+        values = getattr(batch, name)
+        if values is not None and len(values) > 1:
+            fields[name] = values[numbers]
+    return replace(batch, **fields)
+
+
+def _hold_last_finite(q: Array) -> Array:
+    """Return q (batch, n, nq) with rows that are not finite replaced by the last finite row."""
+    good = np.isfinite(q).all(axis=2)
+    last = np.maximum.accumulate(np.where(good, np.arange(q.shape[1]), 0), axis=1)
+    return np.take_along_axis(q, last[:, :, None], axis=1)
+
+
+def _instance_label(k: int, table: Array, row: int, run: Any, system: System) -> str:
+    """Return the number of an instance, the parameters that differ, and its status if not "ok"."""
+    varying = np.flatnonzero(np.ptp(table, axis=0) > 0)
+    units: Mapping[str, str] = run._model.units
+    names = [p.name for p in system.parameters]
+    labels = [
+        f"{names[j]} = {table[row, j]:.4g} {units.get(names[j], '')}".rstrip()
+        for j in varying[:MAX_KEY_PARAMETERS]
+        if len(varying) <= MAX_KEY_PARAMETERS
+    ]
+    ended = str(run.status[row])
+    words = ", ".join([*labels, *([] if ended == "ok" else [ended])])
+    return f"{k}: {words}" if words else str(k)
