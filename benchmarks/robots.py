@@ -115,7 +115,7 @@ def robot(file: str, free: bool = False, locked: tuple[str, ...] = ()) -> str:
     except PackageNotFoundError:
         raise MissingError(f"example-robot-data is not there: {EXTRA}") from None
     read = edit.lock(urdf.read(str(found[0].locate())), dict.fromkeys(locked, 0.0))
-    return scene_text(edit.based(read, free=True) if free else read)
+    return scene_text(edit.with_base(read, free=True) if free else read)
 
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")

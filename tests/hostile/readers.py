@@ -96,12 +96,12 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     path.write_bytes(data)
 
     def stopped(robot: Any) -> Any:
-        return edit.stopped(robot) if joint_stops.joint_stops(robot) else robot
+        return edit.with_joint_stops(robot) if joint_stops.joint_stops(robot) else robot
 
     def made() -> None:
         robot = reader(path)
-        for change in (lambda r: r, edit.mended, stopped):
-            text = scene_text.scene_text(scene_text.finished(change(robot)))
+        for change in (lambda r: r, edit.with_nearest_inertias, stopped):
+            text = scene_text.scene_text(scene_text.prepared_for_scene(change(robot)))
             read_back = parse(text, "fuzz.xml.toml")
             if len(robot.bodies) < SYMPY_FROM:
                 from_scene(read_back)

@@ -37,8 +37,8 @@ def scene(name: str) -> Scene:
 
 def robot(file: Path, free: bool = False) -> Scene:
     """The scene of a URDF, as eomc import writes it."""
-    made = edit.mended(edit.based(urdf.read(file), free))
-    return parse(scene_text.scene_text(scene_text.finished(made)))
+    made = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
+    return parse(scene_text.scene_text(scene_text.prepared_for_scene(made)))
 
 
 def robot_data(name: str) -> Path:

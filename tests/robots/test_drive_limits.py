@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import eomc
-from eomc.robots.limits import both, through
+from eomc.robots.limits import input_range, intersection
 
 INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 URDF = f"""<robot name="pusher"><link name="rail"/>
@@ -113,9 +113,9 @@ def test_they_need_an_input_that_has_some(words: tuple[str, ...], tmp_path: Path
 
 
 def test_ranges_meet() -> None:
-    assert through((-8, 12), -4) == (-3, 2) and through((-8, 12), 0) == (-np.inf, np.inf)
-    assert both((-1, 2), (0, 5)) == (0, 2)
-    assert both((0, 1), (1, 2)) is None
+    assert input_range((-8, 12), -4) == (-3, 2) and input_range((-8, 12), 0) == (-np.inf, np.inf)
+    assert intersection((-1, 2), (0, 5)) == (0, 2)
+    assert intersection((0, 1), (1, 2)) is None
 
 
 def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:

@@ -13,8 +13,8 @@ from eomc.model.from_scene import from_scene
 from eomc.model.symbols import needed
 from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
-from eomc.robots.robot import moved
-from eomc.robots.scene_text import finished, scene_text
+from eomc.robots.robot import body_pose
+from eomc.robots.scene_text import prepared_for_scene, scene_text
 from eomc.scene.read import parse
 
 INSIDE = """
@@ -206,16 +206,16 @@ def test_constraints_that_no_motion_changes_are_left_out(
     flange = '<body name="flange" euler="0 0 90"><geom size="0.1"/></body></body>'
     inside = INSIDE.replace('</body>\n<body name="wheel"', f'{flange}\n<body name="wheel"')
     inside += STILL.format("left", 1) + STILL.format("right", 3)
-    robot = finished(model(tmp_path, inside, after=equality(entry, HARD[0])))
+    robot = prepared_for_scene(model(tmp_path, inside, after=equality(entry, HARD[0])))
     assert [loop.name for loop in robot.loops] == ["pin"]
     assert not robot.couplings
     assert reported(robot, "constraints that no motion changes", said)
-    assert finished(robot) == robot
+    assert prepared_for_scene(robot) == robot
 
 
 def test_a_loop_between_locked_bodies_is_left_out(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[0]))
-    locked = finished(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
+    locked = prepared_for_scene(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
     assert not locked.loops
     assert reported(locked, "constraints that no motion changes", "pin (open by")
 
@@ -247,7 +247,9 @@ def test_a_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
 
 def moved_as(robot, values):
     """The pose of each body in its parent."""
-    return {b.name: moved(b, [values.get(m.name, 0.0) for m in b.motions]) for b in robot.bodies}
+    return {
+        b.name: body_pose(b, [values.get(m.name, 0.0) for m in b.motions]) for b in robot.bodies
+    }
 
 
 def test_a_locked_joint_is_the_root_of_a_polynomial_next_to_the_start(tmp_path: Path) -> None:

@@ -126,13 +126,15 @@ def test_accelerations_are_those_of_mujoco(
     from test_robots_mujoco import in_python
 
     from eomc.robots import scene_text
-    from eomc.robots.limits import limited
+    from eomc.robots.limits import with_input_limits
 
     after = AFTER[: AFTER.index("<equality>")]
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
     inside = INSIDE.replace('frictionloss="0.4"', "").replace('limited="true"', 'limited="false"')
     robot = model(tmp_path, inside, SETTINGS + "".join(flags), after)
-    text = scene_text.scene_text(limited(robot) if "limits" in str(robot.left_out) else robot)
+    text = scene_text.scene_text(
+        with_input_limits(robot) if "limits" in str(robot.left_out) else robot
+    )
     theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     data = mujoco.MjData(theirs)
     data.qpos[:], data.qvel[:], u = (0.5, -0.3), (0.7, 0.9), {"s": 2.0, "m": 0.4}

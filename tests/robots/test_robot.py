@@ -15,7 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.robots import edit, inertias, rotations, scene_text
 from eomc.robots.inertias import Inertia
-from eomc.robots.robot import Drive, Motion, Robot, RobotBody, moved
+from eomc.robots.robot import Drive, Motion, Robot, RobotBody, body_pose
 from eomc.scene.read import parse
 
 angles = st.one_of(
@@ -143,9 +143,9 @@ def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inert
     """The nearest tensor of a body is zero there, or unlike it."""
     base, body, *rest = arm().bodies
     robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
-    assert edit.mended(robot) == robot
+    assert edit.with_nearest_inertias(robot) == robot
     with pytest.raises(EomcError) as fault:
-        scene_text.finished(robot)
+        scene_text.prepared_for_scene(robot)
     assert "check the signs of the tensor" in str(fault.value)
     assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
 
@@ -154,14 +154,14 @@ def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
     bad = replace(arm().bodies[2], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     worse = replace(arm().bodies[1], inertia=(0.1, -0.1, 0.3, 0.0, 0.0, 0.0))
     bodies = tuple({"boom": bad, "column": worse}.get(b.name, b) for b in arm().bodies)
-    mended = edit.mended(replace(arm(), bodies=bodies))
+    mended = edit.with_nearest_inertias(replace(arm(), bodies=bodies))
     text = scene_text.scene_text(mended)
     assert "# - body column: its inertia [0.1, -0.1, 0.3, 0, 0, 0] is that of no body" in text
     assert "# - body boom: its inertia [0.1, 0.1, 0.3, 0, 0, 0] is that of no body" in text
     inertias = [b["inertia"] for b in tomllib.loads(text)["body"] if "inertia" in b]
     assert inertias[1] == pytest.approx([0.4 / 3, 0.4 / 3, 0.8 / 3])
     parse(text)
-    assert edit.mended(arm()) == arm()
+    assert edit.with_nearest_inertias(arm()) == arm()
 
 
 # --- a robot ------------------------------------------------------------------------------------
@@ -197,7 +197,7 @@ def place(robot: Robot, of: str, q: dict[str, float]) -> tuple[np.ndarray, np.nd
     at, turned = np.zeros(3), np.eye(3)
     while of != "world":
         body = by_name[of]
-        offset, rotation = moved(body, [q[m.name] for m in body.motions])
+        offset, rotation = body_pose(body, [q[m.name] for m in body.motions])
         at, turned = np.array(offset) + np.array(rotation) @ at, np.array(rotation) @ turned
         of = body.parent
     return at, turned
@@ -225,7 +225,7 @@ def test_what_can_not_be_locked() -> None:
     with pytest.raises(EomcError, match="did you mean 'lift'"):
         edit.lock(arm(), {"lif": 0.0})
     with pytest.raises(EomcError, match="only a joint with one coordinate"):
-        edit.lock(edit.based(arm(), free=True), {"yaw": 0.0})
+        edit.lock(edit.with_base(arm(), free=True), {"yaw": 0.0})
 
 
 def test_a_cut_keeps_the_root_where_it_stood_at_the_start() -> None:
@@ -251,14 +251,14 @@ def test_a_chain_keeps_what_is_fixed_to_it_but_not_what_the_tip_carries() -> Non
 
 
 def test_a_base_is_freed_and_fixed_again() -> None:
-    free = edit.based(arm(), free=True)
+    free = edit.with_base(arm(), free=True)
     assert [m.name for m in free.motions][:6] == ["x", "y", "z", "yaw", "pitch", "roll"]
-    assert edit.based(free, free=False) == arm()
+    assert edit.with_base(free, free=False) == arm()
     root = replace(
         arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=rotations.from_rpy(0.1, 0.2, 0.3)
     )
     stood = replace(arm(), bodies=(root, *arm().bodies[1:]))
-    free = edit.based(stood, free=True)
+    free = edit.with_base(stood, free=True)
     assert [m.start for m in free.motions[:6]] == pytest.approx([1, 2, 3, 0.3, 0.2, 0.1])
     at_start = {m.name: m.start for m in free.motions}
     hooks = place(free, "hook", at_start), place(stood, "hook", at_start)
@@ -266,7 +266,7 @@ def test_a_base_is_freed_and_fixed_again() -> None:
         assert np.allclose(ours, theirs, atol=1e-15)
     crowd = replace(arm(), bodies=(*arm().bodies, RobotBody("other")))
     with pytest.raises(EomcError, match="2 bodies stand on the world"):
-        edit.based(crowd, free=True)
+        edit.with_base(crowd, free=True)
 
 
 # --- the scene ------------------------------------------------------------------------------------
@@ -320,7 +320,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
         replace(body, name="y", parent="x" * 60, motions=(Motion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
-    robot = scene_text.finished(replace(arm(), name="math", bodies=bodies, drives=drives))
+    robot = scene_text.prepared_for_scene(replace(arm(), name="math", bodies=bodies, drives=drives))
     coordinates = [m.name for m in robot.motions]
     taken = [*coordinates, *(f"{c}_dot" for c in coordinates), *(d.name for d in robot.drives)]
     taken += [f"{b.name}_{letter}" for b in robot.bodies for letter in "xyz"]
@@ -329,7 +329,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     assert names.module_fault(robot.name) is None
     assert "'a.b' in the file" in robot.motions[0].note
     assert [d.coordinate for d in robot.drives] == [coordinates[0], coordinates[2]]
-    assert scene_text.finished(robot) == robot
+    assert scene_text.prepared_for_scene(robot) == robot
 
 
 def test_texts_of_strangers_stay_texts() -> None:
@@ -343,23 +343,24 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
     bodies = (*arm().bodies[:6], RobotBody("finger", "hook", "revolute", (Motion("f-1", "rad"),),
                                            ((1.0, 0.0, 0.0),), note="a mesh only"))  # fmt: skip
     with pytest.raises(EomcError) as fault:
-        scene_text.finished(replace(arm(), bodies=bodies))
+        scene_text.prepared_for_scene(replace(arm(), bodies=bodies))
     assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(
         fault.value
     )
     assert "--lock f-1=0" in str(fault.value)
     locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
-    assert len(scene_text.finished(locked).motions) == 3
+    assert len(scene_text.prepared_for_scene(locked).motions) == 3
     with pytest.raises(EomcError, match="nothing moves"):
-        scene_text.finished(replace(arm(), bodies=arm().bodies[:1]))
+        scene_text.prepared_for_scene(replace(arm(), bodies=arm().bodies[:1]))
 
 
 def test_inertias_that_no_body_has() -> None:
     broken = replace(arm().bodies[1], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
     assert any(
-        "body column: its principal moments" in w for w in scene_text.finished(robot).left_out
+        "body column: its principal moments" in w
+        for w in scene_text.prepared_for_scene(robot).left_out
     )
     negative = replace(broken, inertia=(0.1, 0.1, -0.1, 0.0, 0.0, 0.0))
     with pytest.raises(EomcError, match="body column: its smallest principal moment"):
-        scene_text.finished(replace(robot, bodies=(RobotBody("base"), negative)))
+        scene_text.prepared_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))

@@ -121,7 +121,7 @@ def from_urdf(
     file = stripped(robot_data(name), folder)
     robot = edit.lock(urdf.read(file), locked or {})
     if free:
-        robot = edit.based(robot, free=True)
+        robot = edit.with_base(robot, free=True)
     spec = mujoco.MjSpec.from_file(str(file))
     spec.compiler.fusestatic = fuse
     for joint, value in (locked or {}).items():

@@ -19,7 +19,7 @@ from eomc.program.interpret import evaluate
 from eomc.robots.edit import cut, lock
 from eomc.robots.joint_stops import joint_stops
 from eomc.robots.robot import Law, Robot
-from eomc.robots.scene_text import finished, scene_text
+from eomc.robots.scene_text import prepared_for_scene, scene_text
 from eomc.scene.read import parse
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
@@ -199,8 +199,8 @@ def test_a_sum_of_many_weights_is_not_too_deep(tmp_path: Path) -> None:
 
 
 def test_names_are_kept_when_finished_again(tmp_path: Path) -> None:
-    robot = finished(model(tmp_path, ARM, BEFORE, AFTER))
-    assert finished(robot) == robot
+    robot = prepared_for_scene(model(tmp_path, ARM, BEFORE, AFTER))
+    assert prepared_for_scene(robot) == robot
 
 
 def equations(robot: Robot, state: Mapping[str, float]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.robots import edit, stiffness, urdf
 from eomc.robots.robot import Robot
-from eomc.robots.scene_text import finished, scene_text
+from eomc.robots.scene_text import prepared_for_scene, scene_text
 from eomc.scene.read import parse
 
 WRIST = """<robot name="wrist">
@@ -40,7 +40,7 @@ def wrist(folder: Path, friction: float, kind: str = "continuous", more: str = "
 
 
 def reported(robot: Robot) -> str:
-    return "\n".join(words for words in finished(robot).left_out if "friction" in words)
+    return "\n".join(words for words in prepared_for_scene(robot).left_out if "friction" in words)
 
 
 def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> None:
@@ -50,8 +50,8 @@ def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> 
     assert "stiff: friction of pitch: at the start velocities decay" in reported(robot)
     assert 'friction = "stick"' in reported(robot)
     assert "friction_width" not in scene["body"][2]
-    once = finished(robot)
-    assert finished(once) == once
+    once = prepared_for_scene(robot)
+    assert prepared_for_scene(once) == once
 
 
 @pytest.mark.parametrize("friction", [0.0, 1e-5])
@@ -79,7 +79,7 @@ def test_the_mass_matrix_is_that_of_the_scene(
 ) -> None:
     robot = wrist(tmp_path, 0.0, kind, more)
     if free:
-        robot = edit.based(robot, free=True)
+        robot = edit.with_base(robot, free=True)
     starts = iter((0.3, -0.4, 0.5, 0.6, -0.7, 0.8, 0.9, -0.2))
     bodies = tuple(
         replace(b, motions=tuple(replace(m, start=next(starts)) for m in b.motions))
@@ -91,7 +91,7 @@ def test_the_mass_matrix_is_that_of_the_scene(
         by_name = {m.name: m.start for m in robot.motions}
         (m,) = hand.motions
         assert m.mimics
-        hand = replace(hand, motions=(replace(m, start=m.mimics.at(by_name["shoulder"])),))
+        hand = replace(hand, motions=(replace(m, start=m.mimics.joint_position(by_name["shoulder"])),))
         robot = replace(robot, bodies=(*rest, hand))
     rows = [m.name for m in robot.motions]
     found = stiffness.mass_matrix(robot, rows)
@@ -110,19 +110,19 @@ LIGHT = """<body name="arm">
 
 def test_stiff_servos_and_dampers_ask_for_adaptive_steps(tmp_path: Path) -> None:
     after = '<actuator><position name="lift" joint="light" kp="100" kv="0.5"/></actuator>'
-    robot = finished(model(tmp_path, LIGHT.format(damping=0), after=after))
+    robot = prepared_for_scene(model(tmp_path, LIGHT.format(damping=0), after=after))
     assert robot.method == "auto"
     assert robot.left_out[-1].startswith("stiff: servo lift: ")
     assert "friction" not in robot.left_out[-1]
-    robot = finished(model(tmp_path, LIGHT.format(damping=0.1)))
+    robot = prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1)))
     assert robot.left_out[-1].startswith("stiff: damping of light: ")
 
 
 def test_a_light_body_coupled_to_a_heavy_one_is_not_stiff(tmp_path: Path) -> None:
     after = '<equality><joint joint1="light" joint2="heavy" polycoef="0 2"/></equality>'
-    assert not finished(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
+    assert not prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
     after = '<equality><weld body1="arm" body2="finger"/></equality>'
-    assert not finished(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
+    assert not prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
 
 
 @pytest.mark.slow

@@ -54,10 +54,10 @@ def command(
 
     from eomc.base import names
     from eomc.robots import edit, scene_text, urdf, xml
-    from eomc.robots.limits import limited
+    from eomc.robots.limits import with_input_limits
     from eomc.robots.masses import with_masses
     from eomc.robots.mjcf import read
-    from eomc.robots.robot import refused
+    from eomc.robots.robot import with_left_out_note
     from eomc.scene.toml_text import MAX_BYTES
 
     element = xml.root(file).kind
@@ -76,20 +76,20 @@ def command(
         robot = edit.lock(robot, values)
         robot = edit.cut(robot, root, tip)
         if base:
-            robot = edit.based(robot, free=base == "free")
+            robot = edit.with_base(robot, free=base == "free")
         if no_drives:
             robot = replace(robot, drives=())
         if mend_inertias:
-            robot = edit.mended(robot)
+            robot = edit.with_nearest_inertias(robot)
         if stops:
-            robot = edit.stopped(robot)
+            robot = edit.with_joint_stops(robot)
         if limits:
-            robot = limited(robot)
+            robot = with_input_limits(robot)
         if parameters:
             robot = with_masses(robot, tip)
-        robot = scene_text.finished(robot)
+        robot = scene_text.prepared_for_scene(robot)
     except EomcError as fault:
-        raise refused(fault, robot.left_out) from None
+        raise with_left_out_note(fault, robot.left_out) from None
     path = out or files.scene_path(robot.name)
     text = scene_text.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:

@@ -10,7 +10,7 @@ from eomc.robots.formulas import less, number, total
 from eomc.robots.robot import UNLIMITED, Drive, Law, Robot, RobotBody, Tendon, joined
 
 _FORCES = {"rad": "N m", "m": "N"}  # by a coordinate's unit
-_SUM = 50  # terms of a sum at most: each nests the formula deeper, which bears 150
+_MAX_TERMS = 50  # terms of a sum at most: each nests the formula deeper, which bears 150
 
 
 def law_names(drive: Drive) -> tuple[str, ...]:
@@ -29,11 +29,11 @@ def gains(robot: Robot) -> dict[str, str]:
     for d in robot.drives:
         if d.law:
             unit = units.get(d.coordinate, "") if d.gear == 1 else ""
-            of = {"kp": d.law.kp, "kv": d.law.kv}
-            for key, by in (("kp", f"/{unit}"), ("kv", f" s/{unit}")):
-                shown = f", unit = {toml(_FORCES[unit] + by)}" if unit else ""
-                if of[key]:
-                    entries[f"{d.name}_{key}"] = f"{{ value = {number(of[key])}{shown} }}"
+            values = {"kp": d.law.kp, "kv": d.law.kv}
+            for key, suffix in (("kp", f"/{unit}"), ("kv", f" s/{unit}")):
+                shown = f", unit = {toml(_FORCES[unit] + suffix)}" if unit else ""
+                if values[key]:
+                    entries[f"{d.name}_{key}"] = f"{{ value = {number(values[key])}{shown} }}"
     return entries
 
 
@@ -51,11 +51,11 @@ def definitions(robot: Robot) -> dict[str, str]:
 def energies(robot: Robot) -> dict[str, str]:
     """The entries of [energy]."""
     rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
-    borne = [b for b in robot.bodies if b.lifted and b.mass]
+    lifted = [b for b in robot.bodies if b.lifted and b.mass]
     weights = [
-        (g, _sum([_weight(b, axis) for b in borne]))
+        (g, _sum([_weight(b, axis) for b in lifted]))
         for g, axis in zip(robot.gravity, "xyz", strict=True)
-        if g and borne
+        if g and lifted
     ]
     sums = {
         "kinetic": [(t.armature, rate) for t, rate in rates if t.armature],
@@ -77,7 +77,7 @@ def force(coordinate: str, robot: Robot) -> str:
     terms = [
         (by * d.gear, f"{d.name}_force" if d.law else d.name)
         for d in robot.drives
-        for by, q in robot.along(d.coordinate)
+        for by, q in robot.coordinate_terms(d.coordinate)
         if q == coordinate
     ]
     return total(terms)
@@ -141,9 +141,13 @@ def _spring(t: Tendon) -> str:
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
     """A sum in parentheses, of sums where it is long."""
-    if len(terms) <= _SUM:
+    if len(terms) <= _MAX_TERMS:
         return f"({total(terms)})"
-    return "(" + " + ".join(_sum(terms[k : k + _SUM]) for k in range(0, len(terms), _SUM)) + ")"
+    return (
+        "("
+        + " + ".join(_sum(terms[k : k + _MAX_TERMS]) for k in range(0, len(terms), _MAX_TERMS))
+        + ")"
+    )
 
 
 def _long(formula: str) -> str:

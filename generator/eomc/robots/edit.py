@@ -12,14 +12,14 @@ from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import has_nearest, indefinite, nearest, principal, shown, unbalanced
 from eomc.robots.joint_stops import joint_stops
 from eomc.robots.robot import (
-    LACK,
+    COUPLING_TOLERANCE,
     Robot,
     RobotBody,
-    fixed,
+    body_pose,
+    fix_body,
     free_motions,
     joined,
-    moved,
-    settled,
+    with_joints_fixed,
     without_dust,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
@@ -54,10 +54,15 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
                 f"--lock {name}: it moves as '{mimics.coordinate}' does: lock that, and both are "
                 "frozen"
             )
-        if mimics and abs(mimics.at(values[mimics.coordinate]) - values[name]) > LACK:
+        if (
+            mimics
+            and abs(mimics.joint_position(values[mimics.coordinate]) - values[name])
+            > COUPLING_TOLERANCE
+        ):
             raise EomcError(
                 f"--lock {name}: it moves as '{mimics.coordinate}' does, which puts it at "
-                f"{mimics.at(values[mimics.coordinate]):g} {body.motions[0].unit}: lock it there"
+                f"{mimics.joint_position(values[mimics.coordinate]):g} "
+                f"{body.motions[0].unit}: lock it there"
             )
     bodies = []
     for body in robot.bodies:
@@ -65,33 +70,36 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
         if motion and motion.name in values:
             value = values[motion.name]
             note = joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
-            body = replace(fixed(body, *moved(body, (value,))), note=note)
+            body = replace(fix_body(body, *body_pose(body, (value,))), note=note)
         bodies.append(body)
     for c in robot.couplings:
-        if c.coordinates <= values.keys() and abs(lack := c.excess(values)) > LACK:
+        if (
+            c.coordinates <= values.keys()
+            and abs(violation := c.excess(values)) > COUPLING_TOLERANCE
+        ):
             those = " ".join(f"--lock {q}={values[q]:g}" for q in sorted(c.coordinates))
             raise EomcError(
-                f"{those}: these values break the coupling {c.name} by {lack:g}: lock one of the "
-                "joints only, and the coupling fixes the other, or give values that agree"
+                f"{those}: these values break the coupling {c.name} by {violation:g}: lock one "
+                "of the joints only, and the coupling fixes the other, or give values that agree"
             )
-    return settled(replace(robot, bodies=tuple(bodies)), values)
+    return with_joints_fixed(replace(robot, bodies=tuple(bodies)), values)
 
 
-def stopped(robot: Robot) -> Robot:
+def with_joint_stops(robot: Robot) -> Robot:
     """The robot with stops where its joints have limits. Raises EomcError where none has."""
-    found = joint_stops(robot)
-    if not found:
+    stops = joint_stops(robot)
+    if not stops:
         raise EomcError("--stops: no joint of this robot has limits")
-    told = [
+    notes = [
         "stops: at limits of positions [forces] pushes back; those of speed and effort are notes"
     ]
-    weighed = [s for s in found if not s.known]
-    if weighed:
+    estimated = [s for s in stops if not s.known]
+    if estimated:
         newton = {"rad": "N m", "m": "N"}
-        those = texts.listed([f"{s.coordinate} ({s.effort:g} {newton[s.unit]})" for s in weighed])
-        told.append(f"stops whose effort is not known, and is taken from weights: {those}")
-    others = (words for words in robot.left_out if not _LIMITS.match(words))
-    return replace(robot, stopped=True, left_out=(*told, *others))
+        those = texts.listed([f"{s.coordinate} ({s.effort:g} {newton[s.unit]})" for s in estimated])
+        notes.append(f"stops whose effort is not known, and is taken from weights: {those}")
+    other_notes = (words for words in robot.left_out if not _LIMITS.match(words))
+    return replace(robot, stopped=True, left_out=(*notes, *other_notes))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
@@ -109,37 +117,37 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
                 f"{option} {name}: no body is called '{name}'"
                 + (suggest(name, by_name) or f"; there are {texts.listed(tuple(by_name))}")
             )
-    kept = set(by_name)
+    selected = set(by_name)
     if root:
-        kept = {root}
+        selected = {root}
         for body in robot.bodies:
-            if body.parent in kept:
-                kept.add(body.name)
+            if body.parent in selected:
+                selected.add(body.name)
     if tip:
-        if tip not in kept:
+        if tip not in selected:
             raise EomcError(f"--tip {tip}: '{tip}' is not behind '{root}', which --root names")
         way = [tip]
-        while (parent := by_name[way[-1]].parent) in kept:
+        while (parent := by_name[way[-1]].parent) in selected:
             way.append(parent)
-        kept = set(way)
+        selected = set(way)
         for body in robot.bodies:
-            if body.joint == "fixed" and body.parent in kept and body.parent != tip:
-                kept.add(body.name)
-    bodies = [body for body in robot.bodies if body.name in kept]
+            if body.joint == "fixed" and body.parent in selected and body.parent != tip:
+                selected.add(body.name)
+    bodies = [body for body in robot.bodies if body.name in selected]
     for k, body in enumerate(bodies):
         if body.name == root and body.parent != WORLD:
-            bodies[k] = replace(fixed(body, *_stands(by_name, body)), parent=WORLD)
-    gone = tuple(name for name in by_name if name not in kept)
-    left_out = ((f"cut off: {texts.listed(gone)}",) if gone else ()) + robot.left_out
+            bodies[k] = replace(fix_body(body, *_pose_in_world(by_name, body)), parent=WORLD)
+    removed = tuple(name for name in by_name if name not in selected)
+    left_out = ((f"cut off: {texts.listed(removed)}",) if removed else ()) + robot.left_out
     frozen: dict[str, float] = {}  # the joints that hold the root, at their start
     above = by_name[root] if root and by_name[root].parent != WORLD else None
     while above:
         frozen |= {m.name: m.start for m in above.motions if not m.mimics}
         above = by_name.get(above.parent)
-    return settled(replace(robot, bodies=tuple(bodies), left_out=left_out), frozen)
+    return with_joints_fixed(replace(robot, bodies=tuple(bodies), left_out=left_out), frozen)
 
 
-def mended(robot: Robot) -> Robot:
+def with_nearest_inertias(robot: Robot) -> Robot:
     """The robot with the nearest tensor in place of each that no body can have, noted."""
     bodies, words = [], []
     for body in robot.bodies:
@@ -155,7 +163,7 @@ def mended(robot: Robot) -> Robot:
     return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, *words))
 
 
-def based(robot: Robot, free: bool) -> Robot:
+def with_base(robot: Robot, free: bool) -> Robot:
     """The robot with its first body free, or fixed to the world where it starts.
 
     A free one starts where it was fixed. Raises EomcError where several bodies stand on the world.
@@ -165,32 +173,32 @@ def based(robot: Robot, free: bool) -> Robot:
         those = texts.listed(tuple(body.name for body in roots))
         raise EomcError(f"--base: {len(roots)} bodies stand on the world ({those}), not one")
     root = roots[0]
-    new = root
+    root_body = root
     if free and root.joint == "fixed":
-        taken = {m.name for m in robot.motions}
+        names = {m.name for m in robot.motions}
         motions = free_motions()
-        if taken & {m.name for m in motions}:
+        if names & {m.name for m in motions}:
             motions = free_motions("base")
         at = (*root.offset, *yaw_pitch_roll(root.rotation))
         motions = tuple(replace(m, start=s) for m, s in zip(motions, at, strict=True))
-        new = replace(fixed(root, ORIGIN, IDENTITY), joint="free", motions=motions)
+        root_body = replace(fix_body(root, ORIGIN, IDENTITY), joint="free", motions=motions)
     elif not free and root.motions:
-        new = fixed(root, *_at_start(root))
-    if free and new.joint != "free":
+        root_body = fix_body(root, *_at_start(root))
+    if free and root_body.joint != "free":
         raise EomcError(
             f"--base free: '{root.name}' stands on the world by a {root.joint} joint, "
             "which the file gives it: --base free is for a root without one"
         )
-    bodies = tuple(new if body is root else body for body in robot.bodies)
+    bodies = tuple(root_body if body is root else body for body in robot.bodies)
     frozen = {} if free else {m.name: m.start for m in root.motions}
-    return settled(replace(robot, bodies=bodies), frozen)
+    return with_joints_fixed(replace(robot, bodies=bodies), frozen)
 
 
 def _at_start(body: RobotBody) -> tuple[Vector, Matrix]:
-    return moved(body, [m.start for m in body.motions])
+    return body_pose(body, [m.start for m in body.motions])
 
 
-def _stands(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, Matrix]:
+def _pose_in_world(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in the world at the start."""
     offset, rotation = _at_start(body)
     while body.parent != WORLD:

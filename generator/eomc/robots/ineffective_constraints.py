@@ -10,9 +10,9 @@ from eomc.base.spatial import plus, scaled
 from eomc.robots.robot import Robot, RobotLoop
 from eomc.robots.stiffness import coupling_gradient, loop_jacobian, rigid_bodies
 
-STATES = 3  # random ones at which the Jacobian is zero
-ZERO = 1e-10  # of an entry of a Jacobian, relative to the distances of bodies: rounding
-OPEN = 1e-6  # m: a larger gap is reported
+STATE_COUNT = 3  # random ones at which the Jacobian is zero
+ZERO_TOLERANCE = 1e-10  # of an entry of a Jacobian, relative to the distances of bodies: rounding
+GAP_TOLERANCE = 1e-6  # m: a larger gap is reported
 
 
 def without_ineffective_constraints(robot: Robot) -> Robot:
@@ -23,13 +23,13 @@ def without_ineffective_constraints(robot: Robot) -> Robot:
     if not robot.loops and not robot.couplings:
         return robot
     rows = [m.name for m in robot.motions]
-    moving: set[str] = set()
+    effective: set[str] = set()
     random = np.random.default_rng(0)
-    for _ in range(STATES):
+    for _ in range(STATE_COUNT):
         starts = dict(zip(rows, random.uniform(-1, 1, len(rows)).tolist(), strict=True))
         bodies = tuple(
             replace(b, motions=tuple(
-                replace(m, start=m.mimics.at(starts[m.mimics.coordinate]) if m.mimics
+                replace(m, start=m.mimics.joint_position(starts[m.mimics.coordinate]) if m.mimics
                         else starts[m.name])
                 for m in b.motions
             ))
@@ -39,16 +39,20 @@ def without_ineffective_constraints(robot: Robot) -> Robot:
         size = max(1.0, *(float(np.abs(body.place).max()) for body in rigid.values()))
         slopes = {loop.name: loop_jacobian(loop, rigid, rows) for loop in robot.loops}
         slopes |= {c.name: coupling_gradient(c, starts, rows) for c in robot.couplings}
-        moving |= {name for name, J in slopes.items() if np.abs(J).max(initial=0.0) > ZERO * size}
-    void = [_described(loop, robot, rows) for loop in robot.loops if loop.name not in moving]
-    void += [c.name for c in robot.couplings if c.name not in moving]
-    if not void:
+        effective |= {
+            name for name, J in slopes.items() if np.abs(J).max(initial=0.0) > ZERO_TOLERANCE * size
+        }
+    ineffective = [
+        _described(loop, robot, rows) for loop in robot.loops if loop.name not in effective
+    ]
+    ineffective += [c.name for c in robot.couplings if c.name not in effective]
+    if not ineffective:
         return robot
-    words = f"constraints that no motion changes, which hold nothing: {', '.join(void)}"
+    words = f"constraints that no motion changes, which hold nothing: {', '.join(ineffective)}"
     return replace(
         robot,
-        loops=tuple(loop for loop in robot.loops if loop.name in moving),
-        couplings=tuple(c for c in robot.couplings if c.name in moving),
+        loops=tuple(loop for loop in robot.loops if loop.name in effective),
+        couplings=tuple(c for c in robot.couplings if c.name in effective),
         left_out=(*robot.left_out, words),
     )
 
@@ -58,4 +62,4 @@ def _described(loop: RobotLoop, robot: Robot, rows: list[str]) -> str:
     rigid = rigid_bodies(robot.bodies, rows)
     one, other = (rigid[b].point(p) for b, p in zip(loop.bodies, loop.points, strict=True))
     gap = float(np.linalg.norm(plus(one, scaled(other, -1.0))))
-    return loop.name + (f" (open by {gap:.3g} m)" if gap > OPEN else "")
+    return loop.name + (f" (open by {gap:.3g} m)" if gap > GAP_TOLERANCE else "")

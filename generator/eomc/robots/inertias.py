@@ -75,16 +75,16 @@ def nearest(inertia: Inertia) -> Inertia:
     """
     import numpy as np
 
-    given, axes = principal(inertia)
-    moments = np.array(given)
+    principal_moments, axes = principal(inertia)
+    moments = np.array(principal_moments)
     sums = 1.0 - np.eye(3)
     best, least = np.zeros(3), float(moments @ moments)
     for kept in ((0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)):
         second = np.linalg.lstsq(sums[:, kept], moments, rcond=None)[0]
-        found = sums[:, kept] @ second
-        off = float((found - moments) @ (found - moments))
-        if min(second) >= 0 and off < least:
-            best, least = found, off
+        candidate = sums[:, kept] @ second
+        deviation = float((candidate - moments) @ (candidate - moments))
+        if min(second) >= 0 and deviation < least:
+            best, least = candidate, deviation
     directions = np.array(axes)
     tensor = (directions.T * best) @ directions
     dust = 1e-12 * max(map(abs, inertia))

@@ -34,25 +34,27 @@ class Stop:
 
 def joint_stops(robot: Robot) -> list[Stop]:
     """Of all coordinates that have limits."""
-    carried: dict[str, tuple[float, float]] = {}  # by a body: mass, and moment at most
-    held: dict[str, float] = {}  # by a coordinate: what holds that against gravity
+    carried_loads: dict[str, tuple[float, float]] = {}  # by a body: mass, and moment at most
+    holding_effort: dict[str, float] = {}  # by a coordinate: what holds that against gravity
     g = math.hypot(*robot.gravity)
     for body in reversed(robot.bodies):  # children come before parents
-        mass, moment = carried.get(body.name, (0.0, 0.0))
+        mass, moment = carried_loads.get(body.name, (0.0, 0.0))
         mass, moment = mass + body.mass, moment + body.mass * math.hypot(*body.center)
-        held |= {m.name: g * (moment if m.unit == "rad" else mass) for m in body.motions}
+        holding_effort |= {m.name: g * (moment if m.unit == "rad" else mass) for m in body.motions}
         more = mass, moment + mass * math.hypot(*body.offset)
-        one, other = carried.get(body.parent, (0.0, 0.0)), more
-        carried[body.parent] = one[0] + other[0], one[1] + other[1]
-    given: dict[str, float] = {}  # by a coordinate: what its drives give together
+        one, other = carried_loads.get(body.parent, (0.0, 0.0)), more
+        carried_loads[body.parent] = one[0] + other[0], one[1] + other[1]
+    drive_force: dict[str, float] = {}  # by a coordinate: what its drives give together
     for d in robot.drives:
-        for by, q in robot.along(d.coordinate):
-            given[q] = given.get(q, 0.0) + (abs(by) * d.most if by else 0.0)
+        for factor, q in robot.coordinate_terms(d.coordinate):
+            drive_force[q] = drive_force.get(q, 0.0) + (
+                abs(factor) * d.max_force if factor else 0.0
+            )
 
     def stop(m: Motion) -> Stop:
-        effort = min(max(map(abs, m.driven)), given.get(m.name, math.inf))
+        effort = min(max(map(abs, m.driven)), drive_force.get(m.name, math.inf))
         known = 0 < effort < math.inf
-        effort = effort if known else float(f"{held[m.name]:.3g}") or 1.0
+        effort = effort if known else float(f"{holding_effort[m.name]:.3g}") or 1.0
         return Stop(m.name, m.unit, m.limits, effort, known)
 
     return [

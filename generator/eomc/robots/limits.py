@@ -15,7 +15,7 @@ _JOINTS = re.compile(r"^(limits of \d+ joints?)(?=: )")
 _STOPS = "those of speed and effort are notes"  # of edit.stopped
 
 
-def through(force: Range, factor: float) -> Range:
+def input_range(force: Range, factor: float) -> Range:
     """The limits of an input whose force is factor times its value."""
     if not factor:
         return UNLIMITED
@@ -23,48 +23,48 @@ def through(force: Range, factor: float) -> Range:
     return low, high
 
 
-def both(one: Range, other: Range) -> Range | None:
+def intersection(one: Range, other: Range) -> Range | None:
     """The limits of what obeys both; None where no more than a value does."""
     low, high = max(one[0], other[0]), min(one[1], other[1])
     return (low, high) if low < high else None
 
 
-def limited(robot: Robot) -> Robot:
+def with_input_limits(robot: Robot) -> Robot:
     """The robot with limits of drives as those of their inputs; with those of its joint's force.
 
     Servos have limits of their forces besides. A joint that several drives share, or tendons pull,
     has the sum of their forces within its own limits: these are told and left out. Raises
     EomcError where none has limits.
     """
-    on = [q for d in robot.drives for _, q in robot.along(d.coordinate)]
+    on = [q for d in robot.drives for _, q in robot.coordinate_terms(d.coordinate)]
     driven = {m.name: m.driven for m in robot.motions if m.driven != UNLIMITED}
     alone = {d.coordinate for d in robot.drives if on.count(d.coordinate) == 1}
-    drives, apart = [], []
+    drives, excluded = [], []
     for d in robot.drives:
-        found: Range | None = d.ends
+        force_range: Range | None = d.ends
         if d.coordinate in driven and d.coordinate in alone:
-            found = both(d.ends, through(driven[d.coordinate], d.gear))
-        if found is None:
-            apart.append(d.name)
+            force_range = intersection(d.ends, input_range(driven[d.coordinate], d.gear))
+        if force_range is None:
+            excluded.append(d.name)
         elif d.law:
-            d = replace(d, law=replace(d.law, force=found))
+            d = replace(d, law=replace(d.law, force=force_range))
         else:
-            d = replace(d, limits=found)
+            d = replace(d, limits=force_range)
         drives.append(d)
     free = [d.name for d in drives if d.limits == d.ends == UNLIMITED]
     if len(free) == len(drives):
         raise EomcError("--limits: no input of this robot has limits")
     many = len(drives) - len(free)
-    told = [f"limits of drives: {many} of {len(drives)} inputs have them, and act within"]
-    told[0] += f"; without are {texts.listed(free, 4)}" if free else ""
+    notes = [f"limits of drives: {many} of {len(drives)} inputs have them, and act within"]
+    notes[0] += f"; without are {texts.listed(free, 4)}" if free else ""
     if shared := sorted(q for q in driven if q in on and q not in alone):
         words = "limits of force on joints that several inputs, or tendons, drive"
-        told.append(f"{words}: {texts.listed(shared)}")
-    if apart:
-        told.append(f"limits of force that exclude those of the input: {texts.listed(apart)}")
+        notes.append(f"{words}: {texts.listed(shared)}")
+    if excluded:
+        notes.append(f"limits of force that exclude those of the input: {texts.listed(excluded)}")
     others = (
         _JOINTS.sub(r"\1, of position and speed", words).replace(_STOPS, "those of speed are notes")
         for words in robot.left_out
         if not _ACTING.match(words)
     )
-    return replace(robot, drives=tuple(drives), limited=True, left_out=(*told, *others))
+    return replace(robot, drives=tuple(drives), limited=True, left_out=(*notes, *others))

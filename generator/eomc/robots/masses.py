@@ -59,21 +59,21 @@ def _tips(robot: Robot) -> list[str]:
 
 def parameters(robot: Robot) -> dict[str, str]:
     """Return the entries of [parameters]."""
-    found = {}
+    entries = {}
     for b in robot.bodies:
         if b.parameter:
             note = "" if b.mass else f", note = {toml(f'payload at {b.parent}')}"
-            found[b.parameter] = f'{{ value = {number(b.mass)}, unit = "kg"{note} }}'
-    return found
+            entries[b.parameter] = f'{{ value = {number(b.mass)}, unit = "kg"{note} }}'
+    return entries
 
 
 def inertia_text(body: RobotBody) -> str:
     """Return the tensor about the centre of mass, which is proportional to a mass that varies."""
-    kept = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
+    tensor_entries = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
     if not body.parameter:
-        return f"[{', '.join(map(number, kept))}]"
+        return f"[{', '.join(map(number, tensor_entries))}]"
     entries = []
-    for k, entry in enumerate(kept):
+    for k, entry in enumerate(tensor_entries):
         rotor = body.rotor if k < 3 else 0.0
         own = entry - rotor
         text = f"{number(own)}*{body.parameter}/{number(body.mass)}" if own else ""

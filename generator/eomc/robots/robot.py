@@ -21,7 +21,9 @@ from eomc.scene.joints import JOINTS
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
 Range = tuple[float, float]  # the least and the largest
 Terms = tuple[tuple[float, str], ...]  # a sum of coordinates, each with its factor
-LACK = 1e-4  # rad or m: what locked values may break a coupling by, as typed decimals do
+COUPLING_TOLERANCE = (
+    1e-4  # rad or m: what locked values may break a coupling by, as typed decimals do
+)
 UNLIMITED: Range = (-math.inf, math.inf)
 
 
@@ -33,7 +35,7 @@ class Mimic:
     gear: float = 1.0
     shift: float = 0.0
 
-    def at(self, value: float) -> float:
+    def joint_position(self, value: float) -> float:
         """Where the joint is while the coordinate has this value."""
         return self.gear * value + self.shift
 
@@ -150,7 +152,7 @@ class Drive:
         return self.law.force if self.law else self.limits
 
     @property
-    def most(self) -> float:
+    def max_force(self) -> float:
         """The largest force that acts, infinite where nobody says."""
         return abs(self.gear) * max(map(abs, self.ends)) if self.gear else 0.0
 
@@ -223,8 +225,8 @@ class Coupling:
 
         one, other = (sum(by for by, _ in side) for side in (self.first, self.second))
         right = Polynomial(self.polynomial)(Polynomial([-self.at, other]))
-        lack = (Polynomial([-self.zero, one]) - right).trim()
-        real = [x.real for x in lack.roots() if abs(x.imag) <= 1e-6 * max(1.0, abs(x.real))]
+        residual = (Polynomial([-self.zero, one]) - right).trim()
+        real = [x.real for x in residual.roots() if abs(x.imag) <= 1e-6 * max(1.0, abs(x.real))]
         return min(map(float, real), key=lambda x: abs(x - near), default=None)
 
 
@@ -254,12 +256,12 @@ class Robot:
         """The coordinates, in the order of the bodies."""
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
-    def along(self, name: str) -> Terms:
+    def coordinate_terms(self, name: str) -> Terms:
         """A coordinate or a tendon as a sum of coordinates."""
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
-def refused(fault: EomcError, left_out: Sequence[str]) -> EomcError:
+def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
     """Return the fault with a note of what is not read of the file, which may be its cause."""
     if left_out:
         listed = "".join(f"\n  - {texts.line(words)}" for words in left_out)
@@ -267,7 +269,7 @@ def refused(fault: EomcError, left_out: Sequence[str]) -> EomcError:
     return fault
 
 
-def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
+def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in its parent's: offset (m) and rotation, at `values`."""
     offset, rotation = body.offset, body.rotation
     joint = JOINTS[body.joint]
@@ -279,12 +281,12 @@ def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
     return offset, rotation
 
 
-def fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
+def fix_body(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
     """The body on a fixed joint there."""
     return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
 
 
-def settled(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
+def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
     """Return the robot with its joints fixed at coordinates that are frozen (rad or m).
 
     A joint that mimics a coordinate without motion is fixed too, and so is one whose coordinate is
@@ -292,32 +294,34 @@ def settled(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
     constants. What needs a coordinate or a body that is neither there nor frozen is left out, and
     reported.
     """
-    values, held = _held(robot, frozen or {})
-    there = {m.name for m in robot.motions} - values.keys()
+    values, coupled = _propagate_couplings(robot, frozen or {})
+    free = {m.name for m in robot.motions} - values.keys()
     bodies = []
     for body in robot.bodies:
         motion = body.motions[0] if body.motions else None
-        stands = _standing(motion, values, there) if motion else None
-        if motion and stands is not None:
-            note = f"joint {motion.name} stands at {stands:g} {motion.unit}"
-            body = replace(fixed(body, *moved(body, (stands,))), note=joined(body.note, note))
+        position = _fixed_position(motion, values, free) if motion else None
+        if motion and position is not None:
+            note = f"joint {motion.name} stands at {position:g} {motion.unit}"
+            body = replace(
+                fix_body(body, *body_pose(body, (position,))), note=joined(body.note, note)
+            )
         bodies.append(body)
     tendons = tuple(t for each in robot.tendons if (t := _shortened(each, values)).terms)
-    tendons = tuple(t for t in tendons if there.issuperset(q for _, q in t.terms))
-    acting = there | {t.name for t in tendons}
+    tendons = tuple(t for t in tendons if free.issuperset(q for _, q in t.terms))
+    acting = free | {t.name for t in tendons}
     drives = tuple(d for d in robot.drives if d.coordinate in acting)
     known = {WORLD, *(body.name for body in bodies)}
     loops = tuple(loop for loop in robot.loops if known.issuperset(loop.bodies))
     couplings = tuple(_reduced(c, values) for c in robot.couplings)
-    lost = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
-    lost |= {c.name for c in couplings if not there.issuperset(c.coordinates)}
-    whole = [c for c in robot.couplings if c.coordinates <= values.keys()]
-    broken = [c.name for c in whole if abs(c.excess(values)) > LACK]
-    told = [
-        ("constraints that the values of locked joints break", broken),
-        ("constraints of what is cut off or locked", sorted(lost)),
+    orphaned = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
+    orphaned |= {c.name for c in couplings if not free.issuperset(c.coordinates)}
+    fully_locked = [c for c in robot.couplings if c.coordinates <= values.keys()]
+    violated = [c.name for c in fully_locked if abs(c.excess(values)) > COUPLING_TOLERANCE]
+    notes = [
+        ("constraints that the values of locked joints break", violated),
+        ("constraints of what is cut off or locked", sorted(orphaned)),
         ("tendons of what is cut off or locked", sorted({t.name for t in robot.tendons} - acting)),
-        ("fixed by couplings to what is locked", held),
+        ("fixed by couplings to what is locked", coupled),
     ]
     return replace(
         robot,
@@ -325,22 +329,24 @@ def settled(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
         drives=drives,
         tendons=tendons,
         loops=loops,
-        couplings=tuple(c for c in couplings if c.coordinates and c.name not in lost),
-        left_out=(*(f"{what}: {', '.join(n)}" for what, n in told if n), *robot.left_out),
+        couplings=tuple(c for c in couplings if c.coordinates and c.name not in orphaned),
+        left_out=(*(f"{what}: {', '.join(n)}" for what, n in notes if n), *robot.left_out),
     )
 
 
-def _standing(motion: Motion, values: Mapping[str, float], there: Set[str]) -> float | None:
+def _fixed_position(motion: Motion, values: Mapping[str, float], free: Set[str]) -> float | None:
     """Return where a joint without motion stands; None for one that moves."""
     mimics = motion.mimics
     if not mimics:
         return values.get(motion.name)
     if mimics.coordinate in values:
-        return mimics.at(values[mimics.coordinate])
-    return None if mimics.gear and mimics.coordinate in there else motion.start
+        return mimics.joint_position(values[mimics.coordinate])
+    return None if mimics.gear and mimics.coordinate in free else motion.start
 
 
-def _held(robot: Robot, frozen: Mapping[str, float]) -> tuple[dict[str, float], list[str]]:
+def _propagate_couplings(
+    robot: Robot, frozen: Mapping[str, float]
+) -> tuple[dict[str, float], list[str]]:
     """Return the frozen coordinates, with those that couplings to them fix, and these in words."""
     values, words = dict(frozen), []
     motions = {m.name: m for m in robot.motions}
@@ -365,8 +371,8 @@ def _held(robot: Robot, frozen: Mapping[str, float]) -> tuple[dict[str, float], 
 
 def _split(terms: Terms, values: Mapping[str, float]) -> tuple[Terms, float]:
     """Return the terms of coordinates without a value, and the sum of the others."""
-    kept = tuple((by, q) for by, q in terms if q not in values)
-    return kept, sum((by * values[q] for by, q in terms if q in values), 0.0)
+    remaining = tuple((by, q) for by, q in terms if q not in values)
+    return remaining, sum((by * values[q] for by, q in terms if q in values), 0.0)
 
 
 def _shortened(tendon: Tendon, values: Mapping[str, float]) -> Tendon:

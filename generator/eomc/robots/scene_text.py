@@ -37,7 +37,7 @@ MENDED = ", as --mend-inertias writes"
 _NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot") fits too
 
 
-def finished(robot: Robot) -> Robot:
+def prepared_for_scene(robot: Robot) -> Robot:
     """The robot fit for a scene: its names such as C can bear, bare frames marked as points.
 
     Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
@@ -58,25 +58,25 @@ def finished(robot: Robot) -> Robot:
     ]
     if faults := [*faults, *without_inertia(robot)]:
         raise EomcError("\n".join(faults))
-    robot = _named(robot)  # after the faults, which have the names that --lock takes
-    found = tuple(
+    robot = _with_scene_names(robot)  # after the faults, which have the names that --lock takes
+    notes = tuple(
         f"body {body.name}: {why}{MENDED}; until then the scene is refused"
         for body in robot.bodies
         if (why := unbalanced(body.inertia))
     )
     if light := light_root(robot):
-        found += (
+        notes += (
             f"body {light}: it is free and has neither mass nor inertia, so the joint that it "
             "carries moves nothing against it: give it both, or import with --base fixed; until "
             "then the scene is refused",
         )
     rough = [b.name for b in robot.bodies if any(_rough(by) for _, by in turns_of(b.rotation))]
     if rough:
-        found += (
+        notes += (
             "quarter turns to five digits or so, as 1.5708, which are kept as they are ("
             f'{texts.listed(rough, 4)}): "pi/2" in their place makes less code',
         )
-    new = tuple(words for words in found if words not in robot.left_out)
+    new = tuple(words for words in notes if words not in robot.left_out)
     return with_stable_steps(replace(robot, left_out=(*robot.left_out, *new)))
 
 
@@ -87,19 +87,19 @@ def _rough(angle: float) -> bool:
 
 def _with_points(robot: Robot) -> Robot:
     """Fixed bodies that have no mass and carry no other, which only mark places, as points."""
-    found: list[RobotBody] = []
-    carried: set[str] = set()
+    bodies: list[RobotBody] = []
+    parents: set[str] = set()
     for body in reversed(robot.bodies):  # children come before parents
         bare = not body.mass and not any(body.inertia) and not body.parameter
-        point = body.joint == "fixed" and bare and body.name not in carried
+        point = body.joint == "fixed" and bare and body.name not in parents
         note = "" if point and body.note == BARE else body.note
-        found.append(replace(body, point=point, note=note))
+        bodies.append(replace(body, point=point, note=note))
         if not point:
-            carried.add(body.parent)
-    return replace(robot, bodies=tuple(found[::-1]))
+            parents.add(body.parent)
+    return replace(robot, bodies=tuple(bodies[::-1]))
 
 
-def _named(robot: Robot) -> Robot:
+def _with_scene_names(robot: Robot) -> Robot:
     """With the name of everything such as a scene can bear, and different from all others.
 
     A coordinate takes its velocity's name too, a body those of its centre of mass.
@@ -138,7 +138,7 @@ def _named(robot: Robot) -> Robot:
         motions = tuple(
             replace(m, name=new, note=_renamed(m.name, new, m.note))
             if (new := coordinates.get(m.name, ""))
-            else replace(m, mimics=_of(m, coordinates))
+            else replace(m, mimics=_mimic_in_scene(m, coordinates))
             for m in body.motions
         )
         note = _renamed(body.name, name, body.note)
@@ -173,10 +173,10 @@ def _named(robot: Robot) -> Robot:
     )  # fmt: skip
 
 
-def _of(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
+def _mimic_in_scene(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
     """What a joint mimics, by its name in the scene."""
-    found = motion.mimics
-    return found and replace(found, coordinate=coordinates[found.coordinate])
+    mimic = motion.mimics
+    return mimic and replace(mimic, coordinate=coordinates[mimic.coordinate])
 
 
 def _renamed(old: str, new: str, note: str) -> str:
@@ -192,7 +192,7 @@ def scene_text(robot: Robot) -> str:
     Numbers read back as they were, save angles within 1e-10 of a multiple of pi/12, which are
     written as such, so that their sines are exact.
     """
-    robot = finished(robot)
+    robot = prepared_for_scene(robot)
     head = [f"# {line(robot.title)}"]
     if robot.left_out:
         head += ["#", "# Not modelled, or to be looked at:"]
@@ -204,9 +204,9 @@ def scene_text(robot: Robot) -> str:
         _table("", about),
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
-    found = joint_stops(robot) if robot.stopped else []
+    stops = joint_stops(robot) if robot.stopped else []
     numbers = parameters(robot) | actuation.gains(robot)
-    for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in found)):
+    for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in stops)):
         deep, soft = _stop_names(unit)
         numbers[deep] = _depth(unit)
         numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
@@ -215,7 +215,7 @@ def scene_text(robot: Robot) -> str:
         "[parameters]": numbers,
         "[definitions]": actuation.definitions(robot),
         "[energy]": actuation.energies(robot),
-        "[forces]": {s.coordinate: _stop(s) for s in found},
+        "[forces]": {s.coordinate: _stop(s) for s in stops},
     }
     parts += [_table(head, entries) for head, entries in tables.items() if entries]
     bodies = sorted(robot.bodies, key=lambda body: body.point)

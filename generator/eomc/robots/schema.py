@@ -52,15 +52,15 @@ def parse(outline: str, groups: Mapping[str, str]) -> Element:
     return root
 
 
-def strangers(root: Tag, element: Element, of: str) -> tuple[str, ...]:
+def unknown_parts(root: Tag, element: Element, of: str) -> tuple[str, ...]:
     """Return in words the elements, attributes and texts of a file that its format does not have.
 
     of: what the format is called. Elements that it does not have are not looked into.
     """
-    found: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
+    unknown: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
 
     def note(kind: str, what: str, place: str) -> None:
-        found.setdefault(kind, {}).setdefault(what, []).append(place)
+        unknown.setdefault(kind, {}).setdefault(what, []).append(place)
 
     waiting: list[tuple[Tag, Element, str]] = [(root, element, "")]
     while waiting:
@@ -86,7 +86,7 @@ def strangers(root: Tag, element: Element, of: str) -> tuple[str, ...]:
         "attributes": f"attributes that {of} does not have",
         "text": f"text between tags, where {of} has attributes",
     }
-    return tuple(f"{heads[k]}: {_listed(found[k])}" for k in heads if k in found)
+    return tuple(f"{heads[k]}: {_listed(unknown[k])}" for k in heads if k in unknown)
 
 
 def _listed(places: Mapping[str, list[str]]) -> str:

@@ -133,21 +133,21 @@ FRICTION = "friction of "  # the beginning of such an element's name
 
 def _elements(robot: Robot, rows: Sequence[str]) -> list[Element]:
     """Return what damps and what pulls back."""
-    found = []
+    elements = []
     for m in (m for body in robot.bodies for m in body.motions):
         J = _of_motion(m, rows)
-        found += [
+        elements += [
             Element(FRICTION + m.name, J, m.friction / FRICTION_WIDTH),
             Element(f"damping of {m.name}", J, m.damping),
             Element(f"the spring of {m.name}", J, 0.0, m.stiffness),
         ]
     for t in robot.tendons:
-        found.append(Element(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness))
+        elements.append(Element(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness))
     for d in robot.drives:
         if d.law:
-            J = d.gear * _of_sum(robot.along(d.coordinate), rows)
-            found.append(Element(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0)))
-    return [e for e in found if e.damping or e.stiffness]
+            J = d.gear * _of_sum(robot.coordinate_terms(d.coordinate), rows)
+            elements.append(Element(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0)))
+    return [e for e in elements if e.damping or e.stiffness]
 
 
 def _of_motion(motion: Motion, rows: Sequence[str]) -> Array:
@@ -194,9 +194,9 @@ class Rigid:
 
 def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, Rigid]:
     """Return each body at the start by its name, and the world."""
-    found = {WORLD: Rigid(ORIGIN, IDENTITY)}
+    rigid = {WORLD: Rigid(ORIGIN, IDENTITY)}
     for body in bodies:
-        parent = found[body.parent]
+        parent = rigid[body.parent]
         place, turn = parent.point(body.offset), times(parent.turn, body.rotation)
         columns, joint = [*parent.columns], JOINTS[body.joint]
         axes = zip(joint.motions, joint.motion_axes(body.axes), body.motions, strict=True)
@@ -210,8 +210,8 @@ def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, 
             else:
                 columns.append((row, ORIGIN, _sliding(rate)))
                 place = plus(place, apply(turn, scaled(axis, m.start)))
-        found[body.name] = Rigid(place, turn, tuple(columns))
-    return found
+        rigid[body.name] = Rigid(place, turn, tuple(columns))
+    return rigid
 
 
 def _turning(rate: Vector, about: Vector) -> Callable[[Vector], Vector]:

@@ -28,8 +28,8 @@ from eomc.robots.robot import (
     RobotBody,
     free_motions,
     joined,
-    refused,
-    settled,
+    with_joints_fixed,
+    with_left_out_note,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
 from eomc.robots.xml import Tag
@@ -120,10 +120,10 @@ class _Reader:
         bodies = {name: self._link(name, element) for name, element in links.items()}
         elements = self._named("joint")
         read = [self._joint(name, e, bodies) for name, e in elements.items()]
-        joints = self._coupled([j for j in read if j], elements)
+        joints = self._with_mimics([j for j in read if j], elements)
         tree = self._tree(bodies, joints)
         if self.faults:
-            raise refused(SceneError(self.faults), self._besides())
+            raise with_left_out_note(SceneError(self.faults), self._unread_parts())
         name = self.root.get("name") or self.path.stem
         robot = Robot(
             name=name,
@@ -131,9 +131,9 @@ class _Reader:
             gravity=GRAVITY,
             bodies=tuple(tree),
             drives=tuple(j.drive for j in joints if j.drive),
-            left_out=tuple(self._besides()),
+            left_out=tuple(self._unread_parts()),
         )
-        return settled(robot)
+        return with_joints_fixed(robot)
 
     def say(self, key: str, message: str) -> None:
         """Note a fault of a link or joint."""
@@ -193,15 +193,15 @@ class _Reader:
         kind = joint.get("type")
         if kind not in _TYPES:
             known = f"known are {', '.join(_TYPES)}"
-            found = f"unknown type '{kind}'" if kind else "it has no type"
-            self.say(key, found + (suggest(kind, _TYPES) or f": {known}"))
+            message = f"unknown type '{kind}'" if kind else "it has no type"
+            self.say(key, message + (suggest(kind, _TYPES) or f": {known}"))
         self._parts(joint, _JOINT_PARTS, key)
         ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
         offset, rotation = self._origin(joint, key)
         axis: Vector = (1.0, 0.0, 0.0)
-        given = joint.first("axis")
-        if given is not None and kind not in ("fixed", "floating"):
-            axis = self._vector(given, "xyz", key, axis)
+        axis_tag = joint.first("axis")
+        if axis_tag is not None and kind not in ("fixed", "floating"):
+            axis = self._vector(axis_tag, "xyz", key, axis)
             try:
                 axis = unit(axis)
             except ValueError:
@@ -219,8 +219,8 @@ class _Reader:
 
     def _end(self, joint: Tag, end: str, key: str, bodies: dict[str, RobotBody]) -> str:
         """The link at one end of a joint, or "" where it is at fault."""
-        found = joint.first(end)
-        link = "" if found is None else found.get("link").strip()
+        tag = joint.first(end)
+        link = "" if tag is None else tag.get("link").strip()
         if not link:
             self.say(key, f'it has no {end} link: add <{end} link="..."/>')
         elif link not in bodies:
@@ -259,63 +259,63 @@ class _Reader:
         driven = (-effort, effort) if effort > 0 else UNLIMITED
         return (Motion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
-    def _coupled(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
+    def _with_mimics(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
         """The joints, those with <mimic> moved by the coordinate that it leads to."""
-        found: dict[str, Mimic] = {}
+        mimics: dict[str, Mimic] = {}
         for joint in joints:
-            given = elements[joint.name].first("mimic")
-            if given is not None and joint.kind != "fixed":
-                found[joint.name] = self._mimic(joint, given, elements)
-        for ring in find_cycles({name: [mimic.coordinate] for name, mimic in found.items()}):
+            mimic_tag = elements[joint.name].first("mimic")
+            if mimic_tag is not None and joint.kind != "fixed":
+                mimics[joint.name] = self._mimic(joint, mimic_tag, elements)
+        for ring in find_cycles({name: [mimic.coordinate] for name, mimic in mimics.items()}):
             self.say(f"joint {ring[0]}", f"joints mimic one another in a ring: {cycle_text(ring)}")
             for name in ring:
-                found.pop(name, None)
+                mimics.pop(name, None)
         by_name = {joint.name: joint for joint in joints}
         out = []
         for joint in joints:
-            if joint.name in found:
-                mimic = found[joint.name]
-                while further := found.get(mimic.coordinate):
-                    gear, shift = mimic.gear * further.gear, mimic.at(further.shift)
+            if joint.name in mimics:
+                mimic = mimics[joint.name]
+                while further := mimics.get(mimic.coordinate):
+                    gear, shift = mimic.gear * further.gear, mimic.joint_position(further.shift)
                     mimic = Mimic(further.coordinate, gear, shift)
-                joint = self._following(joint, mimic, by_name.get(mimic.coordinate))
+                joint = self._as_mimic(joint, mimic, by_name.get(mimic.coordinate))
             out.append(joint)
         return out
 
-    def _mimic(self, joint: _Joint, given: Tag, elements: Mapping[str, Tag]) -> Mimic:
-        key, of = f"joint {joint.name}", given.get("joint").strip()
-        if not of:
+    def _mimic(self, joint: _Joint, mimic_tag: Tag, elements: Mapping[str, Tag]) -> Mimic:
+        key, leader = f"joint {joint.name}", mimic_tag.get("joint").strip()
+        if not leader:
             self.say(key, 'its <mimic> names no joint: add joint="..."')
-        elif of not in elements:
-            near = suggest(of, elements) or ": remove the <mimic>, or add that joint"
-            self.say(key, f"it mimics joint '{of}', which is not in the file{near}")
+        elif leader not in elements:
+            near = suggest(leader, elements) or ": remove the <mimic>, or add that joint"
+            self.say(key, f"it mimics joint '{leader}', which is not in the file{near}")
         numbers = {"multiplier": 1.0, "offset": 0.0}
         for name in numbers:
-            if name in given.attributes:
-                numbers[name] = self._number(given, name, key)
-        return Mimic(of, *numbers.values())
+            if name in mimic_tag.attributes:
+                numbers[name] = self._number(mimic_tag, name, key)
+        return Mimic(leader, *numbers.values())
 
-    def _following(self, joint: _Joint, mimic: Mimic, of: _Joint | None) -> _Joint:
+    def _as_mimic(self, joint: _Joint, mimic: Mimic, leader: _Joint | None) -> _Joint:
         """The joint as it moves by what it mimics, without a drive of its own."""
-        for each in (joint, of):
+        for each in (joint, leader):
             if each and len(each.motions) > 1:
                 count = f"a {each.kind} joint, which has {len(each.motions)} coordinates"
                 why = f"it mimics '{mimic.coordinate}'; '{each.name}' is {count}: only joints "
                 self.say(f"joint {joint.name}", why + "with one can mimic: remove the <mimic>")
                 return joint
-        leads = of.motions[0].start if of and of.motions else 0.0
+        leader_start = leader.motions[0].start if leader and leader.motions else 0.0
         (motion,) = joint.motions
-        motion = replace(motion, start=mimic.at(leads), mimics=mimic)
+        motion = replace(motion, start=mimic.joint_position(leader_start), mimics=mimic)
         return replace(joint, motions=(motion,), drive=None)
 
     # --- the tree
 
     def _tree(self, bodies: dict[str, RobotBody], joints: list[_Joint]) -> list[RobotBody]:
         """The bodies, each chain in a row, parents first."""
-        holds: dict[str, _Joint] = {}
-        carries: dict[str, list[_Joint]] = {name: [] for name in bodies}
+        parent_joints: dict[str, _Joint] = {}
+        child_joints: dict[str, list[_Joint]] = {name: [] for name in bodies}
         for joint in joints:
-            if other := holds.get(joint.child):
+            if other := parent_joints.get(joint.child):
                 self.say(
                     f"joint {joint.name}",
                     f"its child link '{joint.child}' is held by joint '{other.name}' already: "
@@ -323,9 +323,9 @@ class _Reader:
                     "loop by a [[loop]] in the scene",
                 )
             else:
-                holds[joint.child] = joint
-                carries[joint.parent].append(joint)
-        roots = [name for name in bodies if name not in holds]
+                parent_joints[joint.child] = joint
+                child_joints[joint.parent].append(joint)
+        roots = [name for name in bodies if name not in parent_joints]
         if self.faults:
             return []  # a joint at fault leaves its links alone, and they would seem roots
         if len(roots) > 1:
@@ -341,23 +341,25 @@ class _Reader:
         waiting = roots[:1]
         while waiting:
             name = waiting.pop()
-            out += self._held(bodies[name], holds.get(name))
-            waiting += [joint.child for joint in reversed(carries[name])]
-        loop = next(find_cycles({name: [joint.parent] for name, joint in holds.items()}), [])
+            out += self._on_joint(bodies[name], parent_joints.get(name))
+            waiting += [joint.child for joint in reversed(child_joints[name])]
+        loop = next(
+            find_cycles({name: [joint.parent] for name, joint in parent_joints.items()}), []
+        )
         if loop and not self.faults:
             self.say(
-                f"joint {holds[loop[0]].name}",
+                f"joint {parent_joints[loop[0]].name}",
                 f"the links hold one another in a loop ({' on '.join(loop)}): "
                 "one of them belongs to the root",
             )
         return out[1:] if out and out[0].name == WORLD else out  # many files call the ground so
 
-    def _held(self, body: RobotBody, joint: _Joint | None) -> list[RobotBody]:
+    def _on_joint(self, body: RobotBody, joint: _Joint | None) -> list[RobotBody]:
         """The link on its joint; a planar joint needs a frame whose z is the plane's normal."""
         if joint is None:
             return [body]
         kinds = {"continuous": "revolute", "floating": "free"}
-        held = replace(
+        child = replace(
             body,
             parent=joint.parent,
             joint=kinds.get(joint.kind, joint.kind),
@@ -365,23 +367,25 @@ class _Reader:
             axes=(joint.axis,) if len(joint.motions) == 1 else (),
             offset=joint.offset,
             rotation=joint.rotation,
-            note=joined(body.note, *(f"joint {_told(m)}" for m in joint.motions if m.mimics)),
+            note=joined(
+                body.note, *(f"joint {_mimic_description(m)}" for m in joint.motions if m.mimics)
+            ),
         )
         if joint.kind != "planar" or joint.axis == (0.0, 0.0, 1.0):
-            return [held]
+            return [child]
         turn = toward(joint.axis)
         frame = f"{joint.name}_frame"
         rotation = times(joint.rotation, turn)
         note = "the joint's plane is its x and y"
-        between = replace(held, name=frame, mass=0.0, inertia=NO_INERTIA,
+        between = replace(child, name=frame, mass=0.0, inertia=NO_INERTIA,
                           center=ORIGIN, rotation=rotation, note=note)  # fmt: skip
         return [between, replace(body, parent=frame, rotation=transposed(turn))]
 
     # --- what is not modelled
 
-    def _besides(self) -> list[str]:
+    def _unread_parts(self) -> list[str]:
         """What the file has besides bodies and joints, in words."""
-        out = [*schema.strangers(self.root, _SCHEMA, "URDF")]
+        out = [*schema.unknown_parts(self.root, _SCHEMA, "URDF")]
         links, joints = [*self.root.each("link")], [*self.root.each("joint")]
         for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
             parts = [shape for link in links for part in link.each(use) for shape in part.all()]
@@ -453,7 +457,7 @@ def _macro(written: str) -> str:
     return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
 
 
-def _told(motion: Motion) -> str:
+def _mimic_description(motion: Motion) -> str:
     """A joint that mimics another in words, with its limits."""
     assert motion.mimics
     return joined(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)

@@ -106,7 +106,7 @@ def root(file: str | os.PathLike[str]) -> Tag:
     builder.parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     try:
         builder.parser.feed(data)
-        found: Tag = builder.parser.close()
+        element: Tag = builder.parser.close()
     except ParseError as fault:
         if b"xacro:" in data and "unbound prefix" in str(fault):
             raise EomcError(f"{shown}: {RUN_XACRO}") from None
@@ -122,7 +122,7 @@ def root(file: str | os.PathLike[str]) -> Tag:
         ) from None
     except (ValueError, LookupError) as fault:  # of the encoding that it claims
         raise EomcError(f"{shown}: not XML: {fault}") from None
-    return found
+    return element
 
 
 def number(word: str) -> float:
@@ -143,13 +143,13 @@ RUN_XACRO = "it holds xacro macros: run xacro first (xacro robot.urdf.xacro > ro
 
 def _bytes(path: Path, shown: str) -> bytes:
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
-            what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or device"
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
+            what = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or device"
             raise EomcError(f"{shown}: can't be read (it is {what}, not a file)")
-        if found.st_size > MAX_BYTES:
+        if status.st_size > MAX_BYTES:
             raise EomcError(
-                f"{shown}: {found.st_size} bytes are more than the {MAX_BYTES} a robot file may "
+                f"{shown}: {status.st_size} bytes are more than the {MAX_BYTES} a robot file may "
                 "have"
             )
         with path.open("rb") as file:

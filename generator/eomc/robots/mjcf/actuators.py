@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
-from eomc.robots.limits import both, through
-from eomc.robots.mjcf.file import Given, Report, leave_unread, missing
-from eomc.robots.mjcf.joints import Found, fresh, limited
-from eomc.robots.mjcf.masses import STILL, Placed, Reader
+from eomc.robots.limits import input_range, intersection
+from eomc.robots.mjcf.file import AttributeReader, Report, leave_unread, missing
+from eomc.robots.mjcf.joints import MjcfJoint, is_limited, unique_name
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Reader
 from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
 from eomc.robots.mjcf.schema import ACTUATORS
 from eomc.robots.mjcf.shortcuts import MEASURES
@@ -39,36 +39,38 @@ class Actuator(NamedTuple):
     lawful: bool
 
 
-def actuated(
-    root: Tag, bodies: Sequence[RobotBody], joints: Sequence[Found], tendons: Tendons,
+def read_actuators(
+    root: Tag, bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Tendons,
     reader: Reader,
-) -> tuple[list[Found], list[Actuator]]:  # fmt: skip
+) -> tuple[list[MjcfJoint], list[Actuator]]:  # fmt: skip
     """The joints with their actuators' armature and damping, and the actuators in their order.
 
     Tendons get theirs in place. bodies: with all their masses, as the file places them.
     """
-    found = {joint.name: joint for joint in joints}
+    by_name = {joint.name: joint for joint in joints}
     tags = [tag for section in root.each("actuator") for tag in section.children]
-    named = {tag.attributes["name"] for tag in tags if "name" in tag.attributes}
-    made: list[Actuator] = []
+    names = {tag.attributes["name"] for tag in tags if "name" in tag.attributes}
+    actuators: list[Actuator] = []
     for tag in tags:
         if tag.kind not in ACTUATORS:
             continue
-        a = reader.given(Placed(tag, "", STILL, ""), "actuator")
+        a = reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "actuator")
         on = a.get("joint", a.get("jointinparent", a.get("tendon")))
-        name = a.get("name") or fresh(f"{on or 'no'}_{tag.kind}", named)
-        named.add(name)
-        law, drive = _law(a), _drive(name, a, found, tendons, reader)
+        name = a.get("name") or unique_name(f"{on or 'no'}_{tag.kind}", names)
+        names.add(name)
+        law, drive = _law(a), _drive(name, a, by_name, tendons, reader)
         if drive:
-            ends = found[on].motions[0].limits if "tendon" not in a else UNLIMITED
+            ends = by_name[on].motions[0].limits if "tendon" not in a else UNLIMITED
             drive = _lawful(drive, law, a, ends, reader)
-        made.append(Actuator(drive, a.get("dyntype", "none"), bool(drive and law)))
-    joints = list(found.values())
-    return joints, made if reader.report.faults else _damped(made, bodies, joints, tendons)
+        actuators.append(Actuator(drive, a.get("dyntype", "none"), bool(drive and law)))
+    joints = list(by_name.values())
+    return joints, actuators if reader.report.faults else _damped(
+        actuators, bodies, joints, tendons
+    )
 
 
 def _drive(
-    name: str, a: Given, joints: dict[str, Found], tendons: Tendons, reader: Reader
+    name: str, a: AttributeReader, joints: dict[str, MjcfJoint], tendons: Tendons, reader: Reader
 ) -> Drive | None:
     """The drive of an actuator; what it acts on gets its armature and damping."""
     report = reader.report
@@ -114,7 +116,9 @@ def _loaded(of: Loaded, armature: float, damping: float) -> Loaded:
     return replace(of, armature=of.armature + armature, damping=of.damping + damping)
 
 
-def _lawful(drive: Drive, law: Law | None, a: Given, ends: Range, reader: Reader) -> Drive:
+def _lawful(
+    drive: Drive, law: Law | None, a: AttributeReader, ends: Range, reader: Reader
+) -> Drive:
     """The drive with the law of an actuator, its limits and its note.
 
     Where its force is no affine law of its input the input is the force, before the gear. Of one
@@ -131,7 +135,7 @@ def _lawful(drive: Drive, law: Law | None, a: Given, ends: Range, reader: Reader
             control, active = (control, mine) if dynamics == "integrator" else (mine, active)
         else:
             report.leave("ranges of actuators that inherit those of what has none here", name)
-    own, other = both(control, active) or control, UNLIMITED
+    own, other = intersection(control, active) or control, UNLIMITED
     if not law:
         report.leave(LAWLESS, f"{name} ({a.get(' law', 'general')})")
         own, other = UNLIMITED, control
@@ -139,23 +143,23 @@ def _lawful(drive: Drive, law: Law | None, a: Given, ends: Range, reader: Reader
         own, other = active, control
     if "clampctrl" in reader.settings.disabled:
         own, other = (active if dynamics != "none" else UNLIMITED), UNLIMITED
-    note = _noted(a.report, name, own, other, force)
+    note = _range_note(a.report, name, own, other, force)
     if law and dynamics != "none":
         report.leave(ACTIVATIONS, f"{name} ({dynamics})")
         note = joined("its activation", note)
     if law and not law.plain:
-        gain, follows = 1.0, replace(law, force=both(force, UNLIMITED) or UNLIMITED)
-        limits = both(own, UNLIMITED)
+        gain, follows = 1.0, replace(law, force=intersection(force, UNLIMITED) or UNLIMITED)
+        limits = intersection(own, UNLIMITED)
     else:
         gain, follows = law.gain[0] if law else 1.0, None
-        limits = both(own, through(force, gain))
+        limits = intersection(own, input_range(force, gain))
     if limits is None:
         report.leave("ranges of actuators that exclude each other", name)
     limits = limits or UNLIMITED
     return replace(drive, gear=drive.gear * gain, law=follows, limits=limits, note=note)
 
 
-def _law(a: Given) -> Law | None:
+def _law(a: AttributeReader) -> Law | None:
     """The force of an actuator by its input; None where that is not affine, and for a fault."""
     gain_type, bias_type = a.get("gaintype", "fixed"), a.get("biastype", "none")
     affine = gain_type in {"fixed", "affine"} and bias_type in {"none", "affine"}
@@ -175,7 +179,7 @@ def _law(a: Given) -> Law | None:
 
 
 def _damped(
-    made: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[Found],
+    made: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint],
     tendons: Tendons,
 ) -> list[Actuator]:  # fmt: skip
     """The actuators, ratios of damping as damping."""
@@ -196,15 +200,15 @@ def _damped(
     return out
 
 
-def _range(a: Given, key: str, reader: Reader) -> Range:
+def _range(a: AttributeReader, key: str, reader: Reader) -> Range:
     """A range of an actuator that holds, or an unlimited one."""
     values = a.numbers(f"{key}range", 2)
-    if not values or not limited(a, f"{key}limited", reader.settings):
+    if not values or not is_limited(a, f"{key}limited", reader.settings):
         return UNLIMITED
     return values[0], values[1]
 
 
-def _noted(report: Report, name: str, own: Range, control: Range, force: Range) -> str:
+def _range_note(report: Report, name: str, own: Range, control: Range, force: Range) -> str:
     """Ranges of an actuator's input, control and force for its note; reported as left out."""
     words = []
     for what, ends in (("input", own), ("control", control), ("force", force)):
@@ -215,13 +219,13 @@ def _noted(report: Report, name: str, own: Range, control: Range, force: Range) 
     return joined(*words)
 
 
-def started(
-    root: Tag, joints: Sequence[Found], actuators: Sequence[Actuator], report: Report
-) -> tuple[list[Found], tuple[Drive, ...]]:
+def with_key_frame_start(
+    root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: Report
+) -> tuple[list[MjcfJoint], tuple[Drive, ...]]:
     """The joints and drives with the start of the key frame "home"; singular ones are reported."""
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
-        a = Given(tag.attributes, tag, report)
+        a = AttributeReader(tag.attributes, tag, report)
         if a.get("name") != "home" or not {"qpos", "ctrl", "act"} & a.attributes.keys():
             report.leave("key frames", a.get("name"))
             continue
@@ -240,7 +244,7 @@ def started(
     return out, tuple(drive for drive in drives if drive)
 
 
-def _posed(a: Given, joints: Sequence[Found]) -> list[Found]:
+def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     """The joints with the positions of a key frame."""
     sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
     size = sum(sizes[joint.type] for joint in joints)
@@ -265,19 +269,19 @@ def _posed(a: Given, joints: Sequence[Found]) -> list[Found]:
     return out
 
 
-def _controlled(a: Given, actuators: Sequence[Actuator]) -> list[Drive | None]:
+def _controlled(a: AttributeReader, actuators: Sequence[Actuator]) -> list[Drive | None]:
     """The drives with the controls of a key frame, or the activations that integrate these."""
-    found = [each.drive for each in actuators]
+    drives = [each.drive for each in actuators]
     active = [k for k, each in enumerate(actuators) if each.dynamics != "none"]
-    for key, those in (("ctrl", range(len(found))), ("act", active)):
+    for key, those in (("ctrl", range(len(drives))), ("act", active)):
         values = a.numbers(key, 1_000_000, 0) or ()
         if len(values) != len(those) and any(values):
             a.report.leave(f"the {key} of the key frame home: it has not {len(those)} numbers")
             continue
         for k, value in zip(those, values, strict=False):
-            each, drive = actuators[k], found[k]
+            each, drive = actuators[k], drives[k]
             if drive and each.lawful and (each.dynamics == "integrator") == (key == "act"):
-                found[k] = replace(drive, start=value)
+                drives[k] = replace(drive, start=value)
             elif value:
                 a.report.leave(BESIDES, key)
-    return found
+    return drives

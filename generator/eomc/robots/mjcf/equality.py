@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from eomc.base.spatial import apply, plus, scaled, transposed
 from eomc.robots import rotations
-from eomc.robots.mjcf.file import Given, missing
-from eomc.robots.mjcf.joints import Found, fresh
-from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, pose_of, rounded
+from eomc.robots.mjcf.file import AttributeReader, missing
+from eomc.robots.mjcf.joints import MjcfJoint, unique_name
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Pose, Reader, pose_of, rounded
 from eomc.robots.mjcf.tendons import Tendons
-from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, moved
+from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, body_pose
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
@@ -41,7 +41,7 @@ class _Ends:
     def of_file(self, body: str) -> Pose:
         """The file's frame of a body, in the world."""
         back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
-        return self.poses[body].of(back)
+        return self.poses[body].compose(back)
 
     def point(self, body: str, place: Vector) -> Vector:
         """A place in the world, in our frame of a body."""
@@ -59,31 +59,31 @@ def _plain(x: float) -> float:
     return rounded(float(f"{x:.15g}"), 1.0)
 
 
-def constrained(
+def read_equalities(
     root: Tag,
     bodies: Sequence[RobotBody],
-    joints: Sequence[Found],
+    joints: Sequence[MjcfJoint],
     tendons: Tendons,
     anchors: Mapping[str, Vector],
     reader: Reader,
 ) -> tuple[tuple[RobotLoop, ...], tuple[Coupling, ...]]:
     """The loops and couplings of a file; bodies and joints as they stand in it."""
-    poses = {WORLD: STILL}
+    poses = {WORLD: IDENTITY_POSE}
     for body in bodies:
-        offset, turn = moved(body, [m.start for m in body.motions])
-        poses[body.name] = poses[body.parent].of(Pose(offset, turn))
-    made = _Reading(tendons, _Ends(poses, anchors), joints, reader)
+        offset, turn = body_pose(body, [m.start for m in body.motions])
+        poses[body.name] = poses[body.parent].compose(Pose(offset, turn))
+    reading = _Reading(tendons, _Ends(poses, anchors), joints, reader)
     for section in root.each("equality"):
         for tag in section.children:
-            made.read(tag)
-    return tuple(made.loops), tuple(made.couplings)
+            reading.read(tag)
+    return tuple(reading.loops), tuple(reading.couplings)
 
 
 class _Reading:
     """The constraints read so far."""
 
     def __init__(
-        self, tendons: Tendons, ends: _Ends, joints: Sequence[Found], reader: Reader
+        self, tendons: Tendons, ends: _Ends, joints: Sequence[MjcfJoint], reader: Reader
     ) -> None:
         self.ends = ends
         self.reader = reader
@@ -96,10 +96,10 @@ class _Reading:
     def read(self, tag: Tag) -> None:
         """One constraint; what is not read is reported."""
         report = self.reader.report
-        a = self.reader.given(Placed(tag, "", STILL, ""), "equality")
+        a = self.reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "equality")
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]
         name = a.get("name") or "_".join([tag.kind, *filter(None, ends)])
-        name = fresh(name, self.taken)
+        name = unique_name(name, self.taken)
         if tag.kind not in KINDS:
             report.leave("equality constraints of other kinds", f"{tag.kind} {name}")
         elif not a.is_true("active", True):
@@ -115,10 +115,10 @@ class _Reading:
 
     # --- bodies
 
-    def _loop(self, name: str, kind: str, a: Given) -> None:
+    def _loop(self, name: str, kind: str, a: AttributeReader) -> None:
         sites = [a.get("site1"), a.get("site2")]
-        found = [self._site(s, a) for s in sites] if any(sites) else self._anchored(kind, a)
-        places = [place for place in found if place]
+        attachments = [self._site(s, a) for s in sites] if any(sites) else self._anchored(kind, a)
+        places = [place for place in attachments if place]
         if len(places) < 2:
             return
         one, other = places
@@ -131,7 +131,7 @@ class _Reading:
         self.loops.append(loop)
         self.reader.report.leave(SOFT, name)
 
-    def _site(self, name: str, a: Given) -> tuple[str, Vector, Matrix] | None:
+    def _site(self, name: str, a: AttributeReader) -> tuple[str, Vector, Matrix] | None:
         """A site: its body, its place in our frame of that, and the body's axes along its own."""
         placed = self.reader.sites.get(name)
         if placed is None:
@@ -139,11 +139,13 @@ class _Reading:
             a.fault(what if name else "it needs both site1 and site2")
             return None
         self.reader.report.read("sites", name)
-        site = placed.pose.of(pose_of(self.reader.given(placed, "site"), self.reader.settings))
-        world = self.ends.of_file(placed.body).of(site)
+        site = placed.pose.compose(
+            pose_of(self.reader.attributes_with_defaults(placed, "site"), self.reader.settings)
+        )
+        world = self.ends.of_file(placed.body).compose(site)
         return placed.body, self.ends.point(placed.body, world.place), transposed(site.turn)
 
-    def _anchored(self, kind: str, a: Given) -> list[tuple[str, Vector, Matrix] | None]:
+    def _anchored(self, kind: str, a: AttributeReader) -> list[tuple[str, Vector, Matrix] | None]:
         """Both bodies, where they meet, and the rotation of each in a frame that both share."""
         names = [a.get("body1"), a.get("body2", WORLD)]
         for name in names:
@@ -158,11 +160,11 @@ class _Reading:
                 if "anchor" not in a:
                     a.fault('it needs an anchor="x y z", where the bodies meet, in that of body1')
                 return [None, None]
-            place = first.of(Pose(anchor, IDENTITY)).place
+            place = first.compose(Pose(anchor, IDENTITY)).place
             return [(name, self.ends.point(name, place), IDENTITY) for name in names]
         point = anchor or ORIGIN  # in the frame of the second body
         place, turn = (
-            second.of(Pose(point, IDENTITY)).place,
+            second.compose(Pose(point, IDENTITY)).place,
             times(transposed(first.turn), second.turn),
         )
         on_first = self.ends.point(one, place)
@@ -175,16 +177,16 @@ class _Reading:
 
     # --- joints
 
-    def _coupling(self, name: str, kind: str, a: Given) -> None:
+    def _coupling(self, name: str, kind: str, a: AttributeReader) -> None:
         read = self._joint if kind == "joint" else self._tendon
         first = read(a.get(f"{kind}1"), name, a)
         second = read(a.get(f"{kind}2"), name, a) if a.get(f"{kind}2") else ()
         if first is None or second is None:
             return
-        given = a.numbers("polycoef", POLYNOMIAL, 1) or (0.0, 1.0)
-        polynomial = (*given, *(0.0,) * POLYNOMIAL)[:POLYNOMIAL]
-        if len(given) == 1:
-            polynomial = (given[0], 1.0, 0.0, 0.0, 0.0)
+        coefficients = a.numbers("polycoef", POLYNOMIAL, 1) or (0.0, 1.0)
+        polynomial = (*coefficients, *(0.0,) * POLYNOMIAL)[:POLYNOMIAL]
+        if len(coefficients) == 1:
+            polynomial = (coefficients[0], 1.0, 0.0, 0.0, 0.0)
         if not second:
             polynomial = (polynomial[0], 0.0, 0.0, 0.0, 0.0)
         elif not any(polynomial[1:]):
@@ -197,18 +199,18 @@ class _Reading:
         )
         self.reader.report.leave(SOFT, name)
 
-    def _joint(self, joint: str, name: str, a: Given) -> Sides | None:
+    def _joint(self, joint: str, name: str, a: AttributeReader) -> Sides | None:
         """The coordinate of a joint, as a sum of one; None where there is none."""
         if joint not in self.joints:
             a.fault(missing("joint", joint, self.joints) if joint else "it needs joint1")
             return None
-        found = self.joints[joint]
-        if len(found.motions) > 1:
+        mjcf_joint = self.joints[joint]
+        if len(mjcf_joint.motions) > 1:
             self.reader.report.leave("couplings of free and ball joints", name)
             return None
-        return ((1.0, found.motions[0]),)
+        return ((1.0, mjcf_joint.motions[0]),)
 
-    def _tendon(self, tendon: str, name: str, a: Given) -> Sides | None:
+    def _tendon(self, tendon: str, name: str, a: AttributeReader) -> Sides | None:
         """A tendon's length in coordinates; None where it is not a sum of these."""
         if not tendon:
             a.fault("it needs tendon1")

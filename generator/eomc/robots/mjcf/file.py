@@ -90,7 +90,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Given:
+class AttributeReader:
     """The attributes that a tag has, by itself or from its class; faults in them are reported."""
 
     attributes: Attributes
@@ -107,7 +107,7 @@ class Given:
     def fault(self, message: str) -> None:
         """Report a fault, with the line it stands in; reading goes on to find the others."""
         tag = self.tag
-        self.report.faults.append(Problem(message, called(tag), str(tag.file), tag.line))
+        self.report.faults.append(Problem(message, element_label(tag), str(tag.file), tag.line))
 
     def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
         """The numbers of an attribute, `least` (by default `most`) to `most` of them.
@@ -124,8 +124,8 @@ class Given:
             self.fault(f'{key}="{text}": {why}')
             return None
         if not least <= len(values) <= most:
-            wanted = str(most) if least == most else f"{least} to {most}"
-            self.fault(f'{key}="{text}" has {len(values)} numbers; it takes {wanted}')
+            expected = str(most) if least == most else f"{least} to {most}"
+            self.fault(f'{key}="{text}" has {len(values)} numbers; it takes {expected}')
             return None
         return values
 
@@ -224,7 +224,7 @@ def _included(
     tag: Tag, folder: Path, include: bool, opened: set[Path], report: Report
 ) -> list[Tag]:
     """What stands in the file that <include> names; it must lie in `folder`."""
-    a = Given(tag.attributes, tag, report)
+    a = AttributeReader(tag.attributes, tag, report)
     name = a.get("file")
     if not include:
         a.fault(
@@ -247,7 +247,7 @@ def _included(
     return []
 
 
-def called(tag: Tag) -> str:
+def element_label(tag: Tag) -> str:
     """A tag as errors call it."""
     name = tag.get("name")
     return f'{tag.kind} "{name}"' if name else tag.kind
@@ -258,7 +258,7 @@ def missing(kind: str, name: str, known: Iterable[str]) -> str:
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
-def leave_unread(a: Given, kind: str, name: str) -> None:
+def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
     """Report the attributes that change the motion in MuJoCo and are not read, as `UNREAD` has."""
     for key, what in UNREAD[kind].items():
         if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):
@@ -274,9 +274,9 @@ def settings_of(root: Tag, report: Report) -> Settings:
     disabled = dict.fromkeys(EFFECTS, False)  # by flag; one option keeps those of another
     groups: set[float] = set()
     for tag in root.each("compiler"):
-        s = _compiler(s, Given(tag.attributes, tag, report))
+        s = _compiler(s, AttributeReader(tag.attributes, tag, report))
     for tag in root.each("option"):
-        a = Given(tag.attributes, tag, report)
+        a = AttributeReader(tag.attributes, tag, report)
         s = replace(s, gravity=a.vector("gravity") or s.gravity)
         groups.update(a.numbers("actuatorgroupdisable", 31, 0) or ())
         for key in a.attributes:
@@ -286,7 +286,7 @@ def settings_of(root: Tag, report: Report) -> Settings:
             elif key not in {"gravity", "actuatorgroupdisable"} and key in OPTIONS:
                 report.leave("options of MuJoCo's simulation", key)
         for flag in tag.each("flag"):
-            f = Given(flag.attributes, flag, report)
+            f = AttributeReader(flag.attributes, flag, report)
             for key in f.attributes:
                 if key in EFFECTS:
                     disabled[key] = f.choice(key, ("enable", "disable")) == "disable"
@@ -299,7 +299,7 @@ def settings_of(root: Tag, report: Report) -> Settings:
     return replace(s, gravity=(0.0, 0.0, 0.0)) if "gravity" in s.disabled else s
 
 
-def _compiler(s: Settings, a: Given) -> Settings:
+def _compiler(s: Settings, a: AttributeReader) -> Settings:
     if a.get("coordinate", "local") != "local":
         a.fault(
             'coordinate="global" is not read, nor by MuJoCo since 2.3.4; '
@@ -346,7 +346,7 @@ def classes_of(root: Tag, report: Report) -> Classes:
                 if kind != "default":
                     own[kind] = merged(own.get(kind, {}), child)
             for child in tag.each("default"):
-                a = Given(child.attributes, child, report)
+                a = AttributeReader(child.attributes, child, report)
                 inner = a.get("class")
                 if not inner:
                     a.fault('a <default> inside another needs a name: class="..."')

@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.mjcf.file import Given, Report, Settings, leave_unread
-from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, direction, rounded
+from eomc.robots.mjcf.file import AttributeReader, Report, Settings, leave_unread
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Pose, Reader, direction, rounded
 from eomc.robots.robot import UNLIMITED, Motion, free_motions, joined
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, unit, yaw_pitch_roll
 
 
-class Found(NamedTuple):
+class MjcfJoint(NamedTuple):
     """A joint as it is read. kind: as in joints.JOINTS. type: as in MJCF.
 
     anchor: where it stands in the body's frame. zero: from the body's frame there to the frame in
@@ -38,14 +38,14 @@ LIMITS = "limits of joints, kept as notes"
 TYPES = ("hinge", "slide", "ball", "free")
 
 
-def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | None:
+def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint | None:
     """A joint; `pose` is where its body stands in the parent. None for a fault.
 
     The motions of free and ball joints get their names in _named.
     """
     report, settings, tag = reader.report, reader.settings, placed.tag
     free = tag.kind == "freejoint"
-    a = reader.own(tag) if free else reader.given(placed, "joint")
+    a = reader.own_attributes(tag) if free else reader.attributes_with_defaults(placed, "joint")
     kind = "free" if free else a.choice("type", TYPES)
     turns = kind != "slide"
 
@@ -89,12 +89,14 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
         )
-        found = Found(name, kind, kind, motions, (), ORIGIN, STILL, 0.0, spring)
-        return _balled(found, own, report)
+        mjcf_joint = MjcfJoint(name, kind, kind, motions, (), ORIGIN, IDENTITY_POSE, 0.0, spring)
+        return _with_turn_forces(mjcf_joint, own, report)
     if kind == "ball":
         motions = tuple(replace(m, note=joined(m.note, note)) for m in free_motions()[3:])
-        found = Found(name, kind, "spherical", motions, (), anchor, STILL, 0.0, spring)
-        return _balled(found, own, report)
+        mjcf_joint = MjcfJoint(
+            name, kind, "spherical", motions, (), anchor, IDENTITY_POSE, 0.0, spring
+        )
+        return _with_turn_forces(mjcf_joint, own, report)
     axis = direction(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
     if axis is None:
         return None
@@ -114,23 +116,23 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
     )
     if turns:
         zero = Pose(ORIGIN, from_axis_angle(axis, -ref) if ref else IDENTITY)
-        return Found(name, kind, "revolute", (motion,), (axis,), anchor, zero, 0.0, spring)
+        return MjcfJoint(name, kind, "revolute", (motion,), (axis,), anchor, zero, 0.0, spring)
     # sliding does not depend on the place: at the body's origin the frames stay simple
     zero = Pose(scaled(axis, -ref) if ref else ORIGIN, IDENTITY)
-    return Found(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0, spring)
+    return MjcfJoint(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0, spring)
 
 
-def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
+def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: Report) -> MjcfJoint:
     """A free or ball joint with what acts along its coordinates.
 
     MuJoCo lets damping, friction and springs of turns act on the angular velocity and on the
     angle of the whole turn; per angle they are the same only near zero angles, which is reported.
     """
     springs = ("damping", "stiffness") if any(joint.spring) else ()
-    given = [key for key in ("damping", "friction", "stiffness") if own[key] or key in springs]
-    if given:
+    keys = [key for key in ("damping", "friction", "stiffness") if own[key] or key in springs]
+    if keys:
         report.leave(
-            f"{' and '.join(given)} of whole turns: here they act on each of the three angles, "
+            f"{' and '.join(keys)} of whole turns: here they act on each of the three angles, "
             "which is the same near zero angles only",
             joint.name,
         )
@@ -140,7 +142,7 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
             damping=own["damping"],
             friction=own["friction"],
             stiffness=own["stiffness"],
-            rest=m.rest if "stiffness" in given else 0.0,
+            rest=m.rest if "stiffness" in keys else 0.0,
             armature=own["armature"] if m.unit == "m" else 0.0,
         )
         for m in joint.motions
@@ -149,12 +151,12 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
 
 
 def _limits(
-    a: Given, kind: str, settings: Settings, name: str
+    a: AttributeReader, kind: str, settings: Settings, name: str
 ) -> tuple[str, tuple[float, float], tuple[float, float]]:
     """The limits of a joint in words, for its note, of position and force; reported as left out."""
     notes, ends, driven = [], Motion.limits, Motion.driven
     limits = a.numbers("range", 2)
-    if limits and kind != "free" and limited(a, "limited", settings):
+    if limits and kind != "free" and is_limited(a, "limited", settings):
         off = "limit" in settings.disabled
         what = "joints whose limits the file disables (<flag>)" if off else LIMITS
         a.report.leave(what, name)
@@ -168,7 +170,7 @@ def _limits(
             notes.append(f"from {low:.6g} to {high:.6g} {of}")
             ends = (low, high)
     force = a.numbers("actuatorfrcrange", 2)
-    if force and kind in {"hinge", "slide"} and limited(a, "actuatorfrclimited", settings):
+    if force and kind in {"hinge", "slide"} and is_limited(a, "actuatorfrclimited", settings):
         a.report.leave("limits of the actuators' force on joints, kept as notes", name)
         newton = "N m" if kind == "hinge" else "N"
         notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
@@ -176,18 +178,18 @@ def _limits(
     return joined(*notes), ends, driven
 
 
-def unlimited(joint: Found) -> Found:
+def without_limits(joint: MjcfJoint) -> MjcfJoint:
     """Return the joint without limits of its positions."""
     return joint._replace(motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
 
 
-def limited(a: Given, key: str, settings: Settings) -> bool:
+def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
     """Whether a range that is given holds."""
     word = a.get(key, "auto")
     return word == "true" or (word == "auto" and settings.autolimits)
 
 
-def fresh(name: str, taken: Collection[str]) -> str:
+def unique_name(name: str, taken: Collection[str]) -> str:
     """`name`, with a number behind it where another has it."""
     free, number = name, 2
     while free in taken:
@@ -195,7 +197,7 @@ def fresh(name: str, taken: Collection[str]) -> str:
     return free
 
 
-def named(joints: Sequence[Found]) -> list[Found]:
+def with_coordinate_names(joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     """With a name of its own for each coordinate: its joint's, or x to roll of a lone free one."""
     taken = {joint.name for joint in joints if joint.type in {"hinge", "slide"}}
     several = sum(joint.type == "free" for joint in joints) > 1
@@ -205,7 +207,7 @@ def named(joints: Sequence[Found]) -> list[Found]:
             short = joint.type == "free" and not several
             motions = []
             for m in joint.motions:
-                new = fresh(m.name if short else f"{m.name}_{joint.name}", taken)
+                new = unique_name(m.name if short else f"{m.name}_{joint.name}", taken)
                 taken.add(new)
                 motions.append(replace(m, name=new))
             joint = joint._replace(motions=tuple(motions))

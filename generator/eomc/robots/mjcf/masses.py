@@ -18,8 +18,8 @@ from eomc.robots.inertias import (
     unbalanced,
 )
 from eomc.robots.mjcf.file import (
+    AttributeReader,
     Classes,
-    Given,
     Report,
     Settings,
     merged,
@@ -40,12 +40,12 @@ class Pose(NamedTuple):
     place: Vector
     turn: Matrix
 
-    def of(self, other: Pose) -> Pose:
+    def compose(self, other: Pose) -> Pose:
         """The frame `other`, given in this one, where this one is given."""
         return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
 
 
-STILL = Pose(ORIGIN, IDENTITY)
+IDENTITY_POSE = Pose(ORIGIN, IDENTITY)
 
 
 class Mass(NamedTuple):
@@ -55,7 +55,7 @@ class Mass(NamedTuple):
     center: Vector = ORIGIN
     inertia: Inertia = NO_INERTIA
 
-    def on(self, pose: Pose) -> Mass:
+    def in_frame(self, pose: Pose) -> Mass:
         """The same in the frame in which `pose` is given."""
         return Mass(
             self.mass,
@@ -85,28 +85,28 @@ class Reader:
     report: Report
     sites: dict[str, Placed] = field(default_factory=dict)
 
-    def given(self, placed: Placed, kind: str) -> Given:
+    def attributes_with_defaults(self, placed: Placed, kind: str) -> AttributeReader:
         """What a tag has, with what its class gives: its own, or the childclass around it."""
         tag = placed.tag
         default = self.class_of(tag.get("class", placed.childclass), tag)
-        return Given(merged(default.get(kind, {}), tag), tag, self.report)
+        return AttributeReader(merged(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
         """The default class that a tag names; the outermost one for "", or for a fault."""
         if name and name not in self.classes:
-            self.own(tag).fault(missing("default class", name, self.classes))
+            self.own_attributes(tag).fault(missing("default class", name, self.classes))
             name = ""
         return self.classes[name or "main"]
 
-    def own(self, tag: Tag) -> Given:
+    def own_attributes(self, tag: Tag) -> AttributeReader:
         """What a tag has by itself."""
-        return Given(tag.attributes, tag, self.report)
+        return AttributeReader(tag.attributes, tag, self.report)
 
 
 # ---- poses
 
 
-def direction(vector: Sequence[float], what: str, a: Given) -> Vector | None:
+def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
     """`vector` of length one; None, and a fault, where it has none."""
     x, y, z = vector
     if math.hypot(x, y, z) < 1e-14:
@@ -115,12 +115,12 @@ def direction(vector: Sequence[float], what: str, a: Given) -> Vector | None:
     return unit((x, y, z))
 
 
-def _orientation(a: Given, settings: Settings) -> Matrix:
+def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
     """The rotation that one of quat, axisangle, euler, xyaxes, zaxis gives."""
-    given = [key for key in ORIENTATION if key in a]
-    if len(given) > 1:
-        a.fault(f"the orientation is given twice, by {' and '.join(given)}; leave one")
-    key = given[0] if given else ""
+    keys = [key for key in ORIENTATION if key in a]
+    if len(keys) > 1:
+        a.fault(f"the orientation is given twice, by {' and '.join(keys)}; leave one")
+    key = keys[0] if keys else ""
     v = a.numbers(key, ORIENTATION.get(key, 0))
     if v is None:
         return IDENTITY
@@ -146,7 +146,7 @@ def _orientation(a: Given, settings: Settings) -> Matrix:
     return rotations.cleaned(transposed((first, second, cross(first, second))))
 
 
-def pose_of(a: Given, settings: Settings) -> Pose:
+def pose_of(a: AttributeReader, settings: Settings) -> Pose:
     """Where an element's frame stands in the frame around it."""
     return Pose(a.vector("pos") or ORIGIN, _orientation(a, settings))
 
@@ -226,7 +226,7 @@ def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
 
     still: the body doesn't move, so that a mass that isn't known doesn't matter.
     """
-    a = reader.given(placed, "geom")
+    a = reader.attributes_with_defaults(placed, "geom")
     kind = a.choice("type", (*SHAPES, *MASSLESS, *FORMLESS))
     mass = a.number("mass") if "mass" in a else None
     density = a.number("density", 1000.0)
@@ -261,17 +261,17 @@ def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
             f"the shell of an ellipsoid has no closed inertia; give {placed.body} an <inertial>"
         )
         return None
-    found = _form(kind, a, reader.settings)
-    if found is None:
+    geometry = _form(kind, a, reader.settings)
+    if geometry is None:
         return None
-    size, pose = found
+    size, pose = geometry
     amount, (x, y, z) = SHAPES[kind][1](size, shell)
     m = density * amount if mass is None else mass
     inertia = (m * (y + z), m * (x + z), m * (x + y), 0.0, 0.0, 0.0)
-    return Mass(m, ORIGIN, inertia).on(placed.pose.of(pose))
+    return Mass(m, ORIGIN, inertia).in_frame(placed.pose.compose(pose))
 
 
-def _form(kind: str, a: Given, settings: Settings) -> tuple[Sequence[float], Pose] | None:
+def _form(kind: str, a: AttributeReader, settings: Settings) -> tuple[Sequence[float], Pose] | None:
     """The sizes of a geom, m, and where it stands in the frame around it; None for a fault."""
     count = SHAPES[kind][0]
     size, ends = a.numbers("size", 3, 1), a.numbers("fromto", 6)
@@ -323,7 +323,7 @@ def rounded(x: float, size: float) -> float:
 
 def _inertial(placed: Placed, reader: Reader) -> Mass | None:
     """The mass that <inertial> gives, in its body's frame; None for a fault."""
-    a = reader.own(placed.tag)
+    a = reader.own_attributes(placed.tag)
     if "mass" not in a or "pos" not in a:
         a.fault(f"the <inertial> of {placed.body} needs pos and mass")
         return None
@@ -337,7 +337,7 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
         return None
     full, along = a.numbers("fullinertia", 6), a.vector("diaginertia") or ORIGIN
     inertia = six(full) if full else (*along, 0.0, 0.0, 0.0)
-    return Mass(mass, ORIGIN, inertia).on(placed.pose.of(pose))
+    return Mass(mass, ORIGIN, inertia).in_frame(placed.pose.compose(pose))
 
 
 def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) -> Mass:
@@ -349,16 +349,16 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) ->
     inertials = [p for p in inner if p.tag.kind == "inertial"]
     geoms = [p for p in inner if p.tag.kind == "geom"]
     for placed in inertials[1:]:
-        reader.own(placed.tag).fault(f"{placed.body} has a second <inertial>; leave one")
+        reader.own_attributes(placed.tag).fault(f"{placed.body} has a second <inertial>; leave one")
     mass = Mass()
     if how == "true" or (how == "auto" and not inertials):
         mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, still)) is not None])
     if inertials and mass.mass < LEAST_MASS:  # of geoms, which then leave <inertial> as it is
         mass, tag = _inertial(inertials[0], reader) or Mass(), inertials[0].tag
-    return _bounded(mass, reader.own(tag), reader.settings)
+    return _bounded(mass, reader.own_attributes(tag), reader.settings)
 
 
-def _bounded(mass: Mass, a: Given, s: Settings) -> Mass:
+def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
     """`mass` under boundmass, boundinertia and balanceinertia; its inertia checked."""
     inertia = mass.inertia
     if not all(math.isfinite(x) for x in (mass.mass, *mass.center, *inertia)):

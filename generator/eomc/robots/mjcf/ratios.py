@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from eomc.base import spatial
 from eomc.base.spatial import apply, cross, plus, scaled
-from eomc.robots.mjcf.joints import Found
-from eomc.robots.mjcf.masses import STILL, Pose
-from eomc.robots.robot import Law, RobotBody, Tendon, moved
+from eomc.robots.mjcf.joints import MjcfJoint
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Pose
+from eomc.robots.robot import Law, RobotBody, Tendon, body_pose
 from eomc.robots.rotations import ORIGIN, Vector
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import X, Y, Z
@@ -48,11 +48,11 @@ def damping(
 
 
 def sprung(
-    joints: Sequence[Found],
+    joints: Sequence[MjcfJoint],
     bodies: Sequence[RobotBody],
     tendons: Iterable[Tendon],
     disabled: Collection[str],
-) -> list[Found]:
+) -> list[MjcfJoint]:
     """Return the joints, springdamper as stiffness m/(t r)^2 and damping 2 m/t in its place.
 
     t is the time constant, r the damping ratio, m the inverse of the mean of M^-1 along the
@@ -82,7 +82,7 @@ def sprung(
 
 
 def masses_at_start(
-    bodies: Sequence[RobotBody], joints: Sequence[Found], tendons: Iterable[Tendon]
+    bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Iterable[Tendon]
 ) -> tuple[NDArray[np.float64], list[str]]:
     """M in the pose of the file, and the coordinate of each row.
 
@@ -92,13 +92,13 @@ def masses_at_start(
 
     rows = [m.name for joint in joints for m in joint.motions]
     M = np.diag([m.armature for joint in joints for m in joint.motions])
-    poses: dict[str, Pose] = {WORLD: STILL}
+    poses: dict[str, Pose] = {WORLD: IDENTITY_POSE}
     columns: dict[str, list[tuple[int, Vector, Vector]]] = {WORLD: []}
     waiting, row = iter(joints), 0
     for body in bodies:
-        around = poses[body.parent].of(Pose(body.offset, body.rotation))
-        stands = Pose(*moved(body, [m.start for m in body.motions]))
-        pose = poses[body.name] = poses[body.parent].of(stands)
+        around = poses[body.parent].compose(Pose(body.offset, body.rotation))
+        stands = Pose(*body_pose(body, [m.start for m in body.motions]))
+        pose = poses[body.name] = poses[body.parent].compose(stands)
         mine = []  # turns: the rate and a point of the axis; slides: no rate, the velocity
         if body.joint != "fixed":
             joint = next(waiting)

@@ -9,24 +9,30 @@ from pathlib import Path
 from eomc.base.errors import SceneError
 from eomc.base.spatial import plus, scaled, six
 from eomc.robots.mjcf import masses
-from eomc.robots.mjcf.actuators import actuated, started
-from eomc.robots.mjcf.equality import constrained
+from eomc.robots.mjcf.actuators import read_actuators, with_key_frame_start
+from eomc.robots.mjcf.equality import read_equalities
 from eomc.robots.mjcf.file import (
     ONE_FILE,
-    Given,
+    AttributeReader,
     Report,
     classes_of,
     load,
     settings_of,
 )
-from eomc.robots.mjcf.joints import Found, fresh, joint_of, named, unlimited
-from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
+from eomc.robots.mjcf.joints import (
+    MjcfJoint,
+    joint_of,
+    unique_name,
+    with_coordinate_names,
+    without_limits,
+)
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Mass, Placed, Pose, Reader
 from eomc.robots.mjcf.ratios import sprung
 from eomc.robots.mjcf.schema import SCHEMA
 from eomc.robots.mjcf.tendons import Tendons
-from eomc.robots.robot import Robot, RobotBody, joined, refused
+from eomc.robots.robot import Robot, RobotBody, joined, with_left_out_note
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
-from eomc.robots.schema import strangers
+from eomc.robots.schema import unknown_parts
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 
@@ -67,27 +73,29 @@ def read(path: str | Path, include: bool = False) -> Robot:
     root = load(path, include, report)
     if root.kind != "mujoco":
         what = KINDS.get(root.kind, "not MJCF")
-        Given({}, root, report).fault(
+        AttributeReader({}, root, report).fault(
             f"the file's element is <{root.kind}>, which is {what}; MJCF has <mujoco>"
         )
         raise SceneError(report.faults)
-    report.strangers = strangers(root, SCHEMA, "MJCF")
+    report.strangers = unknown_parts(root, SCHEMA, "MJCF")
     settings = settings_of(root, report)
     reader = Reader(settings, classes_of(root, report), report)
     bodies, joints, anchors = _bodies(root, reader)
     if settings.totalmass > 0:
         bodies = masses.scaled_to(bodies, settings.totalmass)
     tendons = Tendons(root, joints, reader)
-    loops, couplings = constrained(root, _moving(bodies, joints), joints, tendons, anchors, reader)
-    joints, actuators = actuated(root, bodies, joints, tendons, reader)
+    loops, couplings = read_equalities(
+        root, _moving(bodies, joints), joints, tendons, anchors, reader
+    )
+    joints, actuators = read_actuators(root, bodies, joints, tendons, reader)
     if not report.faults:
         joints = sprung(joints, bodies, tendons.fixed.values(), settings.disabled)
     if "limit" in settings.disabled:  # after actuators, which may inherit them
-        joints = [unlimited(joint) for joint in joints]
-    joints, drives = started(root, joints, actuators, report)
+        joints = [without_limits(joint) for joint in joints]
+    joints, drives = with_key_frame_start(root, joints, actuators, report)
     _sections(root, report)
     if report.faults:
-        raise refused(SceneError(report.faults), report.lines())
+        raise with_left_out_note(SceneError(report.faults), report.lines())
     name = root.get("model") or path.stem
     return Robot(
         name=name,
@@ -104,7 +112,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
 
 def _geom_left_out(placed: Placed, reader: Reader) -> None:
     """Report that a geom's shape and contacts are left out."""
-    a = reader.given(placed, "geom")
+    a = reader.attributes_with_defaults(placed, "geom")
     touches = a.get("contype", "1") != "0" or a.get("conaffinity", "1") != "0"
     what = "contacts of geoms" if touches else "shapes of geoms without contact"
     reader.report.leave(what, a.get("name"))
@@ -113,7 +121,9 @@ def _geom_left_out(placed: Placed, reader: Reader) -> None:
 # ---- the tree
 
 
-def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], dict[str, Vector]]:
+def _bodies(
+    root: Tag, reader: Reader
+) -> tuple[list[RobotBody], list[MjcfJoint], dict[str, Vector]]:
     """The bodies, parents first and in the file's order, and the joints in the order of qpos.
 
     Each joint is that of one body, in the order of the bodies that move. The third is where the
@@ -131,40 +141,42 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
         if placed.tag.kind == "geom":
             _geom_left_out(placed, reader)
         elif placed.tag.kind != "body":
-            reader.own(placed.tag).fault("the world can't have this; put it into a <body>")
+            reader.own_attributes(placed.tag).fault(
+                "the world can't have this; put it into a <body>"
+            )
     # a body, and whether its parent stands still
     waiting = [(placed, True) for placed in reversed(inner) if placed.tag.kind == "body"]
     if not waiting:
-        made = next((t.kind for t in below if t.kind in GENERATORS), "")
-        more = f"; what <{made}> adds is not read: {ONE_FILE}" if made else ""
-        reader.own([*worlds, root][0]).fault(f"there is no <body> in <worldbody>{more}")
+        generator = next((t.kind for t in below if t.kind in GENERATORS), "")
+        more = f"; what <{generator}> adds is not read: {ONE_FILE}" if generator else ""
+        reader.own_attributes([*worlds, root][0]).fault(f"there is no <body> in <worldbody>{more}")
     bodies: list[RobotBody] = []
-    joints: list[Found] = []
+    joints: list[MjcfJoint] = []
     anchors: dict[str, Vector] = {}
-    seen: dict[str, set[str]] = {"body": {WORLD}, "joint": set()}
+    used_names: dict[str, set[str]] = {"body": {WORLD}, "joint": set()}
 
     def called(tag: Tag, kind: str, otherwise: str) -> str:
         name = tag.get("name")
-        if name and name in seen[kind]:
-            reader.own(tag).fault(f'there are two called "{name}"; rename one')
-        name = name or fresh(otherwise, names[kind] | seen[kind])
-        seen[kind].add(name)
+        if name and name in used_names[kind]:
+            reader.own_attributes(tag).fault(f'there are two called "{name}"; rename one')
+        name = name or unique_name(otherwise, names[kind] | used_names[kind])
+        used_names[kind].add(name)
         return name
 
     count = 0
     while waiting:
         placed, still = waiting.pop()
-        tag, parent, a = placed.tag, placed.body, reader.own(placed.tag)
+        tag, parent, a = placed.tag, placed.body, reader.own_attributes(placed.tag)
         count += 1
         name = called(tag, "body", f"body{count}")
-        pose = placed.pose.of(masses.pose_of(a, settings))
+        pose = placed.pose.compose(masses.pose_of(a, settings))
         inner = _contents(tag, name, a.get("childclass", placed.childclass), reader)
-        found = [
+        body_joints = [
             joint_of(p, called(p.tag, "joint", f"{name}_joint"), pose, reader)
             for p in inner
             if p.tag.kind in {"joint", "freejoint"}
         ]
-        own = [joint for joint in found if joint is not None]
+        own = [joint for joint in body_joints if joint is not None]
         if any(joint.type == "free" for joint in own):
             if parent != WORLD:
                 a.fault("only a body in <worldbody> can have a free joint")
@@ -181,35 +193,37 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
             passive = not {"spring", "damper"} <= settings.disabled  # as MuJoCo has it
             lifted = a.number("gravcomp")
             chain[-1] = replace(chain[-1], lifted=lifted if passive else 0.0)
-        seen["body"].update(body.name for body in chain)
+        used_names["body"].update(body.name for body in chain)
         bodies += chain
         anchors[name] = anchor
         joints += own
         back = Pose(scaled(anchor, -1.0), IDENTITY)
         waiting += [
-            (p._replace(pose=back.of(p.pose)), still and not own)
+            (p._replace(pose=back.compose(p.pose)), still and not own)
             for p in reversed(inner)
             if p.tag.kind == "body"
         ]
-    return bodies, named(joints), anchors
+    return bodies, with_coordinate_names(joints), anchors
 
 
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
     """What a body holds, frames resolved, in the file's order; what is not read is reported."""
     report = reader.report
-    found: list[Placed] = []
+    contents: list[Placed] = []
     reader.class_of(childclass, tag)
-    waiting = [Placed(child, body, STILL, childclass) for child in reversed(tag.children)]
+    waiting = [Placed(child, body, IDENTITY_POSE, childclass) for child in reversed(tag.children)]
     while waiting:
         placed = waiting.pop()
         inner = placed.tag
         name = inner.get("name", inner.get("prefix"))
         if inner.kind == "frame":
-            around = placed.pose.of(masses.pose_of(reader.own(inner), reader.settings))
+            around = placed.pose.compose(
+                masses.pose_of(reader.own_attributes(inner), reader.settings)
+            )
             default = inner.get("childclass", placed.childclass)
             waiting += [Placed(child, body, around, default) for child in reversed(inner.children)]
         elif inner.kind in {"body", "joint", "freejoint", "geom", "inertial"}:
-            found.append(placed)
+            contents.append(placed)
         elif inner.kind in ORNAMENTS:
             if inner.kind == "site" and name:
                 reader.sites[name] = placed
@@ -217,7 +231,7 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
         elif inner.kind in GENERATORS:
             what = f"<{inner.kind}> and all that it adds, joints and masses too; {ONE_FILE}"
             report.leave(what, name or f"in {body}")
-    return found
+    return contents
 
 
 def _chain(
@@ -225,11 +239,11 @@ def _chain(
     parent: str,
     still: bool,
     pose: Pose,
-    joints: Sequence[Found],
+    joints: Sequence[MjcfJoint],
     mass: Mass,
     taken: Collection[str],
     report: Report,
-) -> tuple[list[RobotBody], list[Found], Vector]:
+) -> tuple[list[RobotBody], list[MjcfJoint], Vector]:
     """The bodies for one <body>: one a joint, in their order, the mass in the last.
 
     still: the parent stands still. pose: of the body in the parent. The third is the place of the
@@ -239,17 +253,17 @@ def _chain(
         only = RobotBody(name, parent, offset=pose.place, rotation=pose.turn)
         return [_heavy(only, mass, ORIGIN)], [], ORIGIN
     bodies: list[RobotBody] = []
-    own: list[Found] = []
+    own: list[MjcfJoint] = []
     anchor = ORIGIN
     for i, joint in enumerate(joints):
         step = Pose(plus(joint.anchor, scaled(anchor, -1.0)), IDENTITY)
-        frame = (step if bodies else pose.of(step)).of(joint.zero)
+        frame = (step if bodies else pose.compose(step)).compose(joint.zero)
         if joint.type == "free":
-            frame = STILL
+            frame = IDENTITY_POSE
         last = i == len(joints) - 1
         bodies.append(
             RobotBody(
-                name if last else fresh(f"{name}_{joint.name}", taken),
+                name if last else unique_name(f"{name}_{joint.name}", taken),
                 bodies[-1].name if bodies else parent,
                 joint.kind,
                 joint.motions,
@@ -284,7 +298,7 @@ def _heavy(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
     return replace(body, mass=mass.mass, center=center, inertia=mass.inertia, note=note)
 
 
-def _moving(bodies: Sequence[RobotBody], joints: Sequence[Found]) -> tuple[RobotBody, ...]:
+def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[RobotBody, ...]:
     """The bodies, those that move with the motions of their joints and the armature of turns."""
     waiting = iter(joints)
     out = []

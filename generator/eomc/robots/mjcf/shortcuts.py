@@ -27,12 +27,12 @@ def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) ->
     if kind in ("position", "intvelocity"):
         kp = own.get("kp", gain[0])
         kv = _minus(own["kv"]) if "kv" in own else own.get("dampratio", bias[2])
-        made = affine | {"gainprm": kp, "biasprm": f"0 {_minus(kp)} {kv}"}
-        made["dyntype"] = inherited.get("dyntype", "none") if same else "none"
+        attributes = affine | {"gainprm": kp, "biasprm": f"0 {_minus(kp)} {kv}"}
+        attributes["dyntype"] = inherited.get("dyntype", "none") if same else "none"
         if "timeconst" in own:
-            made["dyntype"] = "filterexact" if _value(own["timeconst"]) else "none"
+            attributes["dyntype"] = "filterexact" if _value(own["timeconst"]) else "none"
         integrates = {"dyntype": "integrator", "actlimited": "true"}
-        return made | (integrates if kind == "intvelocity" else {})
+        return attributes | (integrates if kind == "intvelocity" else {})
     if kind == "velocity":
         kv = own.get("kv", gain[0])
         return affine | {"dyntype": "none", "gainprm": kv, "biasprm": f"0 0 {_minus(kv)}"}
@@ -45,8 +45,8 @@ def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) ->
         if "diameter" in own:
             area = repr(math.pi / 4 * _value(own["diameter"]) ** 2)
         own_bias = own.get("bias", "").split()
-        given = " ".join([*own_bias, *bias[len(own_bias) :]][:3])
-        return affine | {"dyntype": "filter", "gainprm": area, "biasprm": given}
+        bias_text = " ".join([*own_bias, *bias[len(own_bias) :]][:3])
+        return affine | {"dyntype": "filter", "gainprm": area, "biasprm": bias_text}
     return {"gaintype": kind, "biastype": kind}
 
 

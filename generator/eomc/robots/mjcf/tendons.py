@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf.file import Given, leave_unread, missing
-from eomc.robots.mjcf.joints import Found, fresh, limited
-from eomc.robots.mjcf.masses import STILL, Placed, Reader
+from eomc.robots.mjcf.file import AttributeReader, leave_unread, missing
+from eomc.robots.mjcf.joints import MjcfJoint, is_limited, unique_name
+from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Reader
 from eomc.robots.robot import Range, Tendon
 from eomc.robots.xml import Tag
 
@@ -17,23 +17,23 @@ LEFT = "tendons"  # the kind under which those are listed that do nothing here
 class Tendons:
     """The tendons of a file by their names in it. fixed: those that are sums of joints."""
 
-    def __init__(self, root: Tag, joints: Sequence[Found], reader: Reader) -> None:
+    def __init__(self, root: Tag, joints: Sequence[MjcfJoint], reader: Reader) -> None:
         self.fixed: dict[str, Tendon] = {}
         self._reader = reader
         self._tags = [tag for section in root.each("tendon") for tag in section.children]
         self._joints = {joint.name: joint for joint in joints}
         self._driven: set[str] = set()
-        taken = {m.name for joint in joints for m in joint.motions}
+        used_names = {m.name for joint in joints for m in joint.motions}
         for tag in self._tags:
             name = tag.get("name")
             reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
             terms = self._terms(tag) if tag.kind == "fixed" else None
             if not terms:
                 continue
-            made = self._read(Tendon(fresh(name or "tendon", taken), terms), tag)
-            taken.add(made.name)
-            self.fixed[name or made.name] = made
-            if made.acts:
+            tendon = self._read(Tendon(unique_name(name or "tendon", used_names), terms), tag)
+            used_names.add(tendon.name)
+            self.fixed[name or tendon.name] = tendon
+            if tendon.acts:
                 self.reads(name)
 
     @property
@@ -41,7 +41,7 @@ class Tendons:
         """Those that have an effect."""
         return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
 
-    def known(self, name: str, a: Given) -> bool:
+    def known(self, name: str, a: AttributeReader) -> bool:
         """Whether there is such a tendon, a fault if there is none."""
         names = {tag.get("name") for tag in self._tags}
         if name not in names:
@@ -62,7 +62,7 @@ class Tendons:
         """The joints of a fixed tendon, each with its factor; none where it is no sum of these."""
         terms = []
         for each in tag.each("joint"):
-            a = self._reader.own(each)
+            a = self._reader.own_attributes(each)
             joint = a.get("joint")
             if joint not in self._joints:
                 a.fault(missing("joint", joint, self._joints) if joint else "it needs a joint")
@@ -74,7 +74,7 @@ class Tendons:
 
     def _read(self, tendon: Tendon, tag: Tag) -> Tendon:
         report, name = self._reader.report, tag.get("name")
-        a = self._reader.given(Placed(tag, "", STILL, ""), "tendon")
+        a = self._reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "tendon")
         own = {}
         for key in ("stiffness", "damping"):
             own[key], *more = a.numbers(key, 3, 1) or (0.0,)
@@ -85,7 +85,9 @@ class Tendons:
             if value < 0:
                 a.fault(f"{key} must not be negative")
         for key, what in (("", "length"), ("actuatorfrc", "force")):
-            if a.numbers(f"{key}range", 2) and limited(a, f"{key}limited", self._reader.settings):
+            if a.numbers(f"{key}range", 2) and is_limited(
+                a, f"{key}limited", self._reader.settings
+            ):
                 report.leave(f"limits of {what} of tendons", name)
         leave_unread(a, "tendon", name)
         disabled = self._reader.settings.disabled
@@ -96,14 +98,14 @@ class Tendons:
             stiffness=own["stiffness"],
             damping=own["damping"],
             armature=own["armature"],
-            rest=self._rest(tendon, a),
+            rest=self._rest_range(tendon, a),
         )
 
-    def _rest(self, tendon: Tendon, a: Given) -> Range:
+    def _rest_range(self, tendon: Tendon, a: AttributeReader) -> Range:
         """Where its spring is slack: as the file says, or as it is where those of joints are."""
-        given = a.numbers("springlength", 2, 1) or (-1.0,)
-        if {*given} != {-1.0}:
-            return given[0], given[-1]
+        slack = a.numbers("springlength", 2, 1) or (-1.0,)
+        if {*slack} != {-1.0}:
+            return slack[0], slack[-1]
         rests = {joint.motions[0].name: joint.motions[0].rest for joint in self._joints.values()}
         length = sum(by * rests[q] for by, q in tendon.terms)
         return length, length
