@@ -167,7 +167,7 @@ def build(
         if name and (there := cache.key_there(folder, digest, form)):
             return cache.Built(name, folder, False, there)
         raise
-    if name and cache.found(folder, wanted):
+    if name and cache.is_built(folder, wanted):
         return cache.Built(name, folder, False, wanted)
     if made is None:
         assert isinstance(scene, (str, os.PathLike))

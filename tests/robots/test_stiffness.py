@@ -91,7 +91,9 @@ def test_the_mass_matrix_is_that_of_the_scene(
         by_name = {m.name: m.start for m in robot.motions}
         (m,) = hand.motions
         assert m.mimics
-        hand = replace(hand, motions=(replace(m, start=m.mimics.joint_position(by_name["shoulder"])),))
+        hand = replace(
+            hand, motions=(replace(m, start=m.mimics.joint_position(by_name["shoulder"])),)
+        )
         robot = replace(robot, bodies=(*rest, hand))
     rows = [m.name for m in robot.motions]
     found = stiffness.mass_matrix(robot, rows)

@@ -159,7 +159,7 @@ def test_builds_of_other_versions_are_kept_some_of_them(
     scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For what they have pickled; not of the same scene with other flags."""
-    monkeypatch.setattr(cache, "KEPT_BUILDS", 1)
+    monkeypatch.setattr(cache, "MAX_ARCHIVED_BUILDS", 1)
     folder = root / "simple_pendulum"
     kept, keys = folder / ".builds", [json.loads((folder / cache.MANIFEST).read_text())["key"]]
     monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DOTHER")
@@ -170,7 +170,7 @@ def test_builds_of_other_versions_are_kept_some_of_them(
         scene.write_text(text, encoding="utf-8")
         eomc.build(scene, root)
         assert [place.name for place in kept.iterdir()] == [keys[-1][:12]]
-        assert cache.found(kept / keys[-1][:12], keys[-1])
+        assert cache.is_built(kept / keys[-1][:12], keys[-1])
 
 
 def test_a_list_of_files_that_lacks_one_is_no_build(root: Path, found: None) -> None:
@@ -178,12 +178,12 @@ def test_a_list_of_files_that_lacks_one_is_no_build(root: Path, found: None) -> 
     folder = root / "simple_pendulum"
     manifest = json.loads((folder / cache.MANIFEST).read_text(encoding="utf-8"))
     key, files = manifest["key"], manifest["files"]
-    assert cache.found(folder, key)
+    assert cache.is_built(folder, key)
 
     def altered(**change: object) -> bool:
         text = json.dumps({k: x for k, x in (manifest | change).items() if x is not None})
         (folder / cache.MANIFEST).write_text(text, encoding="utf-8")
-        return cache.found(folder, key)
+        return cache.is_built(folder, key)
 
     assert altered()
     for name in files:

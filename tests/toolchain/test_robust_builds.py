@@ -128,13 +128,13 @@ def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path, found: None)
             bad = bytearray(good)
             bad[at] ^= 4
             file.write_bytes(bytes(bad))
-            assert not cache.found(folder, _key(folder)), file
+            assert not cache.is_built(folder, _key(folder)), file
         file.write_bytes(b"")
-        assert not cache.found(folder, _key(folder)), file
+        assert not cache.is_built(folder, _key(folder)), file
         file.unlink()
-        assert not cache.found(folder, _key(folder)), file
+        assert not cache.is_built(folder, _key(folder)), file
         file.write_bytes(good)
-    assert cache.found(folder, _key(folder))
+    assert cache.is_built(folder, _key(folder))
     assert not eomc.build(scene, root).fresh
     library = next(folder.glob("_simple_pendulum_*"))
     library.write_bytes(library.read_bytes()[:-1] + b"!")

@@ -14,7 +14,7 @@ from stand_in import StandIn
 from eomc.verify import symbolic
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row
-from eomc.verify.rows_projection import Projection, report
+from eomc.verify.rows_projection import ProjectionChecks, report
 
 SYSTEM = scene_system("pendulum_xy")
 
@@ -37,7 +37,7 @@ class Projecting:
 
 
 def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, Row]:
-    monkeypatch.setattr(Projection, "refusals", lambda _: 0.0)  # which ask a C function
+    monkeypatch.setattr(ProjectionChecks, "refusals", lambda _: 0.0)  # which ask a C function
     random = np.random.default_rng(0)
     made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
     report(made, module, "")

@@ -70,7 +70,7 @@ def _row(path: Path, root: Path) -> Row | None:
         return None
     name, digest = pipeline.name_and_digest(path)
     try:
-        built = bool(name) and cache.found(root / name, cache.key(digest))
+        built = bool(name) and cache.is_built(root / name, cache.key(digest))
     except NoCompilerError:
         built = bool(cache.key_there(root / name, digest))
     return {

@@ -170,12 +170,12 @@ def _judged(t: Vector, amplification: Vector, sizes: Vector, values: Vector) -> 
     rise = math.log(own / amplification[half]) if math.isfinite(own) else math.inf
     rate, wild = rise / (duration / 2), rise > math.log(CHAOS_GROWTH)
     # of a rounding at any time on the way
-    carried = EPSILON * amplification * np.maximum.accumulate(values / amplification)
+    propagated = EPSILON * amplification * np.maximum.accumulate(values / amplification)
     most = 0.1 * (sizes[-1] or values.max() or 1.0)
-    unreliable = np.flatnonzero(~(carried <= most))
+    unreliable = np.flatnonzero(~(propagated <= most))
     horizon = math.inf
     if len(unreliable):
         horizon = float(t[unreliable[0]])
     elif wild and rate > 0:
-        horizon = float(duration + math.log(most / carried[-1]) / rate)
+        horizon = float(duration + math.log(most / propagated[-1]) / rate)
     return Growth(t=t, amplification=amplification, rate=rate, wild=wild, horizon=horizon)

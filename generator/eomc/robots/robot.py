@@ -19,11 +19,10 @@ from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
-Range = tuple[float, float]  # the least and the largest
+Range = tuple[float, float]  # minimum and maximum
 Terms = tuple[tuple[float, str], ...]  # a sum of coordinates, each with its factor
-COUPLING_TOLERANCE = (
-    1e-4  # rad or m: what locked values may break a coupling by, as typed decimals do
-)
+# rad or m: locked values may violate a coupling by this much: typed decimals are rounded
+COUPLING_TOLERANCE = 1e-4
 UNLIMITED: Range = (-math.inf, math.inf)
 
 

@@ -1,10 +1,10 @@
-"""Built modules: found by a key, built under a lock, loaded, unpickled.
+"""Cache of built modules: look-up by key, build under a lock, import, and unpickling.
 
-A module lies in `build/<name>/`. Its extension carries a digest in its name, and `__init__.py`,
-which says which extension is its own, is moved into place last: whatever interrupts a build, the
-module that was there stays whole, and what fails is taken back. A file lock keeps builds of one
-scene apart. The build of another version of the scene that it replaces is kept in
-`build/<name>/.builds/`, where values that it has pickled find it.
+A module lies in `build/<name>/`. The name of its extension contains a digest, and `__init__.py`,
+which imports that extension, is moved into place last: if a build is interrupted, the old module
+stays complete; if it fails, its files are removed again. A file lock serialises the builds of a
+scene. A build that replaces one of another version of the scene archives the old one in
+`build/<name>/.builds/`, so that pickled values of that version can still be loaded.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ if TYPE_CHECKING:
     from eomc.emit.render import Sources
 
 MANIFEST = "build.json"
-HALF = 32  # letters of a key
-KEPT_BUILDS = 32  # of other versions of a scene, some 0.5 MB each: designs compared in one pool
+HALF_KEY_LENGTH = 32  # characters
+MAX_ARCHIVED_BUILDS = 32  # of other versions of a scene, about 0.5 MB each
 
 
 @dataclass(frozen=True)
 class Built:
-    """A module on disk; `fresh` where it was built just now and not found; key: "" for any."""
+    """A module on disk. fresh: it was built by this call. key: "" if any build will do."""
 
     name: str
     folder: Path
@@ -57,12 +57,12 @@ class Built:
 
 
 class ReplacedError(EomcError):
-    """Another build has taken a module's place before it was loaded."""
+    """Another build replaced the module before it was loaded."""
 
 
 @lru_cache(maxsize=1)
 def generator_digest() -> str:
-    """What the generator is: its version and the text of all its parts."""
+    """Return the digest of the generator: of its version and the contents of all its files."""
     total = hashlib.sha256(__version__.encode())
     for name, file in resources.parts():
         total.update(name.encode() + file.read_bytes())
@@ -70,46 +70,51 @@ def generator_digest() -> str:
 
 
 def key(scene_digest: str, form: str = "fast") -> str:
-    """What a build depends on: scene, generator, flags, processor, and with these the compiler.
+    """Return the key of a build.
 
-    Half is the digest of all of it, half that of all but the compiler. Raises EomcError where
-    there is none.
+    Its first half is the digest of scene, generator, flags, processor and compiler; its second half
+    that of the same without the compiler. Raises EomcError if there is no compiler.
     """
     small, large = compiler_for(0), compiler_for(MANY_OPERATIONS + 1)
     parts = _parts(scene_digest, form)
-    return _total(*parts, small.identity, large.identity)[:HALF] + _total(*parts)[:HALF]
+    return (
+        _digest_of_parts(*parts, small.identity, large.identity)[:HALF_KEY_LENGTH]
+        + _digest_of_parts(*parts)[:HALF_KEY_LENGTH]
+    )
 
 
 def key_there(folder: Path, scene_digest: str, form: str = "fast") -> str:
-    """The key of the build in `folder` where it is whole and of this scene; else "".
+    """Return the key of the build in `folder` if it is complete and of this scene; else "".
 
-    It may be another compiler's: for where there is none now.
+    It may be by another compiler: this serves machines that have none.
     """
     try:
         there = _key(folder)
     except (OSError, ValueError, KeyError, TypeError):
         return ""
-    same = there[HALF:] == _total(*_parts(scene_digest, form))[:HALF]
-    return there if same and found(folder, there) else ""
+    same = (
+        there[HALF_KEY_LENGTH:] == _digest_of_parts(*_parts(scene_digest, form))[:HALF_KEY_LENGTH]
+    )
+    return there if same and is_built(folder, there) else ""
 
 
 def _parts(scene_digest: str, form: str) -> tuple[str, ...]:
-    """All that a build depends on but the compiler."""
+    """Return everything that a build depends on except the compiler."""
     return (
         scene_digest, form, generator_digest(), STANDARD, *flags(form), processor(), sys.version,
         str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
 
 
-def _total(*parts: str) -> str:
-    # a variable of the environment may hold bytes that are no text
+def _digest_of_parts(*parts: str) -> str:
+    # environment variables may contain bytes that are not UTF-8
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
 
 
-def found(folder: Path, wanted: str) -> bool:
-    """Whether `folder` holds a whole build of this key: all of its files, each with its digest.
+def is_built(folder: Path, wanted: str) -> bool:
+    """Return whether `folder` contains the complete build with this key.
 
-    A single bit that has changed in an extension may end the process that loads it.
+    The digests of all files are compared: loading a corrupt extension may crash the process.
     """
     try:
         manifest = _manifest(folder)
@@ -124,7 +129,7 @@ def found(folder: Path, wanted: str) -> bool:
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
-    """What the build in `folder` says of itself."""
+    """Return the manifest of the build in `folder`."""
     manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     return manifest
 
@@ -139,12 +144,12 @@ def _python_files_of(folder: Path) -> set[Path]:
 
 
 def _digest_of_files(files: dict[str, str]) -> str:
-    """SHA-256 of a list of files and their digests: a list that lacks one is no build."""
+    """Return the SHA-256 of a manifest's list of files, which detects an incomplete list."""
     return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()
 
 
 def _digest(file: Path) -> str:
-    """SHA-256; some 0.3 ms for a small scene."""
+    """Return the SHA-256 of a file; about 0.3 ms for a small scene."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
@@ -156,23 +161,23 @@ def build(
     form: str = "fast",
     scene_digest: str = "",
 ) -> Built:
-    """The module of one scene under `root`, built where it isn't there yet.
+    """Return the module of one scene under `root`; build it if it is not there yet.
 
-    wanted: the key. sources: makes the files, given the name of the extension; called only where
-    something is to be built. form: of the C that it is compiled from. scene_digest: of the scene;
-    a build of another one is kept, for what it has pickled.
-    Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
+    wanted: the key. sources: returns the files, given the name of the extension; called only if
+    the module must be built. form: of the C that it is compiled from. scene_digest: of the scene;
+    a build with another digest is archived, for values pickled by it.
+    Raises EomcError with the compiler's message if it fails, or if the folder can't be written.
     """
     folder = place(name, root, form)
     root = folder.parent
-    if found(folder, wanted):
+    if is_built(folder, wanted):
         return Built(name, folder, False, wanted)
     try:
         root.mkdir(parents=True, exist_ok=True)
         with locked(root / f".{folder.name}.lock"):
-            if found(folder, wanted):  # by another process, meanwhile
+            if is_built(folder, wanted):  # by another process, meanwhile
                 return Built(name, folder, False, wanted)
-            _free(folder)
+            _check_folder_is_free(folder)
             for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
             with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}.build-") as new:
@@ -185,12 +190,12 @@ def build(
 
 
 def place(name: str, root: Path, form: str = "fast") -> Path:
-    """The folder of a scene's module; that of the plain form, for comparison, lies inside it."""
+    """Return the folder of a scene's module. That of the plain form lies inside it."""
     return root / name if form == "fast" else root / name / ".plain"
 
 
-def _free(folder: Path) -> None:
-    """An EomcError where a folder holds a package that no build made, or is none."""
+def _check_folder_is_free(folder: Path) -> None:
+    """Raise EomcError if `folder` is a file, or a package that was not built by eomc."""
     if folder.is_symlink() or folder.exists():
         if not folder.is_dir():
             raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
@@ -214,14 +219,14 @@ def _build(
     from eomc.toolchain import extension
     from eomc.toolchain.subprocesses import write_files
 
-    called = f"_{name}_{wanted[:12]}"
-    made = sources(called)
-    write_files(made.files, new)
-    library = called + str(sysconfig.get_config_var("EXT_SUFFIX"))
-    compiler = compiler_for(made.operations)
-    extension.build(made, called, new, library, compiler, form)
-    kept = [library, *(f for f in made.files if form == "fast" or f.endswith(".py"))]
-    files = {file: _digest(new / file) for file in kept}
+    extension_name = f"_{name}_{wanted[:12]}"
+    rendered = sources(extension_name)
+    write_files(rendered.files, new)
+    library = extension_name + str(sysconfig.get_config_var("EXT_SUFFIX"))
+    compiler = compiler_for(rendered.operations)
+    extension.build(rendered, extension_name, new, library, compiler, form)
+    shipped = [library, *(f for f in rendered.files if form == "fast" or f.endswith(".py"))]
+    files = {file: _digest(new / file) for file in shipped}
     manifest = {
         "key": wanted,
         "name": name,
@@ -233,57 +238,57 @@ def _build(
         "files_digest": _digest_of_files(files),
     }
     (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    for file in kept:
+    for file in shipped:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    _keep(folder, scene_digest, new / ".kept")
+    _archive(folder, scene_digest, new / ".kept")
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
-    stale += _python_files_of(folder) - {folder / file for file in kept}
-    # the face last: until it is there, the old one is whole; the manifest after it
-    _move(new, folder, [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST])
+    stale += _python_files_of(folder) - {folder / file for file in shipped}
+    # __init__.py goes last, before the manifest: until then the old module is complete
+    _move(new, folder, [*(f for f in shipped if f != "__init__.py"), "__init__.py", MANIFEST])
     for path in stale:
         path.unlink(missing_ok=True)
 
 
-def _keep(folder: Path, scene_digest: str, links: Path) -> None:
-    """Keep the build in `folder`, if it is of another version of the scene, in its `.builds`.
+def _archive(folder: Path, scene_digest: str, links: Path) -> None:
+    """Archive the build in `folder` in its `.builds`, if it is of another version of the scene.
 
-    links: where its files are put together. The oldest of more than KEPT_BUILDS are removed. A
-    build that can't be kept is left out: values that it has pickled are refused then.
+    links: a folder in which to collect its files. Only the newest MAX_ARCHIVED_BUILDS are kept. If
+    a build can't be archived, values that it has pickled can't be loaded any more.
     """
     with suppress(OSError, ValueError, KeyError, TypeError):
         manifest = _manifest(folder)
         key = str(manifest["key"])
-        place = _place_of_kept(folder, key)
-        if manifest["scene"] == scene_digest or found(place, key) or not found(folder, key):
+        place = _archive_folder(folder, key)
+        if manifest["scene"] == scene_digest or is_built(place, key) or not is_built(folder, key):
             return
         for file in (*manifest["files"], MANIFEST):
-            _also_at(folder / file, links / file)
+            _link_or_copy(folder / file, links / file)
         shutil.rmtree(place, ignore_errors=True)
         place.parent.mkdir(exist_ok=True)
         os.replace(links, place)
         dated = sorted((p.stat().st_mtime, p) for p in place.parent.iterdir())
-        for _, old in dated[:-KEPT_BUILDS]:
+        for _, old in dated[:-MAX_ARCHIVED_BUILDS]:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _place_of_kept(folder: Path, key: str) -> Path:
-    """Where the build of this key lies, once another has replaced it in `folder`."""
+def _archive_folder(folder: Path, key: str) -> Path:
+    """Return the folder in which the build with this key is archived."""
     return folder / ".builds" / key[:12]
 
 
 def _move(new: Path, folder: Path, files: list[str]) -> None:
-    """Move files into place, in their order; where that fails, those there before are there again.
+    """Move files into `folder`, in their order; restore the previous ones if that fails.
 
-    Not where the process is killed: the next build mends that.
+    If the process is killed instead, the next build repairs the folder.
     """
-    there = {file: _also_at(folder / file, new / ".old" / file) for file in files}
+    there = {file: _link_or_copy(folder / file, new / ".old" / file) for file in files}
     try:
         for file in files:
             _date_later(new / file, folder / file)
             os.replace(new / file, folder / file)
     except BaseException:  # Ctrl-C too
         for file in reversed(files):
-            with suppress(OSError):  # the others all the same
+            with suppress(OSError):  # restore the others even so
                 if there[file]:
                     os.replace(new / ".old" / file, folder / file)
                 else:
@@ -291,22 +296,23 @@ def _move(new: Path, folder: Path, files: list[str]) -> None:
         raise
 
 
-def _also_at(file: Path, other: Path) -> bool:
-    """Whether a file is there; it is then also at another place, by a link if that can be."""
+def _link_or_copy(file: Path, other: Path) -> bool:
+    """Hard-link `file` to `other`, or copy it if that fails; return False if it is missing."""
     if not file.exists():
         return False
     other.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(file, other)
-    except OSError:  # file systems without, or that are full of them
+    except OSError:  # the file system has no links, or too many to this file
         shutil.copy2(file, other)
     return True
 
 
 def _date_later(new: Path, old: Path) -> None:
-    """Date a file at least a second later than the one that it replaces.
+    """Date a file at least one second later than the one that it replaces.
 
-    Python knows the source of kept bytecode by its second and its size: else the old one's ran.
+    Python compares the source's time in seconds and its size with those in cached bytecode; with
+    equal ones it would run the old bytecode.
     """
     if not old.is_file():
         return
@@ -316,9 +322,9 @@ def _date_later(new: Path, old: Path) -> None:
 
 
 def load(built: Built, home: str = "") -> ModuleType:
-    """Import a built module, whatever else bears its name; the same build gives the same module.
+    """Import a built module under a name of its own; the same build gives the same module object.
 
-    home: the folder of builds of this scene, where that is another. Raises ReplacedError where
+    home: the folder of builds of this scene, if the build lies elsewhere. Raises ReplacedError if
     another build has replaced it.
     """
     folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
@@ -340,37 +346,37 @@ def load(built: Built, home: str = "") -> ModuleType:
     sys.modules[alias] = module
     try:
         spec.loader.exec_module(module)
-        if f"{alias}._{built.name}_{key[:12]}" not in sys.modules:  # another face was read
+        if f"{alias}._{built.name}_{key[:12]}" not in sys.modules:  # __init__.py was replaced
             raise replaced
     except BaseException as fault:
         del sys.modules[alias]
         if isinstance(fault, Exception) and _key(folder) != key:
             raise replaced from None
         raise
-    # another process can't import the alias; what is pickled here is found by its place there
+    # other processes can't import the alias: pickled values refer to the build by its place
     place = (built.name, home or str(folder), key)
     sys.modules[f"{alias}._runtime.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
 
 
 def _alias(name: str, key: str) -> str:
-    """What the module of a build is called in `sys.modules`."""
+    """Return the name of a build's module in `sys.modules`."""
     return f"_eomc_{name}_{key[:12]}"
 
 
 def _key(folder: Path) -> str:
-    """Of the build that lies there now."""
+    """Return the key of the build that is in `folder` now."""
     return str(_manifest(folder)["key"])
 
 
 def unpickled(
     place: tuple[str, str, str], identity: tuple[Any, ...], path: str, arguments: tuple[Any, ...]
 ) -> Any:
-    """A value that was pickled by a module that `load` had imported; pickle calls this.
+    """Return a value that was pickled by a module imported by `load`; pickle calls this function.
 
-    place: the name of the scene, the folder of its builds, and the key of the one that pickled.
-    A pool of processes waits for ever where a task can't be read, so nothing is raised here: what
-    can't be read is an `Unreadable`, which raises EomcError when it is used.
+    place: the scene's name, the folder of its builds, and the key of the build that pickled it.
+    Nothing is raised here, since a pool of processes waits forever if a task can't be unpickled:
+    the value is then an `Unreadable`, which raises EomcError when it is used.
     """
     from eomc.runtime import status
     from eomc.runtime.package import Unreadable
@@ -395,13 +401,13 @@ def unpickled(
 
 
 def _build_of(place: tuple[str, str, str]) -> ModuleType:
-    """The module of the build at a place, also where another has replaced it; else that other."""
+    """Return the module of the build at a place, or from the archive, or else its successor."""
     name, folder, key = place
     if (loaded := sys.modules.get(_alias(name, key))) is not None:
         return loaded
-    for there in (Path(folder), _place_of_kept(Path(folder), key), Path(folder)):
-        # another process may replace it just now: then it is kept, or the other is looked at
-        if found(there, key):
+    for there in (Path(folder), _archive_folder(Path(folder), key), Path(folder)):
+        # another process may replace it meanwhile: then it is in the archive
+        if is_built(there, key):
             with suppress(ReplacedError, OSError):
                 return load(Built(name, there, False, key), folder)
     return load(Built(name, Path(folder), False))

@@ -39,14 +39,16 @@ def largest_angle(system: System) -> Callable[[State], float]:
         return lambda s: 0.0
     parameters = [p.symbol for p in system.parameters]
     names = [*system.q, *system.qd, t, *system.u, *parameters]
-    of = compiled(names, sorted(angles, key=str), "numpy", needed(known, [*angles]))
+    evaluate = compiled(names, sorted(angles, key=str), "numpy", needed(known, [*angles]))
     defaults = {p.name: p.value for p in system.parameters}
 
     def largest(s: State) -> float:
         values = s.params or defaults
         u = np.zeros(len(system.u)) if s.u is None else s.u
         with np.errstate(all="ignore"):
-            found = of(*s.q, *s.qd, s.t, *u, *(np.float64(values[p.name]) for p in parameters))
-        return float(np.nanmax(np.abs(np.array(found, float)), initial=0.0))
+            arguments = evaluate(
+                *s.q, *s.qd, s.t, *u, *(np.float64(values[p.name]) for p in parameters)
+            )
+        return float(np.nanmax(np.abs(np.array(arguments, float)), initial=0.0))
 
     return largest
