@@ -172,7 +172,8 @@ def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Configur
     constraints = manifold.system.constraints
     row, others = constraints[rows[0]], _together_with(constraints, rows)
     if len(rows) > 1 and _alike(manifold, rows, place):
-        message = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {NO_SINGLE_CHANGE}"
+        names = _names(constraints, rows[1:])
+        message = f"contradicts {names}: no rates keep them zero. {NO_SINGLE_CHANGE}"
     else:
         message = (
             f"changes at the start{others}, and no rates mend it: the start is a singular "
