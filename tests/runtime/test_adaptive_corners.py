@@ -161,7 +161,7 @@ def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
     for text, there in ((PENDULUM, True), (smooth, False)):
         files = eomc.sources(from_scene(parse(text, "x.toml")), "_x").files
         for name in ("limited_pendulum.c", "fast/limited_pendulum.c"):
-            assert ("gauss16_bent" in files[name]) == there
+            assert ("gauss16_kink_error" in files[name]) == there
         for name in ("limited_pendulum.h", "limited_pendulum.c"):
             (tmp_path / name).write_text(files[name], encoding="utf-8")
         if there:  # without corners: tests/c

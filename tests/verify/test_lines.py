@@ -61,7 +61,7 @@ UNREACHABLE = {
 # tests/runtime/test_adaptive_stiff.py; sweeps and differences that fail where the accelerations
 # do not; what only a program in C asks for, a run without a memory
 ADAPTIVE = re.compile(
-    r"x->(hindered|stiff) .*|memory->evaluations \+= 2\*NQ \+ 1;|newton = .*|if \(newton\)"
+    r"x->(stiff_votes|stiff) .*|memory->evaluations \+= 2\*NQ \+ 1;|newton = .*|if \(newton\)"
     r"|continue;|return 1;|return \w+_NOT_FINITE;|row\[k\] = k;|memset\(&own.*|memory = &own;"
     r"|.*>= memory\[k\]\.max_evaluations;|.*_TOO_LONG;"  # tests/runtime/test_batch_adaptive.py
 )

@@ -128,7 +128,7 @@ class Stepping:
         arguments = (*self.form.around, *self.functions.moves_stages, *limits, newton)
         results = (*measures, c.filled("int", "sweeps"))
         cap = [c.given(real, "cap")] if self.may_rest else []
-        return c.static(f"{self.method}_settled", "int", out, *arguments, *cap, *results)
+        return c.static(f"{self.method}_solve_stages", "int", out, *arguments, *cap, *results)
 
     @property
     def may_rest(self) -> bool:
@@ -145,7 +145,7 @@ class Stepping:
         values = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
         others = (*self.form.around, *self.functions.moves_stages)
         arguments = (c.filled(real, "cap"), *values, *others, self.number("tol"))
-        return c.static(f"{self.method}_capped", "int", *arguments)
+        return c.static(f"{self.method}_cap_scales", "int", *arguments)
 
     @cached_property
     def forces(self) -> CFunction:
@@ -165,7 +165,9 @@ class Stepping:
         """The function for the next step."""
         arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
-        return c.static(f"{self.method}_adapted", status, self.state, *arguments, self.workspace)
+        return c.static(
+            f"{self.method}_adaptive_step", status, self.state, *arguments, self.workspace
+        )
 
     @cached_property
     def interpolate(self) -> CFunction:
@@ -173,7 +175,7 @@ class Stepping:
         out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.given(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
-        return c.static(f"{self.method}_inside", "void", *out, *arguments, self.workspace)
+        return c.static(f"{self.method}_interpolate", "void", *out, *arguments, self.workspace)
 
     @property
     def step_arguments(self) -> Sequence[CArgument]:
@@ -222,8 +224,8 @@ def tableau(stepping: Stepping) -> dict[str, Any]:
         "most": MAX_ITERATIONS,
         "c": numbers(m.c, real),
         "powers": matrix(list(zip(*m.powers, strict=True)), real),
-        "anew": RETRY_AFTER,
-        "still": len(target.system.modes) + len(target.system.discrete),
+        "retry_after": RETRY_AFTER,
+        "unscaled": len(target.system.modes) + len(target.system.discrete),
     }
 
 
@@ -244,18 +246,18 @@ def steps(stepping: Stepping) -> Adaptive:
         top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),
         weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
         timed=target.driven,
-        held=stepping.may_rest,
+        may_rest=stepping.may_rest,
         capped=stepping.rounding_cap,
         capped_now=stepping.rounding_cap.call(a="&a"),
         events=bool(target.system.events),
         begins="begins" in target.program,
         project=form.project,
         whole=form.whole,
-        settle=stepping.solve_stages,
+        solve_stages=stepping.solve_stages,
         sweep=form.sweep,
         step=stepping.step,
         start=form.start,
-        settled=stepping.solve_stages.call(
+        solve=stepping.solve_stages.call(
             most=f"{target.literal(REJECT_AFTER_TWO)}*aim", cap="capped ? cap : 0", **references
         ),
         within=stepping.interpolate,
@@ -274,7 +276,7 @@ def steps(stepping: Stepping) -> Adaptive:
         to_parts=c.in_braces(numbers(row, real) for row in to_parts),
         from_parts=c.in_braces(numbers(row, real) for row in from_parts),
         forces_there=stepping.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
-        settled_within=stepping.solve_stages.call(most=target.literal(1e30), cap="0", **references),
+        solve_within=stepping.solve_stages.call(most=target.literal(1e30), cap="0", **references),
     )
 
 
@@ -301,7 +303,7 @@ def fixed(stepping: Stepping) -> FixedSteps:
         step=functions.public.fixed_step.call(**at),
         forces_before=stepping.forces.call(f="before", **state),
         forces_halfway=stepping.forces.call(f="halfway", t="t + h/2", **at),
-        forces_behind=stepping.forces.call(f="behind", t="t + h", **at),
+        forces_after=stepping.forces.call(f="after", t="t + h", **at),
     )
 
 
@@ -313,7 +315,7 @@ def max_events_per_step(system: System) -> int:
 def row_storage(stepping: Stepping) -> CFunction:
     """Return the function that stores a state in a row."""
     arguments = (c.filled(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
-    return CFunction(f"{stepping.method}_kept", "void", tuple(arguments))
+    return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 
 
 def tightest(real: Real) -> float:
@@ -322,14 +324,14 @@ def tightest(real: Real) -> float:
 
 
 def run(
-    stepping: Stepping, happen: str = "", restart: str = "", begun: str = "", changed: str = "",
+    stepping: Stepping, happen: str = "", restart: str = "", initial_events: str = "", changed: str = "",
     values: str = "",
 ) -> AdaptiveRun:  # fmt: skip
     """Return the view of the loop over steps.
 
     Parameters
     ----------
-    happen, restart, begun
+    happen, restart, initial_events
         Calls that detect events, continue after them, and handle events at the start.
     changed, values
         Calls that report whether inputs have changed the event functions, and evaluate them.
@@ -358,13 +360,13 @@ def run(
         f=target.real.suffix,
         eps=target.literal(target.real.epsilon),
         fabs=f"fabs{target.real.function_suffix}",
-        lately=RECENT_STEPS,
-        begun=begun,
+        recent_steps=RECENT_STEPS,
+        initial_events=initial_events,
         changed=changed,
         values=values,
         huge=target.literal(1e30),
-        busy=max_events_per_step(target.system),
-        anew=RETRY_AFTER,
+        max_events=max_events_per_step(target.system),
+        retry_after=RETRY_AFTER,
         run=functions.public.adaptive(METHOD.name),
         advance=stepping.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
         fixed=stepping.fixed.call(x="&x") if happen else "",
@@ -402,7 +404,7 @@ def call_for_instance(functions: Functions) -> str:
         times="times ? times + kept[k] : 0", count="row_count - kept[k]", t_rows="0", **rows,
         events="events ? events + k : 0", which="which ? which + room*k : 0",
         event_rows=f"which ? event_rows + (1 + 2*{NQ})*room*k : 0", p="p + p_instance*k",
-        memory="memory + k", status="&found",
+        memory="memory + k", status="&result",
     )  # fmt: skip
 
 

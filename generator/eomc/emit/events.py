@@ -22,7 +22,7 @@ from eomc.emit.adaptive import (
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events, FixedSteps
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, InitialEvents, Events, FixedSteps
 from eomc.integrators.tableaux import Row
 from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
@@ -88,7 +88,7 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
 
 def views(
     functions: Functions, form: SweepInterface
-) -> Iterator[Adaptive | FixedSteps | Events | Begun | AdaptiveRun]:
+) -> Iterator[Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun]:
     """Yield the views of adaptive steps, fixed steps, events and the loop over them."""
     stepping = Stepping(functions, form)
     yield steps(stepping)
@@ -108,12 +108,12 @@ def views(
     if start_view:
         yield start_view
     start_call = start_view.function.call(x="&x") if start_view else ""
-    end_state = {"events": "x.seen", "t": "x.t", "q": "x.q", "qd": "x.qd"}
+    end_state = {"events": "x.last_values", "t": "x.t", "q": "x.q", "qd": "x.qd"}
     values = functions.public.evaluation("events").call(**end_state)
     changed = event_view.changed.call(x="&x")
     yield run(
         stepping,
-        event_view.happened.call(**arguments),
+        event_view.event_step.call(**arguments),
         event_view.restart.call(**again),
         start_call,
         changed,
@@ -121,7 +121,7 @@ def views(
     )
 
 
-def _start_events(stepping: Stepping, restart: CFunction) -> Begun:
+def _start_events(stepping: Stepping, restart: CFunction) -> InitialEvents:
     """Return the view of events at the start of a motion."""
     functions, x = stepping.functions, stepping.state.name
     values, record = (
@@ -132,9 +132,9 @@ def _start_events(stepping: Stepping, restart: CFunction) -> Begun:
     extra = [a for a in functions.arguments("u", "p") if a.name in arguments_taken]
     arguments = (stepping.state, *extra, *record, stepping.workspace)
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
-    return Begun(
+    return InitialEvents(
         **functions.names,
-        function=c.static(f"{stepping.method}_begun", functions.status, *arguments),
+        function=c.static(f"{stepping.method}_initial_events", functions.status, *arguments),
         values=values.call(begins="value", **state),
         method=stepping.method,
         restart=restart.call(reached=state["t"]),
@@ -154,24 +154,26 @@ def _events(stepping: Stepping) -> Events:
     # arguments of the formulas besides the state
     extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
 
-    looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *extra)
+    evaluate_events = c.static(
+        f"{method}_evaluate_events", "void", c.filled(real, "g"), read, number("z"), *extra
+    )
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
-    bracketed = c.static(f"{method}_bracketed", real, read, k, *ends, *extra)
+    refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
     above = tuple(int(e.above) for e in system.events if "begins" in target.program)
-    crossing = c.static(
-        f"{method}_crossing", real, stepping.state, k, number("from"), c.given(real, "g"),
+    find_root = c.static(
+        f"{method}_find_root", real, stepping.state, k, number("from"), c.given(real, "g"),
         *([number("noise")] if above else []), *extra,
     )  # fmt: skip
     outputs = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
     rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
-    happened = c.static(f"{method}_happened", "int", stepping.state, *outputs, *rest)
-    changed = c.static(f"{method}_changed", "int", stepping.state, *extra)
+    event_step = c.static(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
+    changed = c.static(f"{method}_events_changed", "int", stepping.state, *extra)
     calls = [*evaluated, *([public.project] if stepping.form.project else ())]
     taken_by_calls = {a.name for f in calls for a in f.arguments}
     after_event = [a for a in functions.arguments("u", "p") if a.name in taken_by_calls]
     restart = c.static(
-        f"{method}_restarted", functions.status, stepping.state, number("reached"), *outputs[1:],
+        f"{method}_restart", functions.status, stepping.state, number("reached"), *outputs[1:],
         *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}
@@ -188,24 +190,24 @@ def _events(stepping: Stepping) -> Events:
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
         above=above,
         jumps=jumps,
-        busy=max_events_per_step(system),
+        max_events=max_events_per_step(system),
         together=EVENTS_PER_STEP + 4 * (max_events_per_step(system) - EVENTS_PER_STEP),
-        apart=target.literal(difference),
+        difference_step=target.literal(difference),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
         **_rounding(stepping, extra),
-        looked=looked,
+        evaluate_events=evaluate_events,
         values=values.call(events="g", **within),
-        bracketed=bracketed,
-        crossing=crossing,
-        look_value=looked.call(g="value"),
-        bracket=bracketed.call(high="node[j]", at_high="g[j]"),
-        bracket_dip=bracketed.call(high="z", at_high="value[k]"),
-        happened=happened,
-        cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
-        look_before=looked.call(g="value", z=f"z - {target.literal(difference / 2)}"),
-        look_behind=looked.call(g="value", z=f"z + {target.literal(difference / 2)}"),
+        refine_root=refine_root,
+        find_root=find_root,
+        look_value=evaluate_events.call(g="value"),
+        bracket=refine_root.call(high="node[j]", at_high="g[j]"),
+        bracket_dip=refine_root.call(high="z", at_high="value[k]"),
+        event_step=event_step,
+        cross=find_root.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
+        look_before=evaluate_events.call(g="value", z=f"z - {target.literal(difference / 2)}"),
+        look_after=evaluate_events.call(g="value", z=f"z + {target.literal(difference / 2)}"),
         inside=stepping.state_within.call(),
         values_there=values.call(events="value", **within),
         values_end=values.call(events="value", t=now["t"]),
@@ -252,8 +254,8 @@ def _tables(functions: Functions) -> dict[str, Any]:
         "slopes": matrix(slopes(x), real),
         "huge": target.literal(1e30),
         "halvings": MAX_EVENT_HALVINGS,
-        "lately": RECENT_STEPS,
-        "told": target.literal(MAX_TAIL),
+        "recent_steps": RECENT_STEPS,
+        "max_tail": target.literal(MAX_TAIL),
         "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
         "stages": METHOD.stages,
         "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),

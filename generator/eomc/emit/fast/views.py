@@ -372,15 +372,16 @@ class Batch(Named, Driven):
 class AdaptiveLanes(AdaptiveTableau):
     """c/fast/adaptive_lanes.c.jinja: adaptive steps of many instances side by side.
 
-    roughest: of the root of tol/2, what refuses a step after two sweeps. accelerate: of each at a
-    stage; forces: of one at its start; alone: the call for one; kept, look: the calls that write a
-    row, at the end of a step or in it.
+    max_roughness: in units of sqrt(tol/2); rougher steps are rejected after two iterations.
+    accelerate: call of the accelerations of all lanes at a stage; forces: that of one instance at
+    the start; alone: call that steps one instance; store_row, look: calls that write a row at the
+    end of a step, and within it.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"
     inline: str
     noinline: str
-    roughest: str
+    max_roughness: str
     loosest: str
     tightest: str
     inputs: bool
@@ -393,7 +394,7 @@ class AdaptiveLanes(AdaptiveTableau):
     forces: str
     batch: CFunction
     alone: str
-    kept: str
+    store_row: str
     look: str
 
 

@@ -21,11 +21,11 @@ class AdaptiveTableau(Named):
         Matrix from accelerations at the stages (rows) to coefficients of their polynomial.
     most
         Largest number of iterations over the stages.
-    anew
+    retry_after
         Steps by Newton's method before fixed-point iteration is tried again.
     of_most, of_most_coarse
         Least scale of coordinates and velocities, relative to the largest; for rounding errors.
-    still
+    unscaled
         Number of trailing coordinates that only jumps change, which have no scale.
     """
 
@@ -38,11 +38,11 @@ class AdaptiveTableau(Named):
     tiny: str
     of_most: str
     of_most_coarse: str
-    still: int
+    unscaled: int
     most: int
     c: tuple[str, ...]
     powers: tuple[str, ...]
-    anew: int
+    retry_after: int
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Adaptive(AdaptiveTableau):
     total: the sum of half[0], ... over half of the stages. lanes: macro before loops over stages.
     top: matrix from accelerations at the stages (rows) to the last four Legendre coefficients.
     weights: matrix to the increments of position and velocity. project: the call that projects the
-    end of a step, given as an increment, or as a state with `whole`. held: whether time-dependent
+    end of a step, given as an increment, or as a state with `whole`. may_rest: whether time-dependent
     forces may hold all bodies at rest; capped: the effect of rounding errors then. corners: whether
     forces jump or have kinks; share: of the tolerance, for steps with them. ends: weights of the
     values at both ends of a step. forces: accelerations at a state; slopes: their derivatives, by
@@ -66,20 +66,20 @@ class Adaptive(AdaptiveTableau):
     top: tuple[str, ...]
     weights: tuple[str, ...]
     timed: bool
-    held: bool
+    may_rest: bool
     capped: CFunction
     capped_now: str
     events: bool
     begins: bool
     project: str
     whole: bool
-    settle: CFunction
+    solve_stages: CFunction
     sweep: str
     step: CFunction
     start: str
-    settled: str
+    solve: str
     within: CFunction
-    settled_within: str
+    solve_within: str
     corners: bool
     fabs: str
     longest: str
@@ -104,7 +104,7 @@ class FixedSteps(Named):
 
     fixed, at: the next step, and the state within the last one. step: the call of the method
     through a function pointer. inside: the call for the state within an adaptive step.
-    forces_before, forces_halfway, forces_behind: calls of the accelerations at both ends and the
+    forces_before, forces_halfway, forces_after: calls of the accelerations at both ends and the
     middle of a step. above: whether there are events of stick-slip friction.
     """
 
@@ -124,7 +124,7 @@ class FixedSteps(Named):
     step: str
     forces_before: str
     forces_halfway: str
-    forces_behind: str
+    forces_after: str
 
 
 @dataclass(frozen=True)
@@ -132,9 +132,9 @@ class Events(Named):
     """c/events.c.jinja: event detection in adaptive steps.
 
     samples, nodes: number and positions of evaluations in a step. slopes: matrix from values at the
-    nodes to derivatives. last: weights of the last Chebyshev coefficients. told: largest such
+    nodes to derivatives. last: weights of the last Chebyshev coefficients. max_tail: largest such
     coefficient relative to the largest value; above it, a step is halved, at most `halvings` times
-    besides one step in `lately`. busy: largest number of events in a step. apart, near, close:
+    besides one step in `recent_steps`. max_events: largest number of events in a step. difference_step, near, close:
     fractions of a step. chance: fraction of the time between jumps below which the next jump counts
     as coincidental.
     """
@@ -155,31 +155,31 @@ class Events(Named):
     actions: tuple[int, ...]
     above: tuple[int, ...]
     jumps: bool
-    busy: int
+    max_events: int
     together: int
-    apart: str
+    difference_step: str
     near: str
     close: str
     chance: str
     huge: str
     halvings: int
-    lately: int
+    recent_steps: int
     rounding: CFunction
     rounded: str
     values_near: str
-    told: str
+    max_tail: str
     last: tuple[str, ...]
-    looked: CFunction
+    evaluate_events: CFunction
     values: str
-    bracketed: CFunction
-    crossing: CFunction
+    refine_root: CFunction
+    find_root: CFunction
     look_value: str
     bracket: str
     bracket_dip: str
-    happened: CFunction
+    event_step: CFunction
     cross: str
     look_before: str
-    look_behind: str
+    look_after: str
     inside: str
     values_there: str
     values_end: str
@@ -197,10 +197,10 @@ class Events(Named):
 
 
 @dataclass(frozen=True)
-class Begun(Named):
-    """c/begun.c.jinja: events at the start of a motion."""
+class InitialEvents(Named):
+    """c/initial_events.c.jinja: events at the start of a motion."""
 
-    TEMPLATE: ClassVar[str] = "c/begun.c"
+    TEMPLATE: ClassVar[str] = "c/initial_events.c"
     function: CFunction
     values: str
     restart: str
@@ -222,13 +222,13 @@ class AdaptiveRun(Named):
     f: str
     eps: str
     fabs: str
-    lately: int
-    begun: str
+    recent_steps: int
+    initial_events: str
     changed: str
     values: str
     huge: str
-    busy: int
-    anew: int
+    max_events: int
+    retry_after: int
     run: CFunction
     advance: str
     fixed: str

@@ -11,7 +11,7 @@ from eomc.emit.plain.adaptive_views import (
     Adaptive,
     AdaptiveBatch,
     AdaptiveRun,
-    Begun,
+    InitialEvents,
     Events,
     FixedSteps,
 )
@@ -299,5 +299,5 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Projection | Project | Derivative | RungeKutta4 | Explicit | Implicit
-    | Gauss | Nodes | Adaptive | FixedSteps | Events | Begun | AdaptiveRun | AdaptiveBatch | Loop
+    | Gauss | Nodes | Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun | AdaptiveBatch | Loop
 )  # fmt: skip
