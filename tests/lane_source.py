@@ -24,7 +24,7 @@ EXPONENTIALS = ("exp", "tanh")
 MOST = 16  # numbers in the widest of them
 
 ONE = """
-typedef EOMC_REAL eomc_LANE_loose;
+typedef EOMC_REAL eomc_LANE_unaligned;
 enum { EOMC_LANE_COUNT = 1 };
 
 void exceeds(long n, const EOMC_REAL *x, const EOMC_REAL *most, int *told)
@@ -37,11 +37,11 @@ ROTATING = """
 void rotate_LANE(long n, const EOMC_REAL *d, EOMC_REAL *s, EOMC_REAL *c)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
-        eomc_LANE x = *(eomc_LANE_loose *)(s + i), y = *(eomc_LANE_loose *)(c + i);
+        eomc_LANE x = *(eomc_LANE_unaligned *)(s + i), y = *(eomc_LANE_unaligned *)(c + i);
 
-        eomc_rotate_LANE(*(const eomc_LANE_loose *)(d + i), &x, &y);
-        *(eomc_LANE_loose *)(s + i) = x;
-        *(eomc_LANE_loose *)(c + i) = y;
+        eomc_rotate_LANE(*(const eomc_LANE_unaligned *)(d + i), &x, &y);
+        *(eomc_LANE_unaligned *)(s + i) = x;
+        *(eomc_LANE_unaligned *)(c + i) = y;
     }
 }
 
@@ -51,13 +51,13 @@ void rotate_both_LANE(long n, const EOMC_REAL *d, const EOMC_REAL *s0, const EOM
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
         eomc_LANE s[2], c[2];
 
-        eomc_rotate_both_LANE(*(const eomc_LANE_loose *)(d + i),
-            *(const eomc_LANE_loose *)(s0 + i), *(const eomc_LANE_loose *)(c0 + i),
+        eomc_rotate_both_LANE(*(const eomc_LANE_unaligned *)(d + i),
+            *(const eomc_LANE_unaligned *)(s0 + i), *(const eomc_LANE_unaligned *)(c0 + i),
             &s[0], &c[0], &s[1], &c[1]);
-        *(eomc_LANE_loose *)(s_back + i) = s[0];
-        *(eomc_LANE_loose *)(c_back + i) = c[0];
-        *(eomc_LANE_loose *)(s_on + i) = s[1];
-        *(eomc_LANE_loose *)(c_on + i) = c[1];
+        *(eomc_LANE_unaligned *)(s_back + i) = s[0];
+        *(eomc_LANE_unaligned *)(c_back + i) = c[0];
+        *(eomc_LANE_unaligned *)(s_on + i) = s[1];
+        *(eomc_LANE_unaligned *)(c_on + i) = c[1];
     }
 }
 """
@@ -71,12 +71,12 @@ static void tell_LANE(int *told, const eomc_LANE_mask *failed)
 void small_LANE(long n, const EOMC_REAL *x, EOMC_REAL *s, EOMC_REAL *c)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
-        const eomc_LANE angle = *(const eomc_LANE_loose *)(x + i);
+        const eomc_LANE angle = *(const eomc_LANE_unaligned *)(x + i);
         eomc_LANE sine, cosine;
 
         eomc_sincos_small_LANE(&angle, &sine, &cosine);
-        *(eomc_LANE_loose *)(s + i) = sine;
-        *(eomc_LANE_loose *)(c + i) = cosine;
+        *(eomc_LANE_unaligned *)(s + i) = sine;
+        *(eomc_LANE_unaligned *)(c + i) = cosine;
     }
 }
 
@@ -89,9 +89,9 @@ void sincos_LANE(long n, const EOMC_REAL *x, EOMC_REAL *s, EOMC_REAL *c, int *to
 
         for (int k = 0; k < EOMC_LANE_COUNT; k++)
             failed[k] = -told[i + k];
-        eomc_sincos_LANE(*(const eomc_LANE_loose *)(x + i), &sine, &cosine, &failed);
-        *(eomc_LANE_loose *)(s + i) = sine;
-        *(eomc_LANE_loose *)(c + i) = cosine;
+        eomc_sincos_LANE(*(const eomc_LANE_unaligned *)(x + i), &sine, &cosine, &failed);
+        *(eomc_LANE_unaligned *)(s + i) = sine;
+        *(eomc_LANE_unaligned *)(c + i) = cosine;
         tell_LANE(told + i, &failed);
     }
 }
@@ -99,7 +99,7 @@ void sincos_LANE(long n, const EOMC_REAL *x, EOMC_REAL *s, EOMC_REAL *c, int *to
 void exceeds_LANE(long n, const EOMC_REAL *x, const EOMC_REAL *most, int *told)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
-        eomc_LANE_mask failed = eomc_exceeds_LANE(*(const eomc_LANE_loose *)(x + i), *most);
+        eomc_LANE_mask failed = eomc_exceeds_LANE(*(const eomc_LANE_unaligned *)(x + i), *most);
 
         tell_LANE(told + i, &failed);
     }
@@ -108,7 +108,7 @@ void exceeds_LANE(long n, const EOMC_REAL *x, const EOMC_REAL *most, int *told)
 void not_positive_LANE(long n, const EOMC_REAL *x, int *told)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
-        eomc_LANE_mask failed = eomc_not_positive_LANE(*(const eomc_LANE_loose *)(x + i));
+        eomc_LANE_mask failed = eomc_not_positive_LANE(*(const eomc_LANE_unaligned *)(x + i));
 
         tell_LANE(told + i, &failed);
     }
@@ -117,7 +117,7 @@ void not_positive_LANE(long n, const EOMC_REAL *x, int *told)
 void not_finite_LANE(long n, const EOMC_REAL *x, int *told)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
-        eomc_LANE_mask failed = eomc_not_finite_LANE(*(const eomc_LANE_loose *)(x + i));
+        eomc_LANE_mask failed = eomc_not_finite_LANE(*(const eomc_LANE_unaligned *)(x + i));
 
         tell_LANE(told + i, &failed);
     }
@@ -139,14 +139,14 @@ int any_LANE(const EOMC_INTEGER *bits)
 
 void same_LANE(const EOMC_REAL *x, EOMC_REAL *to)
 {
-    *(eomc_LANE_loose *)to = eomc_same_LANE(*x);
+    *(eomc_LANE_unaligned *)to = eomc_same_LANE(*x);
 }
 """
 EACH = """
 void NAME_LANE(long n, const EOMC_REAL *x, EOMC_REAL *y)
 {
     for (long i = 0; i < n; i += EOMC_LANE_COUNT)
-        *(eomc_LANE_loose *)(y + i) = eomc_NAME_LANE(*(const eomc_LANE_loose *)(x + i));
+        *(eomc_LANE_unaligned *)(y + i) = eomc_NAME_LANE(*(const eomc_LANE_unaligned *)(x + i));
 }
 """
 FOUR = """

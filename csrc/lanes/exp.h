@@ -22,7 +22,7 @@ EOMC_INLINE eomc_LANE eomc_exp_reduced_LANE(eomc_LANE x, eomc_LANE *shifted)
     /* r and what it lost: the first part of ln 2 has 41 bits, its product with n is exact,
      * whether compilers contract it or not */
     const eomc_LANE above = x - n*0.693147180559663, r = above - n*2.8235290563031577e-13;
-    const eomc_LANE lost = (above - r) - n*2.8235290563031577e-13;
+    const eomc_LANE remainder = (above - r) - n*2.8235290563031577e-13;
 
     const eomc_LANE z = r*r, z2 = z*z;
     const eomc_LANE p01 = r*0.1666666666666667 + 0.5;
@@ -35,7 +35,7 @@ EOMC_INLINE eomc_LANE eomc_exp_reduced_LANE(eomc_LANE x, eomc_LANE *shifted)
     const eomc_LANE p = z2*(z2*p8 + p47) + p03;
 
     *shifted = rounded;
-    return (z*p + lost + r) + 1.0;
+    return (z*p + remainder + r) + 1.0;
 }
 
 /* e^x. Infinity from 709.79 on, 0 below -745.2. */

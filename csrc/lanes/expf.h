@@ -20,14 +20,14 @@ EOMC_INLINE eomc_LANE eomc_exp_reduced_LANE(eomc_LANE x, eomc_LANE *shifted)
     /* r and what it lost: the first part of ln 2 has 15 bits, its product with n is exact,
      * whether compilers contract it or not */
     const eomc_LANE above = x - n*0.69314575f, r = above - n*1.4286068e-06f;
-    const eomc_LANE lost = (above - r) - n*1.4286068e-06f;
+    const eomc_LANE remainder = (above - r) - n*1.4286068e-06f;
 
     const eomc_LANE z = r*r;
     const eomc_LANE p01 = r*0.16666667f + 0.5f, p23 = r*0.0083333105f + 0.041666467f;
     const eomc_LANE p45 = r*0.00019890988f + 0.0013933647f;
 
     *shifted = rounded;
-    return (z*(z*(z*p45 + p23) + p01) + lost + r) + 1.0f;
+    return (z*(z*(z*p45 + p23) + p01) + remainder + r) + 1.0f;
 }
 
 /* e^x. Infinity from 88.73 on, 0 below -103.98. */

@@ -8,5 +8,5 @@ EOMC_INLINE void eomc_put(EOMC_REAL *to, EOMC_REAL a, EOMC_REAL b, EOMC_REAL c, 
 {
     const eomc_four all = { a, b, c, d };
 
-    *(eomc_four_loose *)to = all;
+    *(eomc_four_unaligned *)to = all;
 }

@@ -11,8 +11,8 @@ EOMC_INLINE void eomc_sincos_small_LANE(const eomc_LANE *angle, eomc_LANE *sine,
     /* r = x - n pi/2, with pi/2 in parts of 33 bits: their products with n < 2^20 are exact,
      * whether compilers contract them or not */
     const eomc_LANE above = x - n*1.5707963267341256, second = n*6.077100506303966e-11;
-    const eomc_LANE rounded = above - second, lost = (above - rounded) - second;
-    const eomc_LANE r = rounded - (n*2.0222662487111665e-21 - lost);
+    const eomc_LANE rounded = above - second, remainder = (above - rounded) - second;
+    const eomc_LANE r = rounded - (n*2.0222662487111665e-21 - remainder);
 
     /* sin r = r + r^3 P(r^2), cos r = 1 + r^2 (-1/2 + r^2 Q(r^2)); adding 0.0 keeps sin(-0.0) */
     const eomc_LANE z = r*r, z2 = z*z, r3 = r*z + 0.0;

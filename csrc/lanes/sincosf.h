@@ -11,8 +11,8 @@ EOMC_INLINE void eomc_sincos_small_LANE(const eomc_LANE *angle, eomc_LANE *sine,
     /* r = x - n pi/2, with pi/2 in parts of 11 bits: their products with n < 2^13 are exact,
      * whether compilers contract them or not */
     const eomc_LANE above = (x - n*1.5703125f) - n*0.0004837513f, second = n*7.5495336e-08f;
-    const eomc_LANE rounded = above - second, lost = (above - rounded) - second;
-    const eomc_LANE r = rounded - (n*2.563283e-12f - lost);
+    const eomc_LANE rounded = above - second, remainder = (above - rounded) - second;
+    const eomc_LANE r = rounded - (n*2.563283e-12f - remainder);
 
     /* sin r = r + r^3 P(r^2), cos r = 1 + r^2 (-1/2 + r^2 Q(r^2)); adding 0.0 keeps sin(-0.0) */
     const eomc_LANE z = r*r, r3 = r*z + 0.0f;

@@ -5,7 +5,7 @@
 typedef EOMC_REAL eomc_LANE
     __attribute__((vector_size(EOMC_LANE_BYTES), aligned(EOMC_LANE_ALIGNED), may_alias));
 /* anywhere in memory */
-typedef eomc_LANE eomc_LANE_loose __attribute__((aligned(sizeof(EOMC_REAL))));
+typedef eomc_LANE eomc_LANE_unaligned __attribute__((aligned(sizeof(EOMC_REAL))));
 typedef EOMC_INTEGER eomc_LANE_mask
     __attribute__((vector_size(EOMC_LANE_BYTES), aligned(EOMC_LANE_ALIGNED), may_alias));
 

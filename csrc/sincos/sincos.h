@@ -76,8 +76,8 @@ EOMC_INLINE double eomc_sincos_reduce(double x, double *shifted)
     const double above = x - n * 1.5707963267341256; /* exact */
     const double second = n * 6.077100506303966e-11;
     const double rounded = above - second;
-    const double lost = (above - rounded) - second;
-    return rounded - (n * 2.0222662487111665e-21 - lost);
+    const double remainder = (above - rounded) - second;
+    return rounded - (n * 2.0222662487111665e-21 - remainder);
 #endif
 }
 

@@ -77,8 +77,8 @@ EOMC_INLINE float eomc_sincosf_reduce(float x, float *shifted)
     const float above = (x - n * 1.5703125f) - n * 0.0004837513f; /* exact */
     const float second = n * 7.5495336e-08f;
     const float rounded = above - second;
-    const float lost = (above - rounded) - second;
-    return rounded - (n * 2.563283e-12f - lost);
+    const float remainder = (above - rounded) - second;
+    return rounded - (n * 2.563283e-12f - remainder);
 #endif
 }
 

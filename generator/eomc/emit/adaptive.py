@@ -324,8 +324,8 @@ def tightest(real: Real) -> float:
 
 
 def run(
-    stepping: Stepping, happen: str = "", restart: str = "", initial_events: str = "", changed: str = "",
-    values: str = "",
+    stepping: Stepping, happen: str = "", restart: str = "", initial_events: str = "",
+    changed: str = "", values: str = "",
 ) -> AdaptiveRun:  # fmt: skip
     """Return the view of the loop over steps.
 

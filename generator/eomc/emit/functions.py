@@ -383,7 +383,7 @@ class Functions:
         if self.rotation_errors is None:
             return None
         read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]
-        out = (c.filled(self.real, "lack"), c.filled(self.real, "A"))
+        out = (c.filled(self.real, "residual"), c.filled(self.real, "A"))
         return c.static(f"{self.prefix}_rotated", "void", *out, *read)
 
     @cached_property

@@ -18,7 +18,9 @@ SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 LEFT_OUT = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
 COUPLING_ROUNDINGS = 30  # error of the rates, in units of rounding, after correcting q and qd
 ZERO_SQUARE = 1e-12  # a coordinate counts as 0 if its square is below this part of the sum of all
-SETTLED = 1e-14  # of the squared distance to the nearest state: the square of the last change
+NEAREST_TOLERANCE = (
+    1e-14  # of the squared distance to the nearest state: the square of the last change
+)
 STARTS = 16  # random starts, if the search from a state does not converge
 
 
@@ -63,12 +65,12 @@ def view(
         rate_terms=rate_terms,
         rate_terms_call=rate_terms.function.call(**(state or {})) if rate_terms else "",
         rows=width(target) - 2 * len(target.names),
-        loose=target.literal(largest_fraction),
+        tolerance=target.literal(largest_fraction),
         part=target.literal(row_fraction),
         fabs=f"fabs{target.real.function_suffix}",
         near=target.literal(large),
         crossed=target.literal((COUPLING_ROUNDINGS * target.real.epsilon) ** 2),
-        apart=target.literal(ZERO_SQUARE),
+        scale_floor=target.literal(ZERO_SQUARE),
         little=target.literal(little),
         slight=target.literal(1e4 * little),
         rounded=target.literal(large**2 * noise),
@@ -112,12 +114,12 @@ def project(functions: Functions) -> Project:
         function=public.project,
         call_D=D.call(q="at"),
         call_A=A.call(q="at"),
-        call_phi=phi.call(phi="lack", q="at", qd="moving"),
-        call_rates=rates.call(rates="lack", q="at", qd="moving"),
+        call_phi=phi.call(phi="residual", q="at", qd="moving"),
+        call_rates=rates.call(rates="residual", q="at", qd="moving"),
         dependent=target.literal(64 * eps),
         small=target.literal((64 * eps) ** 2),
         enough=target.literal((4096 * eps) ** 2),
-        loose=target.literal(4096 * eps),
+        tolerance=target.literal(4096 * eps),
         rounded=target.literal(4 * eps),
         weights="{ " + ", ".join(map(target.literal, weights)) + " }" if weights else "",
         sums=in_braces([*map(target.literal, row)] for row in sums),
@@ -136,6 +138,6 @@ def project(functions: Functions) -> Project:
         atan=f"atan{end}",
         searched=any(row.holonomic and row.loop for row in rows),
         starts=STARTS,
-        settled=target.literal(SETTLED),
+        converged=target.literal(NEAREST_TOLERANCE),
         half_turn=target.literal(float(f"{eps**0.5:.0e}")),
     )

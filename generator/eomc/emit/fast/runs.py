@@ -61,12 +61,12 @@ def loop(steppers: Steppers, m: Method) -> views.Loop:
     lane, s, public = steppers.one, steppers.accelerations, steppers.functions.public
     run = public.run(m.name)
     corrected = steppers.corrected(m)
-    here = {"q": "x.q", "qd": "x.qd", "u": "given", "m": "&x", "end": "&sines"}
+    here = {"q": "x.q", "qd": "x.qd", "u": "input", "m": "&x", "end": "&sines"}
     end = [c.filled(f"{lane.prefix}_sines", "end")] if corrected else []
     advance = steppers.implicit(m) if m.implicit else steppers.advanced(lane, m.name, *end)
     alone = steppers.advanced(lane, f"{m.name}_alone")
     step_end = {"q": "x.q", "qd": "x.qd", "t": "t + h", "singular": "&singular"}
-    first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "given", "a": "x.a"}
+    first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "input", "a": "x.a"}
     zeros = dict.fromkeys(("first", "every", "q_rows", "qd_rows", "memory", "u_stride"), "0")
     predicted = ["&x", *(["t0"] if lane.target.driven else []), "h", "first", "n", "steps"]
     predicted += ["u", "u_stride"] if lane.target.system.inputs else []
@@ -92,7 +92,7 @@ def loop(steppers: Steppers, m: Method) -> views.Loop:
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
         corrected=corrected,
         project=ending(steppers.functions, lane, **step_end, s="&sines" if corrected else "NULL"),
-        project_anew=ending(steppers.functions, lane, **step_end, s="NULL"),
+        project_again=ending(steppers.functions, lane, **step_end, s="NULL"),
     )
 
 
@@ -116,7 +116,7 @@ def batch(steppers: Steppers, m: Method) -> views.Batch:
         own=has_own_constants,
         compute_constants=constants_call(steppers),
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
-        alone=alone.call(q="at", qd="moving", u="given"),
+        alone=alone.call(q="at", qd="moving", u="input"),
         corrected=steppers.corrected(m),
         project=ending(
             steppers.functions, steppers.wide, q="from[b].q", qd="from[b].qd", t="t + h",

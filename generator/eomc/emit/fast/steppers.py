@@ -169,7 +169,7 @@ class Steppers:
 
         def stage(k: int) -> str:
             names = ["&w", *(a.name for a in self.stepping(lane))]
-            named = {"q": "x.q", "qd": "x.qd", "u": "w.u[0]" if shared else "given"}
+            named = {"q": "x.q", "qd": "x.qd", "u": "w.u[0]" if shared else "input"}
             arguments = [str(k), "1", *(named.get(n, n) for n in names)]
             return f"{lane.prefix}_rk4_stage({', '.join(arguments)})"
 
@@ -334,7 +334,7 @@ class Steppers:
             extrapolated=before,
             sweep=self.sweep(m),
             together=self.accelerate(
-                wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? given : NULL", c="&wide"
+                wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? input : NULL", c="&wide"
             ),
             alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
             onto=onto(lane).call(at="x", moving="v", t="t + c_[i + j]*h")
@@ -356,7 +356,7 @@ class Steppers:
             **self.literals,
             # Steps that need more than five iterations are long, with errors above this value.
             enough=lane.target.literal(max(1e-8, real.epsilon)),
-            loose=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
+            tolerance=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
             inputs=bool(lane.target.system.inputs),
             name=m.name,
             title=m.title,

@@ -278,7 +278,7 @@ class Sweeps(Named):
     fabs: str
     eps: str
     enough: str
-    loose: str
+    tolerance: str
     inputs: bool
     name: str
     title: str
@@ -341,7 +341,7 @@ class Loop(Named, Driven):
     advance: str
     otherwise: str
     project: str
-    project_anew: str
+    project_again: str
     corrected: bool
 
 

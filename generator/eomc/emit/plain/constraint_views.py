@@ -19,12 +19,12 @@ class Projection:
         Suffix of C names ("" for one number), type and failure type of the lane.
     increments
         Whether r and v are increments of a step.
-    near, apart
-        Squares of relative changes, of one and of all coordinates, above which a correction is
-        large.
+    near, scale_floor
+        Squares of the relative correction above which it is large, and of the least scale of a
+        coordinate, relative to all.
     rate_terms, rate_terms_call, rows
         Rates of constraints that may be dropped, and their number.
-    loose, part
+    tolerance, part
         Largest rate of a dropped constraint, relative to the largest terms and to its own terms.
     little, slight, rounded
         Squares that bound corrections near a singular configuration, of coordinates and velocities,
@@ -50,12 +50,12 @@ class Projection:
     rate_terms: Computed | None
     rate_terms_call: str
     rows: int
-    loose: str
+    tolerance: str
     part: str
     fabs: str
     near: str
     crossed: str
-    apart: str
+    scale_floor: str
     little: str
     slight: str
     rounded: str
@@ -75,7 +75,7 @@ class Project(Named):
     small, enough
         Squares of relative changes of q that are rounding errors, and of sufficiently small
         residuals.
-    loose, rounded
+    tolerance, rounded
         Fractions of a rate's terms, and of residuals and rates below which the state is unchanged.
     redundant
         Constraints that others imply.
@@ -94,7 +94,7 @@ class Project(Named):
         without gradients.
     searched, starts
         Whether random starts are tried if the search from a state fails, and their number.
-    settled
+    converged
         Square of the last change towards the nearest state, relative to that of its distance.
     half_turn
         The squared cosine of half an angle, below which a rotation counts as half a turn.
@@ -113,7 +113,7 @@ class Project(Named):
     dependent: str
     small: str
     enough: str
-    loose: str
+    tolerance: str
     rounded: str
     redundant: tuple[int, ...]
     weights: str
@@ -130,5 +130,5 @@ class Project(Named):
     atan: str
     searched: bool
     starts: int
-    settled: str
+    converged: str
     half_turn: str

@@ -375,6 +375,6 @@ def loop(plain: Functions, m: Method) -> Loop:
         ),
         run_one=run.call(
             q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", u="u ? u + u_instance*k : 0", u_stride="u_step",
-            q_rows="to_q", qd_rows="to_qd", p="p + p_instance*k", memory="0", status="&found",
+            q_rows="to_q", qd_rows="to_qd", p="p + p_instance*k", memory="0", status="&result",
         ),
     )  # fmt: skip

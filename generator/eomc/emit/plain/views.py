@@ -11,9 +11,9 @@ from eomc.emit.plain.adaptive_views import (
     Adaptive,
     AdaptiveBatch,
     AdaptiveRun,
-    InitialEvents,
     Events,
     FixedSteps,
+    InitialEvents,
 )
 from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed, Named, Tableau
@@ -142,9 +142,10 @@ class Derivative(Tableau):
 
     width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
     projection, moved: under constraints how rows move a state, shared too, and what moves a step's
-    end by that; near, apart: as of Projection. start, stage: calls of accelerations. settled,
-    loose: corrections of stages, of a velocity; other: how far apart ends are of stages that are
-    not the step's.
+    end by that; near, scale_floor: as in Projection. start, stage: calls of accelerations.
+    converged, tolerance: relative corrections of velocities below which the stages are accepted,
+    without and with a stagnating iteration; other: relative difference of the ends of two steps
+    with different stages.
     """
 
     TEMPLATE: ClassVar[str] = "c/derivative.c"
@@ -159,7 +160,7 @@ class Derivative(Tableau):
     projection_call: str
     move: str
     near: str
-    apart: str
+    scale_floor: str
     function: CFunction
     implicit: bool
     stages: int
@@ -170,8 +171,8 @@ class Derivative(Tableau):
     fabs: str
     fmax: str
     tiny: str
-    settled: str
-    loose: str
+    converged: str
+    tolerance: str
     other: str
     most: int
 
