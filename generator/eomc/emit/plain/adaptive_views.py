@@ -52,11 +52,12 @@ class Adaptive(AdaptiveTableau):
     total: the sum of half[0], ... over half of the stages. lanes: macro before loops over stages.
     top: matrix from accelerations at the stages (rows) to the last four Legendre coefficients.
     weights: matrix to the increments of position and velocity. project: the call that projects the
-    end of a step, given as an increment, or as a state with `whole`. may_rest: whether
-    time-dependent forces may hold all bodies at rest; capped: the effect of rounding errors then.
-    corners: whether forces jump or have kinks; share: of the tolerance, for steps with them. ends: weights of the
-    values at both ends of a step. forces: accelerations at a state; slopes: their derivatives, by
-    finite differences with step `nudge`. eigenvalues, to_parts, from_parts: see `Method.eigen`.
+    end of a step, given as an increment, or as a state with `whole`. may_rest: whether time-
+    dependent forces may hold all bodies at rest; capped: the effect of rounding errors then.
+    corners: whether forces jump or have kinks; share: of the tolerance, for steps with them. ends:
+    weights of the values at both ends of a step. forces: accelerations at a state; slopes: their
+    derivatives, by finite differences with step `nudge`. eigenvalues, to_parts, from_parts: see
+    `Method.eigen`.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -134,9 +135,9 @@ class Events(Named):
     samples, nodes: number and positions of evaluations in a step. slopes: matrix from values at the
     nodes to derivatives. last: weights of the last Chebyshev coefficients. max_tail: largest such
     coefficient relative to the largest value; above it, a step is halved, at most `halvings` times
-    besides one step in `recent_steps`. max_events: largest number of events in a
-    step. difference_step, near, close: fractions of a step. chance: fraction of the time between jumps below which the next jump counts
-    as coincidental.
+    besides one step in `recent_steps`. max_events: largest number of events in a step.
+    difference_step, near, close: fractions of a step. chance: fraction of the time between jumps
+    below which the next jump counts as coincidental.
     """
 
     TEMPLATE: ClassVar[str] = "c/events.c"

@@ -300,5 +300,6 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Projection | Project | Derivative | RungeKutta4 | Explicit | Implicit
-    | Gauss | Nodes | Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun | AdaptiveBatch | Loop
+    | Gauss | Nodes | Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun | AdaptiveBatch
+    | Loop
 )  # fmt: skip
