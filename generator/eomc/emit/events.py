@@ -154,9 +154,8 @@ def _events(stepping: Stepping) -> Events:
     # arguments of the formulas besides the state
     extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
 
-    evaluate_events = c.static(
-        f"{method}_evaluate_events", "void", c.filled(real, "g"), read, number("z"), *extra
-    )
+    values_at = (c.filled(real, "g"), read, number("z"), *extra)
+    evaluate_events = c.static(f"{method}_evaluate_events", "void", *values_at)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
     refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
     above = tuple(int(e.above) for e in system.events if "begins" in target.program)
