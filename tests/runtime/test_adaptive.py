@@ -102,8 +102,8 @@ def test_rows_at_times_are_those_of_runs_that_end_there(kepler: ModuleType) -> N
 def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     run = kepler.simulate(duration=50.0)
     module = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"])
-    monkeypatch.setattr(module, "_ROOM", 1)
-    monkeypatch.setattr(module, "_MOST", 3)
+    monkeypatch.setattr(module, "_FIRST_CALL_STEPS", 1)
+    monkeypatch.setattr(module, "_MAX_STEPS_PER_CALL", 3)
     monkeypatch.setattr(kepler._model, "_room", 0)
     again = kepler.simulate(duration=50.0)
     assert again == run and np.array_equal(again.t, run.t) and again.steps == run.steps

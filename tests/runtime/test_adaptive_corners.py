@@ -91,8 +91,8 @@ def test_each_of_many_is_as_it_is_alone(bouncing: ModuleType) -> None:
 def test_a_run_is_the_same_in_pieces(bouncing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     run = bouncing.simulate()
     module = __import__(f"{bouncing.__name__}._runtime.adaptive", fromlist=["adaptive"])
-    monkeypatch.setattr(module, "_ROOM", 1)
-    monkeypatch.setattr(module, "_MOST", 3)
+    monkeypatch.setattr(module, "_FIRST_CALL_STEPS", 1)
+    monkeypatch.setattr(module, "_MAX_STEPS_PER_CALL", 3)
     assert bouncing.simulate() == run
 
 

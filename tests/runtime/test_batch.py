@@ -111,7 +111,7 @@ def test_a_batch_is_the_same_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
         return [m.simulate_batch(q0, qd0, u=u, **how) for u in (None, table, table[:1])]
 
     whole = runs()
-    for name in ("_FIRST", "_SECONDS"):
+    for name in ("_FIRST_POLL_SECONDS", "_POLL_SECONDS"):
         monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch_work"], name, 0.0)
     for one, other in zip(whole, runs(), strict=True):
         for name in ("t", "q", "qd", "steps"):

@@ -72,8 +72,8 @@ def test_it_is_the_same_in_pieces(orbits: ModuleType, monkeypatch: pytest.Monkey
     module = __import__(f"{orbits.__name__}._runtime.batch_adaptive", fromlist=["batch_adaptive"])
     monkeypatch.setattr(module, "next_chunk", lambda many, spent: many)
     for few, group in ((1, 16), (7, 5), (64, 128)):
-        monkeypatch.setattr(module, "_FEW", few)
-        monkeypatch.setattr(module, "_FEWEST", group)
+        monkeypatch.setattr(module, "_FIRST_CHUNK_STEPS", few)
+        monkeypatch.setattr(module, "_SMALL_GROUP_SIZE", group)
         assert same(orbits.simulate_batch(*starts(21), **how), run)
 
 

@@ -93,7 +93,7 @@ def test_they_are_the_same_in_pieces(balls: ModuleType, monkeypatch: pytest.Monk
     how = {"params": {"e": many}, "duration": 1.9}
     run = balls.simulate_batch(**how, threads=1)
     monkeypatch.setattr(own(balls, "events"), "_EVENTS_EACH", 32)
-    monkeypatch.setattr(own(balls, "batch_adaptive"), "_FEWEST", 3)
+    monkeypatch.setattr(own(balls, "batch_adaptive"), "_SMALL_GROUP_SIZE", 3)
     again = balls.simulate_batch(**how, threads=2)
     for name, found in run.events.items():
         for what in ARRAYS:

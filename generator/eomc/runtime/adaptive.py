@@ -1,6 +1,7 @@
-"""Runs by steps of a size that a tolerance asks for: what `[run] tolerance` adds in Python.
+"""Simulation with adaptive step-size control, which `[run] tolerance` adds to a module.
 
-The method of Gauss and Legendre with eight stages; how its steps are chosen is said in the C.
+The method is that of Gauss and Legendre with eight stages (order 16). The step-size control itself
+is in the generated C.
 """
 
 from __future__ import annotations
@@ -29,28 +30,33 @@ from .status import FULL, STATUS
 from .stepping import Stepping
 from .trajectory import Run
 
-_ROOM = 48  # steps of the first call
-_AT_ONCE = 2048  # steps times coordinates of it, at most
-_MOST = 2**20  # of one call
-_DRAWN = 1_000  # rows of a curve, at least
-_EVEN = 8  # rows a step, as equally spaced ones need them
+_FIRST_CALL_STEPS = 48  # accepted steps in the first call of C
+_FIRST_CALL_NUMBERS = 2048  # limit of steps times coordinates in the first call
+_MAX_STEPS_PER_CALL = 2**20
+_MIN_CURVE_ROWS = 1_000  # in a plot
+_ROWS_PER_STEP = 8  # equidistant rows for each step
 
 
 class AdaptiveRun(AdaptiveTrajectory):
-    """A run whose steps fit `tol`: rows after each step, or at the times that were asked for.
+    """A run with adaptive step-size control: rows after each step, or at requested times.
 
-    h is the mean step, `rejected` how many steps were tried in vain, `stiff_steps` how many were
-    found by Newton's method, since the motion is stiff there. events: by name where and when each
-    happened, t, q, qd; stopped: the one that ended the run, or "". A run whose jumps follow one
-    another ever sooner ends with the status "accumulated", and `limit`, the time that it can't
-    pass, s. Everything else as in a Run.
+    In addition to the attributes of a Run:
+
+    h : mean step size, s.
+    rejected : number of rejected steps.
+    stiff_steps : number of steps that were solved by Newton's method because the motion is stiff.
+    events : for each event its times and states (t, q, qd), by name.
+    stopped : name of the event that ended the run, or "".
+    limit : the time at which events accumulate (Zeno behaviour), s; nan unless the status is
+        "accumulated".
     """
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """(q, qd) at any time within the run, t (...,): each (..., nq); at a jump before it.
+        """Return (q, qd), each (..., nq), at times t (...,) within the run, s.
 
-        By the same steps once more, and shorter ones within them: as exact as these. Raises
-        ValueError outside of the run.
+        At a state jump the state before the jump is returned. The run is repeated with rows at
+        these times, so the states are as accurate as the run. Raises ValueError for times outside
+        of the run.
         """
         times = within(self, t)
         sorted_times, place = np.unique(times, return_inverse=True)
@@ -64,7 +70,7 @@ class AdaptiveRun(AdaptiveTrajectory):
         return both[0], both[1]
 
     def _rerun(self, times: Array | None, end: float) -> AdaptiveRun:
-        """The same run with rows at times, or after each step and on both sides of each jump."""
+        """Repeat the run with rows at `times`; None: after each step and on both sides of jumps."""
         q, qd = self._begin
         held = self._held
         return run(
@@ -75,10 +81,10 @@ class AdaptiveRun(AdaptiveTrajectory):
 
     @property
     def _drawn(self) -> Run:
-        """Itself, with rows between where steps are too long for curves."""
-        if len(self) < 2 or len(self) >= _DRAWN:
+        """The run for plots: with additional rows if it has fewer than _MIN_CURVE_ROWS."""
+        if len(self) < 2 or len(self) >= _MIN_CURVE_ROWS:
             return self
-        return self._insert_rows(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
+        return self._insert_rows(np.linspace(self.t[0], self.t[-1], _MIN_CURVE_ROWS + 1)[1:-1])
 
     def _evenly(self, count: int) -> AdaptiveRun:
         """Interpolate the run at `count` equidistant times, with both rows of each jump."""
@@ -93,7 +99,7 @@ class AdaptiveRun(AdaptiveTrajectory):
         return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
 
     def _insert_rows(self, times: Array) -> AdaptiveRun:
-        """Itself, with rows at some times within among its own."""
+        """Return a copy of the run with additional rows at `times`."""
         whole = np.concatenate([self.t, times])
         order = np.argsort(whole, kind="stable")
         both = zip((self.q, self.qd), self(times), strict=True)
@@ -103,7 +109,7 @@ class AdaptiveRun(AdaptiveTrajectory):
         self, name: str, value: float, rising: bool | None, period: float | None
     ) -> dict[str, Array]:
         steps: AdaptiveRun = with_jumps(self)
-        t, parts = steps.t[:, None], np.arange(1, _EVEN) / _EVEN
+        t, parts = steps.t[:, None], np.arange(1, _ROWS_PER_STEP) / _ROWS_PER_STEP
         between = (t[:-1] + np.diff(t, axis=0) * parts).astype(t.dtype)
         is_inside = (t[:-1] < between) & (between < t[1:])
         columns = crossings(
@@ -131,7 +137,7 @@ class AdaptiveRun(AdaptiveTrajectory):
     def _equidistant(self) -> Run:
         if (np.diff(self.t) == 0).any() or len(self) < 2:
             return self
-        times = np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
+        times = np.linspace(self.t[0], self.t[-1], _ROWS_PER_STEP * (self.steps + 1))
         return self._at(times, np.array(self(times)))
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
@@ -139,11 +145,11 @@ class AdaptiveRun(AdaptiveTrajectory):
 
 
 class SteppedRun(AdaptiveRun):
-    """A run by fixed steps of a scene with events: a row after each step, two where it jumps.
+    """A run with fixed steps of a scene with events: a row after each step, two at each jump.
 
-    A step ends where the state jumps, and a shorter one goes to the next multiple of h. events,
-    stopped, limit: as of an AdaptiveRun. evaluations: each call of an implicit method counts as one
-    of each stage.
+    A step ends at a state jump; a shorter step then leads to the next multiple of h. The attributes
+    events, stopped and limit are those of an AdaptiveRun. evaluations: number of evaluations of the
+    accelerations; an iteration of an implicit method counts once for each stage.
     """
 
     @property
@@ -162,7 +168,7 @@ def simulate(
     control_period: float | None, tol: float | None, h_most: float | None, stiff: bool,
     fixed: tuple[Any, ...],
 ) -> AdaptiveRun:  # fmt: skip
-    """`Model.simulate` with a tolerance; fixed: the values of FIXED."""
+    """Simulate with adaptive steps. fixed: values of the arguments in FIXED_STEP_DEFAULTS."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     q, qd = model._start
     if q0 is not None or qd0 is not None:
@@ -189,9 +195,9 @@ def simulate_short_run(
     model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
-    """A run with nothing unusual in one call, of count rows at most; None: it goes another way.
+    """Simulate in one call of C, with at most `count` rows; None if the run needs more calls.
 
-    Not for scenes with events or constraints.
+    Only for scenes without events and constraints.
     """
     (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
     inputs, at_u = None, null
@@ -235,8 +241,12 @@ def run(
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
     method: str = "",
 ) -> AdaptiveRun:  # fmt: skip
-    """A run from checked arguments, whatever its status, not far beyond `enough` steps; times (n,)
-    later than t0. method: of fixed steps of the size h_most."""
+    """Simulate from checked arguments and return the run, whatever its status.
+
+    times : (n,) times of the rows, later than t0; None: a row after each step.
+    enough : the run ends at the first return from C after this number of steps.
+    method : method of fixed steps of size h_most; "": adaptive steps.
+    """
     (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:
@@ -246,8 +256,8 @@ def run(
     acting = InputSchedule(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
     events = EventBuffer(model) if model.events else None
-    rows_per_step = 2 if events else 1  # rows of a step, beside a jump
-    room = max(_ROOM, min(model._room, _AT_ONCE // nq))
+    rows_per_step = 2 if events else 1  # a jump adds a row
+    room = max(_FIRST_CALL_STEPS, min(model._room, _FIRST_CALL_NUMBERS // nq))
     rows = RowBuffer(model, times, 1 + rows_per_step * room)
     call = model._lib.adaptive_begin
     place: tuple[Any, ...] = address(real, q), address(real, qd), t0
@@ -268,7 +278,11 @@ def run(
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
-            room = min(next_chunk(room, perf_counter() - call_start), _MOST) if cut else room
+            room = (
+                min(next_chunk(room, perf_counter() - call_start), _MAX_STEPS_PER_CALL)
+                if cut
+                else room
+            )
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
             if not (room := counters.limit_steps(room, rows_per_step)):
                 status = FULL
@@ -281,8 +295,8 @@ def run(
         status = "interrupted"
     stamps, both = rows.concatenate()
     steps = work.steps
-    is_unusual = events or model.constraint_names or nq * steps > _AT_ONCE
-    model._room = 0 if is_unusual else steps + _ROOM
+    is_unusual = events or model.constraint_names or nq * steps > _FIRST_CALL_NUMBERS
+    model._room = 0 if is_unusual else steps + _FIRST_CALL_STEPS
     h = h_most if method else (work.t - t0) / steps if steps else t_end - t0
     called = model._called(method, steps, work.evaluations) if method else work.evaluations
     trajectory = (SteppedRun if method else AdaptiveRun)(
@@ -310,7 +324,7 @@ def run(
 
 
 def _take_rows(work: Any, events: EventBuffer | None) -> int:
-    """The rows of the last call, whose events are kept."""
+    """Store the events of the last call and return the number of its rows."""
     rows, work.rows = work.rows, 0
     if events:
         events.keep(work)

@@ -1,4 +1,4 @@
-"""What is asked of adaptive steps, or a ValueError that says why not."""
+"""Checks of the arguments of adaptive steps. Invalid arguments raise ValueError."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .arguments import Array, as_flag, as_number, as_step_size, check_time, with
 from .metadata import ModelInfo
 from .package import option
 
-LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
-LOOSEST = 1e-2
-FIXED = {  # what belongs to fixed steps, where nothing is said of it
+MIN_TOLERANCE = {8: 1e-15, 4: 5e-7}  # by the size of a floating-point number in bytes
+MAX_TOLERANCE = 1e-2
+FIXED_STEP_DEFAULTS = {  # arguments of fixed steps and their default values
     "h": None, "steps": None, "method": None, "every": 1, "out": None,
 }  # fmt: skip
 
@@ -23,7 +23,8 @@ FIXED = {  # what belongs to fixed steps, where nothing is said of it
 def uses_adaptive_steps(
     model: ModelInfo, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any
 ) -> bool:
-    """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
+    """True if steps are adaptive: an argument of adaptive steps is given, or the scene has a
+    tolerance and no argument of fixed steps is given."""
     if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
     return True
@@ -32,15 +33,18 @@ def uses_adaptive_steps(
 def as_limits(
     model: ModelInfo, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
-    """(tolerance, longest step or 0); fixed: the values of FIXED, which belongs to fixed steps."""
+    """Return (tolerance, longest step in s or 0 for no limit).
+
+    fixed: values of the arguments in FIXED_STEP_DEFAULTS, which must have their defaults.
+    """
     as_flag(stiff, "stiff")
     if model.tolerance is None:
         raise ValueError(
             f"tol: {model.name} was built without adaptive steps, to which tol, h_most and stiff "
             f"belong: build it with {option('tolerance', '1e-9')}"
         )
-    if not all(map(is_, fixed, FIXED.values())):
-        for name, value in zip(FIXED, fixed, strict=True):
+    if not all(map(is_, fixed, FIXED_STEP_DEFAULTS.values())):
+        for name, value in zip(FIXED_STEP_DEFAULTS, fixed, strict=True):
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
                 wants_adaptive = tol is not None or h_most is not None or stiff or "auto" in fixed
                 raise ValueError(f"{name}: {_why_not(model, name, bool(wants_adaptive))}")
@@ -49,7 +53,10 @@ def as_limits(
 
 
 def _why_not(model: ModelInfo, name: str, wants_adaptive: bool) -> str:
-    """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
+    """Explain why adaptive steps do not accept the argument `name`.
+
+    wants_adaptive: whether the call has an argument of adaptive steps.
+    """
     if wants_adaptive:
         return (
             "belongs to fixed steps; tol, h_most and stiff to adaptive ones: give one or the other"
@@ -61,14 +68,14 @@ def _why_not(model: ModelInfo, name: str, wants_adaptive: bool) -> str:
 
 
 def as_progress(progress: Any) -> Any:
-    """The same, or a ValueError where it can't be called."""
+    """Return `progress`; raise ValueError if it is neither None nor callable."""
     if progress is not None and not callable(progress):
         raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
     return progress
 
 
 def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
-    """The time at which a run ends, as the module's numbers hold it."""
+    """Return the end time of a run in s, rounded to the precision of the module."""
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:
         raise ValueError(f"duration: {span:g} is not a time in s")
@@ -78,16 +85,16 @@ def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
 
 
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
-    """A tolerance that the numbers have digits for, or a ValueError."""
-    least = LEAST[dtype.itemsize]
+    """Return the tolerance; raise ValueError unless MIN_TOLERANCE <= tol <= MAX_TOLERANCE."""
+    least = MIN_TOLERANCE[dtype.itemsize]
     number = as_number(tol, "tol")
-    if not least <= number <= LOOSEST:
-        raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
+    if not least <= number <= MAX_TOLERANCE:
+        raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {MAX_TOLERANCE:g}")
     return number
 
 
 def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
-    """A C-contiguous array, of any shape, or a ValueError."""
+    """Return a C-contiguous array of any shape; raise ValueError if it is not numeric."""
     without_mask(value, name)
     try:
         array = np.asarray(value)
@@ -101,7 +108,7 @@ def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
 def as_times(
     times: ArrayLike, t0: float, dtype: np.dtype[Any], duration: float | None = None
 ) -> Array:
-    """Times in ascending order from t0 on, within the duration if there is one, or a ValueError."""
+    """Return ascending times (n,) from t0 on, within the duration if it is given."""
     array = np.atleast_1d(as_numbers(times, "times", dtype))
     if array.ndim != 1 or not len(array) or not (isfinite(array[0]) and isfinite(array[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")

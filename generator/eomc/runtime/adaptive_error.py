@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .adaptive_arguments import LEAST
+from .adaptive_arguments import MIN_TOLERANCE
 from .adaptive_trajectory import AdaptiveTrajectory
 from .arguments import Array
 from .estimate import Estimate, growth_of, moving_mask, rounding_words, scales
@@ -16,20 +16,29 @@ from .growth import mean_mass_matrix
 from .input_schedule import ZeroOrderHold
 from .status import FULL, REMEDY
 
-ORDER = 16
-WHOLE = ("ok", "accumulated")  # the statuses of runs that came as far as their motion goes
-_TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
-_FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
-_LITTLE = 4.0  # roundings, by which a start is moved where more fills the scale
-_TAIL = 40  # a part of the rows, over which a difference does not vanish
-_FINER = 100.0  # the tolerance over that of the run by which an error is found
-_LEAST = 512  # steps of that, at least
-_CURVE = 24  # rows along a run, at least, at which differences are seen
-_LATER = 10  # steps, at least, in which a finer run looks for the event that ends the run
-_SHIFT = 4.0  # times that differences of states last, by which the same event may be moved
-_EDGE = 1e-9  # of a span: times so near an end are at it
-_ZENO = 0.01  # of the time to an accumulation point: jumps that are nearer differ in number
-_LONGER = 100  # times the steps, which a moved start takes at most
+GAUSS16_ORDER = 16
+COMPLETE_STATUSES = (
+    "ok",
+    "accumulated",
+)  # the statuses of runs that came as far as their motion goes
+_UNRESOLVED_ERROR = 0.1  # of a coordinate's scale: a result more wrong than that is none
+_SATURATED_DIFFERENCE = (
+    0.01  # of a scale: a difference that has become so large grows no more as it did
+)
+_PERTURBATION_ROUNDINGS = 4.0  # roundings, by which a start is moved where more fills the scale
+_TAIL_DIVISOR = 40  # a part of the rows, over which a difference does not vanish
+_TOLERANCE_RATIO = 100.0  # the tolerance over that of the run by which an error is found
+_MIN_REFERENCE_STEPS = 512  # steps of that, at least
+_MIN_CURVE_ROWS = 24  # rows along a run, at least, at which differences are seen
+_MIN_EXTRA_STEPS = 10  # steps, at least, in which a finer run looks for the event that ends the run
+_EVENT_SHIFT_FACTOR = (
+    4.0  # times that differences of states last, by which the same event may be moved
+)
+_END_TOLERANCE = 1e-9  # of a span: times so near an end are at it
+_ZENO_FRACTION = (
+    0.01  # of the time to an accumulation point: jumps that are nearer differ in number
+)
+_MAX_STEP_RATIO = 100  # times the steps, which a moved start takes at most
 
 
 def error_by_tighter_tolerance(
@@ -47,7 +56,7 @@ def error_by_tighter_tolerance(
         raise MemoryError(f"estimate: {REMEDY}")
     model, again = own._model, _Rerun(own, run, progress)
     x, begin = again.x, np.ravel(own._begin).astype(float)
-    eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
+    eps, least = float(np.finfo(model.dtype).eps) / 2, MIN_TOLERANCE[model.dtype.itemsize]
     scale = scales(x, float(np.ptp(own.t)), eps, len(model.discrete_coordinates))
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
@@ -60,7 +69,9 @@ def error_by_tighter_tolerance(
 
     def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
         """The difference that a nudge of the start makes along the run, nan behind an end."""
-        most = _LONGER * (own.steps + own.rejected) + _LONGER**2  # of another motion, not its end
+        most = (
+            _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
+        )  # of another motion, not its end
         return again.states(tol, begin + nudge, own._h_most, most) - base
 
     differences = [moved(moves * size * scale * signs)]
@@ -71,14 +82,14 @@ def error_by_tighter_tolerance(
         left[-1] = np.abs(x[-1] - events.end)
     elif not events.stops:
         left[-1] = np.inf
-    if len(own._happened[0]) or (left > _TENTH * scale).any():
+    if len(own._happened[0]) or (left > _UNRESOLVED_ERROR * scale).any():
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
-        full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
+        full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
         if full.any():  # where so little fills the scale, rounding fills a quarter of it
-            little = moves * _LITTLE * eps * scale * signs
+            little = moves * _PERTURBATION_ROUNDINGS * eps * scale * signs
             nearest = again.states(least, begin, own._h_most)
             differences.append(moved(little, least, nearest))
-            near = _filled(np.abs(again.at_rows(differences[1]))) / (_LITTLE * eps)
+            near = _filled(np.abs(again.at_rows(differences[1]))) / (_PERTURBATION_ROUNDINGS * eps)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
     exact = [*modes[:, 0], *(model.nq + modes[:, 0])]
@@ -96,7 +107,7 @@ def error_by_tighter_tolerance(
     end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
     return Estimate(
         error[:, : model.nq], error[:, model.nq :], end, right,
-        model.orders[own._by] if own._by else ORDER, float("nan"),
+        model.orders[own._by] if own._by else GAUSS16_ORDER, float("nan"),
         amplification, _verdict(own, left / scale, rounding / scale, amplification, events),
         events.errors, events.missed,
     )  # fmt: skip
@@ -158,14 +169,14 @@ class _Rerun:
     @property
     def times(self) -> Array:
         """Of `curve` and `states`: those of the rows, with others between where these are few."""
-        between = np.linspace(self.own.t0, self.own.t[-1], _CURVE + 1)[1:-1]
+        between = np.linspace(self.own.t0, self.own.t[-1], _MIN_CURVE_ROWS + 1)[1:-1]
         own = self.own.t[self.kept].astype(float)
-        few = between if len(own) < _CURVE else between[:0]
+        few = between if len(own) < _MIN_CURVE_ROWS else between[:0]
         return np.unique(np.concatenate([[self.own.t0], own, few]))
 
     def curve(self) -> Array:
         """The run's own states at `times`."""
-        if len(self.kept) < _CURVE:
+        if len(self.kept) < _MIN_CURVE_ROWS:
             return np.concatenate(self.own(self.times), axis=1).astype(float)
         return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
 
@@ -191,10 +202,12 @@ class _Rerun:
         """The same by a finer run."""
         own, end = self.own, None
         if own.stopped:  # shorter steps may detect that event later, or not at all
-            end = min(own._t_end, self.reached + max(self.reached - own.t0, _LATER * own.h))
+            end = min(
+                own._t_end, self.reached + max(self.reached - own.t0, _MIN_EXTRA_STEPS * own.h)
+            )
         tol, shorter = _finer(own, least)
         rows, rerun = self(tol, begin, shorter, end=end)
-        if own.status == "ok" and rerun is not None and rerun.status not in WHOLE:
+        if own.status == "ok" and rerun is not None and rerun.status not in COMPLETE_STATUSES:
             # short ones near singular positions
             rows, rerun = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
         return rows, rerun
@@ -231,19 +244,21 @@ class _Events:
         reached, came = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
                          for r in (own, other))  # fmt: skip
         relative_difference = np.where(np.isfinite(left), left, 0.0) / scale
-        wrong = np.flatnonzero((left > _TENTH * scale).any(axis=1))
+        wrong = np.flatnonzero((left > _UNRESOLVED_ERROR * scale).any(axis=1))
         alike = slice(0, wrong[0] if len(wrong) else len(left))
         speed = np.max(np.abs(own.qd.astype(float)), axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             late = np.max(left[alike, : len(speed)], axis=0, initial=0.0) / speed
-        shift = _SHIFT * float(np.max(late[np.isfinite(late)], initial=0.0))
-        gap = max(own.h, min(shift, _TENTH * abs(reached - own.t0)))
+        shift = _EVENT_SHIFT_FACTOR * float(np.max(late[np.isfinite(late)], initial=0.0))
+        gap = max(own.h, min(shift, _UNRESOLVED_ERROR * abs(reached - own.t0)))
         # an event so near the end of a run may be just behind that of the other
         edge = abs(reached - own.t0) * max(
-            float(np.max(relative_difference[alike], initial=0.0)), _EDGE
+            float(np.max(relative_difference[alike], initial=0.0)), _END_TOLERANCE
         )
         until = float(own.t[wrong[0]]) if len(wrong) else reached - edge
-        whole = (r.limit - _ZENO * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit)
+        whole = (
+            r.limit - _ZENO_FRACTION * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit
+        )
         until = min(until, *whole, np.inf)
         # that friction sticks is a part of the state, and so of its error
         coordinates = (own._model.coordinates[k] for _, k in own._model._rows.modes)
@@ -268,7 +283,7 @@ class _Events:
             errors,
             {name: t for name, t in missed.items() if len(t)},
             {name: t for name, t in false.items() if len(t)},
-            same or at_end or before_end or other.status not in WHOLE,
+            same or at_end or before_end or other.status not in COMPLETE_STATUSES,
             None if event is None else np.concatenate([event.q[-1], event.qd[-1]]).astype(float),
         )
 
@@ -319,8 +334,8 @@ def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
     steps a quarter of their size."""
     if own._by:
         return own.tol, own.h / 4
-    tol = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
-    longest = (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most)
+    tol = max(own.tol / _TOLERANCE_RATIO, least) if own.tol >= 2 * least else 4 * least
+    longest = (own.h / 2, float(np.ptp(own.t)) / _MIN_REFERENCE_STEPS, own._h_most)
     return tol, min((h for h in longest if h > 0), default=0.0)
 
 
@@ -335,7 +350,7 @@ def _filled(rows: Array) -> Array:
     filled: Array = np.nan_to_num(
         rows[np.maximum.accumulate(np.where(is_finite, np.arange(len(rows)), 0))]
     )
-    filled[-1] = filled[-1 - len(rows) // _TAIL :].max(axis=0)  # it may vanish for a moment
+    filled[-1] = filled[-1 - len(rows) // _TAIL_DIVISOR :].max(axis=0)  # it may vanish for a moment
     return filled
 
 
@@ -344,10 +359,10 @@ def _verdict(
 ) -> str:
     """What speaks against the run; its differences, and rounding, relative to the scales."""
     words = []
-    if own.status not in WHOLE:
+    if own.status not in COMPLETE_STATUSES:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
     words += (event_messages := events.words(own))
-    lost, wrong = (np.asarray((x > _TENTH).any(axis=1)) for x in (rounding, left))
+    lost, wrong = (np.asarray((x > _UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
     if lost[-1]:
         words.append(rounding_words(own._model, amplification, float(own.t[np.argmax(lost)])))
     if wrong.any() and not (event_messages and np.isinf(left[wrong]).all()):

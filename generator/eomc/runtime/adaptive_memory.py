@@ -1,4 +1,4 @@
-"""How many rows and events a run by adaptive steps keeps: what the machine has memory for."""
+"""Memory of the rows and events of adaptive runs, limited by the memory of the machine."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ from .status import PART
 
 
 class StepCounters:
-    """How many rows and events a run keeps, and how many more there is room for."""
+    """Counts the stored rows and events of a run and limits the steps of the next call."""
 
     def __init__(self, model: ModelInfo) -> None:
         self.rows, self.most = 0, room_for(model)
 
     def add(self, work: Any, events: bool) -> None:
-        """Those of the last call of C."""
+        """Add the rows and events of the last call of C."""
         self.rows += work.rows + (work.events if events else 0)
 
     def limit_steps(self, steps: int, each: int) -> int:
-        """So many steps of `each` rows, or as many as there is room for; 0: none."""
+        """Return the number of steps, at most `steps`, whose `each` rows fit in memory."""
         return int(min(steps, max(0.0, self.most - self.rows) // each))
 
 
 class RowBuffer:
-    """Times and rows as C fills them, in pieces: one after each step, or at `times` (n,)."""
+    """Buffers for times and rows that C fills: a row after each step, or at `times` (n,).
+
+    The rows after steps are stored in several pieces, since their number is not known.
+    """
 
     def __init__(self, model: ModelInfo, times: Array | None, count: int) -> None:
         self.model, self.own = model, times is None
@@ -42,13 +45,13 @@ class RowBuffer:
         self.to_t = self.to if self.times is None else address(real, self.times)
 
     def reserve(self, steps: int, each: int) -> None:
-        """Have room for a step of `each` rows at least: where there is none, for so many steps."""
+        """Allocate a piece for `steps` steps unless the current one has room for `each` rows."""
         if self.own and self.count - self.filled < each:
             self.pieces.append(self._filled())
             self._piece(1 + each * steps)
 
     def c_arguments(self, steps: int, each: int) -> tuple[Any, ...]:
-        """What C takes: steps at most, times and how many, room for times, for q and for qd."""
+        """Arguments of C: maximum of steps, times, their number, buffers for t, q and qd."""
         null, nq, left = self.model._c[2], self.model.nq, self.count - self.filled
         to_q = self.to + (self.count + nq * self.filled)
         at = to_q, to_q + nq * self.count
@@ -57,7 +60,7 @@ class RowBuffer:
         return steps, self.to_t + self.filled, left, null, *at
 
     def concatenate(self) -> tuple[Array, Array]:
-        """The times (n,) and rows (2, n, nq)."""
+        """Return the times (n,) and rows (2, n, nq) of all pieces."""
         times, rows = self._filled()
         if self.pieces:
             times = np.concatenate([*(t for t, _ in self.pieces), times])
@@ -65,19 +68,19 @@ class RowBuffer:
         return times, rows
 
     def _filled(self) -> tuple[Array, Array]:
-        """Those of the last piece."""
+        """Return the times and rows of the last piece."""
         times = self.whole if self.times is None else self.times
         rows = self.whole[self.count :].reshape(2, self.count, self.model.nq)
         return times[: self.filled], rows[:, : self.filled]
 
 
 def room_for(model: ModelInfo) -> float:
-    """How many rows and events a run may keep."""
+    """Maximum number of rows and events of a run."""
     return PART * machine_memory() / _row(model)
 
 
 def rows_for(model: ModelInfo, count: int) -> Array:
-    """Room for so many times, q and qd. Raises MemoryError where there is none."""
+    """Allocate a buffer for `count` rows (t, q, qd). Raises MemoryError if it does not fit."""
     try:
         if count * _row(model) > machine_memory():
             raise MemoryError
@@ -89,5 +92,5 @@ def rows_for(model: ModelInfo, count: int) -> Array:
 
 
 def _row(model: ModelInfo) -> int:
-    """The bytes of a time, q and qd."""
+    """Size of a row (t, q, qd) in bytes."""
     return (1 + 2 * model.nq) * model.dtype.itemsize

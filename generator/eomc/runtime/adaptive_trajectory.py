@@ -1,4 +1,4 @@
-"""What a run by a tolerance keeps besides its rows: its steps, its events, what it was asked."""
+"""Data of adaptive runs beyond the rows: step counts, events and the settings of the run."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ FRICTION_REMEDIES = (
 
 
 def _friction() -> str:
-    """How friction that sticks is written."""
+    """The option of a scene that adds Coulomb friction with sticking."""
     return (
         "System.make(..., friction={...})" if is_made_in_python() else option("friction", '"stick"')
     )
 
 
 def failure_message(model: Stepping, status: str, fixed: str) -> str:
-    """Why steps by a tolerance, or fixed ones of a method, could not go on."""
+    """Explain the status of a run with adaptive steps, or with fixed steps of method `fixed`."""
     if status == "no convergence" and not fixed:
         return STEP_TOO_SHORT.format(FRICTION_REMEDIES[bool(model._rows.modes)].format(_friction()))
     return SAID[status]
@@ -49,24 +49,28 @@ def failure_message(model: Stepping, status: str, fixed: str) -> str:
 
 @dataclass(eq=False, repr=False)
 class AdaptiveTrajectory(Run):
-    """What `adaptive.AdaptiveRun` keeps, and what follows from that alone."""
+    """Data and derived properties of an adaptive run."""
 
     tol: float = field(kw_only=True)
     rejected: int = field(kw_only=True)
     stiff_steps: int = field(kw_only=True)
     _times: Array = field(kw_only=True)
     _t_end: float = field(kw_only=True)
-    # what few runs have is set behind: a run of few steps takes no longer than its making
+    # rarely used fields are set after construction, whose time dominates that of short runs
     _h_most: float = field(default=0.0, init=False)
     _by: str = field(default="", init=False)  # the method of fixed steps
     _last: tuple[float, Array] = field(default=(0.0, _NONE[1]), init=False)  # t, [q; qd] reached
     _stiff: bool = field(default=False, init=False)
-    _happened: tuple[Array, Array] = field(default=_NONE, init=False)  # which, rows of t, q, qd
+    _happened: tuple[Array, Array] = field(
+        default=_NONE, init=False
+    )  # event indices (n,), rows of t, q, qd
     stopped: str = field(default="", init=False)
     limit: float = field(default=float("nan"), init=False)
-    _period: float = field(default=0.0, init=False)  # over which inputs are held, if any are,
-    _held: Array | None = field(default=None, init=False)  # and these, (n, nu)
-    _periods: int = field(default=0, init=False)  # of the whole run
+    _period: float = field(default=0.0, init=False)  # control period, s; 0 without one
+    _held: Array | None = field(
+        default=None, init=False
+    )  # the inputs of each control period, (n, nu)
+    _periods: int = field(default=0, init=False)  # number of control periods in the run
 
     @property
     def t(self) -> Array:
@@ -75,12 +79,12 @@ class AdaptiveTrajectory(Run):
 
     @cached_property
     def _begin(self) -> Array:
-        """q and qd at t0, (2, nq): its first row, where nobody said otherwise."""
+        """q and qd at t0, (2, nq); by default the first row."""
         return np.array([self._rows[0][0], self._rows[1][0]])
 
     @property
     def message(self) -> str:
-        """What happened, in a sentence."""
+        """Result of the run in a sentence."""
         progress = f"{self.steps} steps, {self.description}"
         if self.status == "ok":
             return progress
@@ -98,7 +102,7 @@ class AdaptiveTrajectory(Run):
 
     @cached_property
     def events(self) -> dict[str, EventLog]:
-        """Where and when each of the scene's events happened."""
+        """Times and states of each event of the scene, by name."""
         which, rows = self._happened
         nq, names = self._model.nq, self._model.events
         each = (rows[which == k] for k in range(len(names)))
@@ -116,17 +120,17 @@ class AdaptiveTrajectory(Run):
         return f"<Run of {self._model.name}: {how}{self.steps} steps, tolerance {self.tol:g}>"
 
     def _at(self, times: Array, rows: Array) -> Self:
-        """Itself with other rows, (2, n, nq)."""
+        """Return a copy of the run with other times (n,) and rows (2, n, nq)."""
         run = copy(self)
         run._begin = self._begin
-        for name in ("q", "qd", "outputs"):  # which are kept once they were made
+        for name in ("q", "qd", "outputs"):  # cached properties
             run.__dict__.pop(name, None)
         run._rows, run._times, run._energy = rows, times, None
         run._told_inputs()
         return run
 
     def _told_inputs(self) -> None:
-        """Find which of the values that are held over periods acts at each row."""
+        """Set the inputs that are applied at each row (zero-order hold)."""
         if self._held is not None:
             self._applied = sample_zero_order_hold(self._times, self.t0, self._period, self._held)
 

@@ -23,8 +23,8 @@ Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 
-FEWEST_TIMES = 256  # numbers in the span of a run, from which a tolerance can choose steps
-_FEW = 32  # numbers that Python looks at sooner than NumPy
+MIN_RESOLVED_TIMES = 256  # numbers in the span of a run, from which a tolerance can choose steps
+_MAX_LIST_NUMBERS = 32  # numbers that Python looks at sooner than NumPy
 
 
 class Params:
@@ -107,7 +107,9 @@ class Arguments:
         self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
-        self._shape = (self.nq,) if self.nq <= _FEW else None  # of a state that is soon looked at
+        self._shape = (
+            (self.nq,) if self.nq <= _MAX_LIST_NUMBERS else None
+        )  # of a state that is soon looked at
         self._start = (self._constant(start[0]), self._constant(start[1]))
         self._p0 = self._constant(tuple(parameters.values()))
         self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
@@ -194,7 +196,11 @@ class Arguments:
             array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
             array = self._numbers(value, name)
-        if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
+        if (
+            array.ndim == 1
+            and array.size == width <= _MAX_LIST_NUMBERS
+            and isfinite(sum(array.tolist()))
+        ):
             return array  # of few numbers the sum is quickest; it may overflow all the same
         if array.shape[-1:] != (width,) or array.ndim > 1 + many:
             description = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
@@ -204,7 +210,7 @@ class Arguments:
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
                 f"{'; velocities go to qd' + name[1:] if rates else ''}"
             )
-        if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
+        if array.size <= _MAX_LIST_NUMBERS and isfinite(sum(array.ravel().tolist())):
             return array
         if not np.isfinite(array).all():
             if array.ndim == 1:
@@ -531,7 +537,7 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
             f"h: {h:g} s is less than what time resolves at {t0 + span:g} s, {least:.2g} s: take "
             "a smaller t0, or a larger h"
         )
-    if span and h is None and not abs(span) >= FEWEST_TIMES * least:
+    if span and h is None and not abs(span) >= MIN_RESOLVED_TIMES * least:
         raise ValueError(
             f"t0: time resolves {least:.2g} s at {t0 + span:g} s, which is too coarse for steps "
             f"within {span:g} s: take a smaller t0, or a longer duration"

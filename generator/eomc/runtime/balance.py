@@ -15,13 +15,13 @@ from .package import reduced
 from .stepping import Stepping
 from .trajectory_data import Trajectory
 
-_ROWS = 8  # of an interpolating polynomial, and so the order of an integral, at most
-_FEWEST = 2 * _ROWS + 1  # from which on every fourth shows something; below all may be wrong
-_LEAST = 0.5  # of the order that is taken for seen
-_TOLD = 0.005  # of the largest part: an integral that is off by more tells nothing
-_EVEN = 8  # rows for each step between jumps, beside
-_PIECE = 4 * _ROWS + 1  # for a piece
-_MOST = 400_000  # rows of all pieces
+_MAX_ORDER = 8  # of an interpolating polynomial, and so the order of an integral, at most
+_MIN_ROWS = 2 * _MAX_ORDER + 1  # from which on every fourth shows something; below all may be wrong
+_MIN_ORDER = 0.5  # of the order that is taken for seen
+_MAX_RELATIVE_ERROR = 0.005  # of the largest part: an integral that is off by more tells nothing
+_ROWS_PER_STEP = 8  # rows for each step between jumps, beside
+_MIN_PIECE_ROWS = 4 * _MAX_ORDER + 1  # for a piece
+_MAX_ROWS = 400_000  # rows of all pieces
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Balance:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _PowerSamples:
     """Rows t (n,), q, qd (n, nq) that tell a run's power; u: its inputs, (nu,) or (n, nu)."""
 
     model: Stepping
@@ -116,7 +116,7 @@ def balance(run: Trajectory) -> Balance | None:
     off, rounding = max(off, blur), float(np.finfo(model.dtype).eps * np.max(np.abs(energy)))
     left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
     jumped = float(jump_work[-1])
-    is_resolved = off <= max(_TOLD * max(map(abs, (*parts, jumped))), 10 * rounding)
+    is_resolved = off <= max(_MAX_RELATIVE_ERROR * max(map(abs, (*parts, jumped))), 10 * rounding)
     return Balance(*parts, left, off + rounding, told=is_resolved, jumps=jumped)
 
 
@@ -130,22 +130,22 @@ def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array,
     return lambda q, qd: (signs * q, -qd)
 
 
-def _rows(run: Trajectory) -> _Rows | None:
+def _rows(run: Trajectory) -> _PowerSamples | None:
     """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
         states = _in_steps(run) or _between_jumps(
             run
         )  # all its rows: few may look smooth and not be
-        return _Rows(model, run._params, *states, u)
+        return _PowerSamples(model, run._params, *states, u)
     run = with_jumps(run)
     ends, values = _held(run)
     if not len(values):
         return None
     after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # a jump
     periods, (ends, values) = ends, _cut(ends, values, run.t[after_jumps])
-    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / (len(periods) - 1)) + 1
-    count = min(max(each, _FEWEST), max(_MOST // len(values), 2))
+    each = (_ROWS_PER_STEP if hasattr(run, "tol") else 1) * ceil(run.steps / (len(periods) - 1)) + 1
+    count = min(max(each, _MIN_ROWS), max(_MAX_ROWS // len(values), 2))
     t = np.concatenate([np.linspace(a, b, count) for a, b in pairwise(ends.tolist())])
     q, qd = run(t)
     for row in after_jumps.tolist():
@@ -154,7 +154,7 @@ def _rows(run: Trajectory) -> _Rows | None:
             t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
         q[first], qd[first] = run.q[row], run.qd[row]
     piece = np.minimum(np.arange(len(t)) // count, len(values) - 1)
-    return _Rows(model, run._params, t, q, qd, values[piece])
+    return _PowerSamples(model, run._params, t, q, qd, values[piece])
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
@@ -189,15 +189,15 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     Such steps are short where power is not smooth, as in a stop. Those of some roundings of the
     time have their ends alone. None: fixed steps, or too many.
     """
-    if not hasattr(run, "tol") or run.steps * _FEWEST > _MOST or not run._model.has_power:
+    if not hasattr(run, "tol") or run.steps * _MIN_ROWS > _MAX_ROWS or not run._model.has_power:
         return None
     run = with_jumps(run)
     if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows were asked for
         run = _after_steps(run)
     t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
     intervals = np.diff(t)
-    long = np.flatnonzero(intervals > _FEWEST * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
-    inner = np.arange(1, _FEWEST - 1) / (_FEWEST - 1)
+    long = np.flatnonzero(intervals > _MIN_ROWS * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
+    inner = np.arange(1, _MIN_ROWS - 1) / (_MIN_ROWS - 1)
     at = (t[long, None] + intervals[long, None] * inner).ravel()
     between = 1 + np.flatnonzero(intervals[:-1] * intervals[1:])  # they end a step, and begin one
     rows = np.sort([*range(len(t)), *between])
@@ -216,7 +216,9 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     firsts, lasts = np.array([0, *jumps]), np.array([*(jumps - 1), n - 1])
     times, grain = [], 16 * np.finfo(run._model.dtype).eps
     for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True):
-        rows = min(max(_EVEN * (b - a + 1), _PIECE), max(_MOST // len(firsts), 2))
+        rows = min(
+            max(_ROWS_PER_STEP * (b - a + 1), _MIN_PIECE_ROWS), max(_MAX_ROWS // len(firsts), 2)
+        )
         begin, end = float(run.t[a]), float(run.t[b])
         if end - begin > rows * grain * max(abs(begin), abs(end)):
             times.append(np.linspace(begin, end, rows)[1:-1])
@@ -271,7 +273,7 @@ def _work(t: Array, power: Array) -> tuple[Array, Array]:
         parts = np.cumsum(_intervals(t[rows], power[..., rows]), axis=-1)
         return np.concatenate([np.zeros((*power.shape[:-1], 1)), parts], axis=-1)
 
-    if n < _FEWEST:
+    if n < _MIN_ROWS:
         return sums(np.arange(n)), np.max(np.abs(power), axis=-1) * (t[-1] - t[0])
     strides = [np.unique([*range(0, n, stride), n - 1]) for stride in (1, 2, 4)]
     integrals = [sums(rows) for rows in strides]
@@ -282,7 +284,7 @@ def _work(t: Array, power: Array) -> tuple[Array, Array]:
     near, far = (np.max(np.abs(x), axis=-1) for x in (whole - half, half - quarter))
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.log2(far / near)
-    order = np.clip(np.where((near > 0) & (far > 0), order, _LEAST), _LEAST, _ROWS)
+    order = np.clip(np.where((near > 0) & (far > 0), order, _MIN_ORDER), _MIN_ORDER, _MAX_ORDER)
     return integrals[0], 3 * near / (2.0**order - 1)
 
 
@@ -291,7 +293,7 @@ def _intervals(t: Array, y: Array) -> Array:
 
     Each goes through some rows, which are equally far apart, but perhaps the last.
     """
-    n, rows = len(t), min(_ROWS, len(t))
+    n, rows = len(t), min(_MAX_ORDER, len(t))
     k = np.arange(n - 1)
     first = np.clip(k - (rows // 2 - 1), 0, n - rows)
     usual = _weights(np.arange(rows)) * (t[1] - t[0] if n > 1 else 0.0)

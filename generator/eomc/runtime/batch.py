@@ -26,7 +26,7 @@ from .arguments import (
 )
 from .batch_instances import Instances
 from .batch_run import BatchRun
-from .batch_work import WORTH, Work
+from .batch_work import MIN_STEPS_FOR_THREADS, Work
 from .metadata import SOME
 from .model import RARELY
 from .output_times import as_times_and_steps
@@ -175,7 +175,10 @@ class BatchModel(Instances):
                 raise ValueError(f"{name}: {len(rows)} instances where q has {count}")
         if threads is not None:
             as_count(threads, "threads", 1)
-        if count * steps >= WORTH or count * steps * self.nq > 8 * WORTH:
+        if (
+            count * steps >= MIN_STEPS_FOR_THREADS
+            or count * steps * self.nq > 8 * MIN_STEPS_FOR_THREADS
+        ):
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
             begin = t if times is None else times
             work = Work(self, step, q, qd, h, begin, steps, 0, inputs, table, None, None)

@@ -26,16 +26,21 @@ from .metadata import SOME
 from .slices import next_chunk
 from .status import FULL, STATUS
 
-_GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
-_COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
-MOST_EVALUATIONS = 2**31 - 1  # of an instance, that every machine's C counts
-_BETWEEN = 8 * 64  # evaluations for a state between two steps: stages times sweeps, at most
-_FEW = 64  # steps of an instance before the first look at Ctrl-C
+_GROUP_SIZE, _SMALL_GROUP_SIZE = (
+    128,
+    16,
+)  # instances that a thread takes at once, of many and of few
+_COUNTERS = ("steps", "evaluations", "rejected", "stiff_steps")
+MAX_EVALUATIONS = 2**31 - 1  # of an instance, that every machine's C counts
+_EVALUATIONS_PER_STATE = (
+    8 * 64
+)  # evaluations for a state between two steps: stages times sweeps, at most
+_FIRST_CHUNK_STEPS = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = (
     "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
     "_stiff", "_period", "_by", "_max_evaluations",
 )  # fmt: skip
-_HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
+_EVENT_FIELDS = ("event_instances", "which", "event_rows")  # in what is kept of a run
 _ENDS = np.array([*STATUS, FULL])
 
 
@@ -100,7 +105,7 @@ class AdaptiveBatchRun(BatchRun):
         )  # fmt: skip
         work.leave(initial_failures(self))
         if self._max_evaluations:  # what states between steps take is besides
-            each = _BETWEEN + 2 * model.nq + 1
+            each = _EVALUATIONS_PER_STATE + 2 * model.nq + 1
             work.limit(self._max_evaluations + each * (len(times) + len(self.t)))
         if len(times) and not work.run(None, None):
             raise KeyboardInterrupt
@@ -152,7 +157,7 @@ class AdaptiveBatchRun(BatchRun):
     def _to_arrays(self) -> dict[str, Any]:
         found = super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
         if self._happened is not None:
-            found |= zip(_HAPPENED, self._happened, strict=True)
+            found |= zip(_EVENT_FIELDS, self._happened, strict=True)
             found |= {"stopped": self._stopped, "limit": self._limit}
         return found
 
@@ -161,7 +166,7 @@ class AdaptiveBatchRun(BatchRun):
         made = BatchRun._from_arrays(model, kept)._all()
         found = cls(*made, **{name: kept[name] for name in _NAMES if name in kept})
         if "which" in kept:
-            found._happened = tuple(kept[name] for name in _HAPPENED)
+            found._happened = tuple(kept[name] for name in _EVENT_FIELDS)
             found._stopped, found._limit = kept["stopped"], kept["limit"]
         return found
 
@@ -180,7 +185,7 @@ def simulate(
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     limit = 0
     if max_evaluations is not None:
-        limit = min(as_count(max_evaluations, "max_evaluations", 1), MOST_EVALUATIONS)
+        limit = min(as_count(max_evaluations, "max_evaluations", 1), MAX_EVALUATIONS)
     t0 = as_number(t0, "t0")
     length = duration
     if times is None:
@@ -329,7 +334,7 @@ class _Work:
     def counts(self) -> dict[str, Array]:
         """Steps and so on of each instance, (batch,), by their names in C."""
         ffi, memory = self.model._ffi, "adaptive_memory"
-        kinds = dict.fromkeys(_COUNTED, "l")
+        kinds = dict.fromkeys(_COUNTERS, "l")
         if self.events:
             kinds |= {"stopped": "i", "limit": self.model.dtype.char}
         layout: Any = {
@@ -347,7 +352,7 @@ class _Work:
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
         count = len(self.q)
-        group = _GROUP if count > 8 * _GROUP else _FEWEST
+        group = _GROUP_SIZE if count > 8 * _GROUP_SIZE else _SMALL_GROUP_SIZE
         groups = [(at, min(group, count - at)) for at in range(0, count, group)]
         whole = run_groups(
             self, groups, as_threads(threads), lambda: progress and progress(self.ended, count)
@@ -380,7 +385,7 @@ class _Work:
         """These instances to a time, some steps of each at once; whether there is more to do."""
         end = at + count
         model, pointer = self.model, self.model._pointer
-        n, many = len(self.times), _FEW
+        n, many = len(self.times), _FIRST_CHUNK_STEPS
         p_each = len(self.table) > 1
         address, (long, integer) = model._c[0], model._whole
         events = self.events.room(count) if self.events else None

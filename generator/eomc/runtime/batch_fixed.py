@@ -20,7 +20,7 @@ from .model import LARGE
 from .status import STATUS
 
 _NAMES = ("_times", "_begin")
-_CUT = STATUS.index("interrupted")
+_INTERRUPTED = STATUS.index("interrupted")
 
 
 @dataclass(eq=False, repr=False)
@@ -113,7 +113,7 @@ def _by_steps(
             completed = 1 + work.done[k] // every
             q_rows[k, completed:] = qd_rows[k, completed:] = np.nan
         if not whole:
-            work.status[(work.status == 0) & short] = _CUT
+            work.status[(work.status == 0) & short] = _INTERRUPTED
     row_inputs = None if inputs is None else _at_rows(inputs, np.arange(rows) * every, steps)
     step_inputs = inputs if inputs is not None and inputs.shape[1] > 1 and every > 1 else None
     run = BatchRun(
@@ -140,7 +140,7 @@ def _at_times(
     whole = stepper.rows(places, (q_rows, qd_rows), request.threads, request.progress)
     work, last = stepper.work, int(places[0][-1])
     if not whole:
-        work.status[(work.status == 0) & (work.done < last)] = _CUT
+        work.status[(work.status == 0) & (work.done < last)] = _INTERRUPTED
     row_inputs = None if inputs is None else _at_rows(inputs, places[0], request.steps)
     run = TimedBatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),

@@ -22,7 +22,7 @@ from .package import own_model, reduced
 from .status import SAID, STATUS
 
 _ENDS = np.array(STATUS)
-_KEPT = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
+_FIELDS = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
 _OF_ONE = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
     "section": "section(...)",
@@ -135,11 +135,11 @@ class BatchRun(Values, Fans, Columns):
 
     def _to_arrays(self) -> dict[str, Any]:
         """What a saved run keeps of it besides its columns; None: nothing."""
-        return dict(zip(_KEPT, self._all()[1:], strict=True))
+        return dict(zip(_FIELDS, self._all()[1:], strict=True))
 
     @classmethod
     def _from_arrays(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
-        values: Any = map(kept.get, _KEPT)
+        values: Any = map(kept.get, _FIELDS)
         return cls(model, *values)
 
     @classmethod

@@ -12,7 +12,7 @@ from .arguments import Array
 from .by_name import ByName
 from .metadata import ModelInfo
 
-_ROWS = 2**16  # of all instances in one call: they share the processor's cache
+_ROWS_PER_CALL = 2**16  # of all instances in one call: they share the processor's cache
 
 
 class Values:
@@ -93,7 +93,7 @@ class Values:
         t, each = np.broadcast_to(self.t, (count, n)), {"params": self._params[:, None]}
         each |= inputs or {}
         alike = {name: x.size == x.shape[-1] for name, x in each.items()}
-        for first in range(0, count, many := max(1, _ROWS // max(n, 1))):
+        for first in range(0, count, many := max(1, _ROWS_PER_CALL // max(n, 1))):
             at = slice(first, first + many)
             q, qd = self.q[at], self.qd[at]
             finite = np.isfinite(q).all(axis=-1) & np.isfinite(qd).all(axis=-1)

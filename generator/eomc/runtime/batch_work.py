@@ -14,13 +14,15 @@ from .arguments import Array, as_count
 from .batch_instances import Instances
 from .slices import next_chunk
 
-_GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
-_TILES = 64  # at most in a group: threads ask for the next one seldom
-_SHARES = 8  # groups of a thread, so that all end together
-WORTH = 20_000  # steps in all from which threads pay
-_SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
-_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
-_FIRST = 0.02  # seconds before the first look
+_GROUP_SIZE = 128  # instances, in the smallest group: some tiles, the last of them not full
+_MAX_TILES_PER_GROUP = 64  # at most in a group: threads ask for the next one seldom
+_GROUPS_PER_THREAD = 8  # groups of a thread, so that all end together
+MIN_STEPS_FOR_THREADS = 20_000  # steps in all from which threads pay
+_DEFAULT_STEP_SECONDS = (
+    1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
+)
+_POLL_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+_FIRST_POLL_SECONDS = 0.02  # seconds before the first look
 
 
 class Work:
@@ -63,10 +65,16 @@ class Work:
         """All of it; False where Ctrl-C came in between."""
         count = self.count
         threads = as_threads(threads)
-        if count * (self.steps - self.first) < WORTH:
+        if count * (self.steps - self.first) < MIN_STEPS_FOR_THREADS:
             threads = 1
-        tiles = -(-count // _GROUP)
-        size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
+        tiles = -(-count // _GROUP_SIZE)
+        size = _GROUP_SIZE * max(
+            1,
+            min(
+                _MAX_TILES_PER_GROUP,
+                tiles // (_GROUPS_PER_THREAD * threads) if threads > 1 else tiles,
+            ),
+        )
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
         self._begin_all(threads if len(groups) > 1 else 1)
         total = count * self.steps
@@ -116,7 +124,13 @@ class Work:
             u_step = width if many > 1 else 0
         first, kind = self.first, (self.step, count.bit_length())
         # the first piece is short: another batch may have been quicker
-        many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
+        many = max(
+            1,
+            int(
+                _FIRST_POLL_SECONDS
+                / (model._paces.get(kind, _DEFAULT_STEP_SECONDS * model.nq) * count)
+            ),
+        )
         while first < self.steps and not self.stop:
             many = min(many, self.steps - first)
             call_start = perf_counter()
@@ -130,7 +144,7 @@ class Work:
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
             model._paces[kind] = max(1e-10, duration / (many * count))
-            many = next_chunk(many, duration, _SECONDS)
+            many = next_chunk(many, duration, _POLL_SECONDS)
             look()
 
 
@@ -202,7 +216,7 @@ def run_groups(
     waiting: set[Future[None]] = {pool.submit(work._group, *group) for group in groups}
     try:
         while waiting:
-            finished, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
+            finished, waiting = wait(waiting, timeout=_POLL_SECONDS, return_when=FIRST_EXCEPTION)
             for future in finished:
                 future.result()
             look()

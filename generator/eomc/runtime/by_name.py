@@ -1,4 +1,4 @@
-"""What each constraint, loop or event has, by name."""
+"""Dictionary of quantities of constraints, loops or events, by name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .arguments import not_one_of
 
 
 class ByName(dict[str, Any]):
-    """Raises KeyError with the names that there are, where one is not among them."""
+    """A dict whose KeyError lists the known names."""
 
     def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
         super().__init__(zip(names, values, strict=True))

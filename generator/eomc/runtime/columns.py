@@ -1,4 +1,4 @@
-"""What a run holds, by name: as an item, an attribute, a dict, a file, a table of pandas or xarray.
+"""Columns of a run by name: as items, attributes, a dict, a file, pandas or xarray tables.
 
 The names are t, the scene's coordinates, their rates (`theta_dot`), its inputs and outputs, energy,
 and jacobi where that is not the energy.
@@ -31,18 +31,20 @@ class Columns:
     __iter__ = None  # `for name in run` would ask for run[0]
 
     def _columns(self) -> dict[str, Callable[[], Array]]:
-        """What makes each column, by name, in the order of `to_dict`."""
+        """Return a function for each column that computes it, by name in the order of `to_dict`."""
         columns: dict[str, Callable[[], Array]] = {
             "t": partial(getattr, self, "t"),
             **self._named(),
         }
         names = ("energy", "jacobi") if self._model.has_jacobi else ("energy",)
         for name in names:
-            columns.setdefault(name, partial(getattr, self, name))  # a coordinate may be called so
+            columns.setdefault(
+                name, partial(getattr, self, name)
+            )  # unless a coordinate has this name
         return columns
 
     def _named(self) -> dict[str, Callable[[], Array]]:
-        """Those that the scene names: coordinates, rates, inputs, outputs."""
+        """Return the columns of the scene's coordinates, rates, inputs and outputs."""
         model = self._model
         rates = [f"{name}_dot" for name in model.coordinates]
         halves = (("q", model.coordinates), ("qd", rates), ("u", model.inputs))
@@ -70,7 +72,7 @@ class Columns:
         return columns[name]()
 
     def __getattr__(self, name: str) -> Any:
-        """A column that the scene names and no member hides."""
+        """Return the column of that name from the scene, unless a member has the same name."""
         named = {} if name.startswith("_") else self._named()
         if name not in named:
             known = tuple(named)
@@ -82,7 +84,7 @@ class Columns:
 
     @property
     def params(self) -> dict[str, Any]:
-        """Its parameters by name, as `simulate` takes them; of a batch (batch,)."""
+        """Parameters by name, as in the arguments of `simulate`; for a batch (batch,) each."""
         names, table = self._model.parameters, self._params
         if table.ndim == 1:
             return dict(zip(names, table.tolist(), strict=True))
@@ -90,15 +92,15 @@ class Columns:
         return dict(zip(names, columns, strict=True))
 
     def to_dict(self) -> dict[str, Array]:
-        """All columns by name, in this order; jacobi where it is not the energy."""
+        """Return all columns by name: t, coordinates, rates, inputs, outputs, energy, jacobi."""
         return {name: column() for name, column in self._columns().items()}
 
     def save(self, file: File) -> None:
         """Write the columns to NAME.csv, or all of the run to NAME.npz, which `load_run` reads.
 
-        An .npz keeps arrays only, nothing pickled: numpy.load(file)["q"] reads it without a module.
-        A u that is a function is not kept, but what it gave at the rows is. Raises ValueError for
-        other names, and for the .csv of a batch.
+        An .npz contains arrays only and nothing pickled: numpy.load(file)["q"] reads it without a
+        module. If u is a function, its values at the rows are saved, not the function. Raises
+        ValueError for other file names, and for the .csv of a batch.
         """
         path = Path(file)
         if path.suffix == ".csv" and self._axes == ("t",):
@@ -116,12 +118,12 @@ class Columns:
         with atomic_write(path) as new, new.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
-            numbers = (c.astype(float) + 0.0 for c in columns.values())  # no -0, as of rest
+            numbers = (c.astype(float) + 0.0 for c in columns.values())  # -0 becomes 0
             for row in zip(*(c.tolist() for c in numbers), strict=True):
                 writer.writerow(map(repr, row))
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame of the columns over t; of a batch over instance and t."""
+        """Return a pandas.DataFrame of the columns over t, for a batch over instance and t."""
         pandas = imported("pandas", "to_pandas")
         columns = self.to_dict()
         t = columns.pop("t")
@@ -132,7 +134,7 @@ class Columns:
         return pandas.DataFrame({n: c.ravel() for n, c in columns.items()}, index=index)
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset of the columns over t, of a batch over instance and t; with units.
+        """Return an xarray.Dataset of the columns with units, for a batch over instance and t.
 
         Parameters that differ between the instances of a batch are coordinates over instance.
         """
@@ -151,7 +153,7 @@ class Columns:
         return xarray.Dataset(variables, coords=coordinates, attrs=attributes)
 
     def _swept(self, units: dict[str, str], taken: set[str]) -> dict[str, Any]:
-        """Parameters that differ, over instance, by name; as params_NAME if that is taken."""
+        """Return the parameters that differ between instances by name (params_NAME if taken)."""
         if self._params.ndim == 1 or len(self._params) == 1:
             return {}
         return {
@@ -164,7 +166,7 @@ class Columns:
 
 
 def imported(package: str, function: str) -> Any:
-    """A package that a module does not need otherwise."""
+    """Import an optional package; ModuleNotFoundError says how to install it."""
     try:
         return import_module(package)
     except ModuleNotFoundError as fault:

@@ -18,7 +18,7 @@ from .frames import Frames
 from .package import option
 from .status import SAID, STATUS, MotionError, state_text
 
-AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
+REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
 
 class ConstraintRows(NamedTuple):
@@ -308,6 +308,6 @@ class Constrained(Frames):
         """A start whose modes are what its velocities say; one that is rounding is 0."""
         at, of = np.array(self._rows.modes).T
         fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
-        qd[..., of] *= np.abs(qd[..., of]) > np.maximum(AT_REST * fastest, SLOWEST)
+        qd[..., of] *= np.abs(qd[..., of]) > np.maximum(REST_TOLERANCE * fastest, MIN_SPEED)
         q[..., at] = np.sign(qd[..., of])
         return q, qd

@@ -10,8 +10,8 @@ import numpy as np
 from .arguments import Array
 from .by_name import ByName
 
-_HOLDS = 2.0**26  # roundings of its terms: more is no rounding
-_LEAST = 1e-9  # of these terms
+_MAX_ROUNDINGS = 2.0**26  # roundings of its terms: more is no rounding
+_MIN_SCALE = 1e-9  # of these terms
 
 
 class ConstrainedRun:
@@ -71,9 +71,9 @@ class ConstrainedRun:
         sizes = np.abs(model.constraint_jacobian(q, t=t, params=p)).astype(float)
         for what, x in (("constraints", q), ("constraint_rates", qd)):
             off = np.abs(getattr(model, what)(q, qd, t, p)).astype(float)
-            share = off / np.maximum(sizes @ (np.abs(x) + np.max(np.abs(x))), _LEAST)
+            share = off / np.maximum(sizes @ (np.abs(x) + np.max(np.abs(x))), _MIN_SCALE)
             worst = int(np.argmax(share))
-            if share[worst] > _HOLDS * float(np.finfo(model.dtype).eps):
+            if share[worst] > _MAX_ROUNDINGS * float(np.finfo(model.dtype).eps):
                 rate = "the rate of " if what != "constraints" else ""
                 return (
                     f"{rate}{names[worst]} is {off[worst]:.3g} at the end, not 0: constraints "

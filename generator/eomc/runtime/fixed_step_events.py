@@ -23,9 +23,9 @@ def simulate(
     params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None, fixed: tuple[Any, ...], look: Callable[..., None],
 ) -> SteppedRun:  # fmt: skip
-    """`Model.simulate` by fixed steps where there are events; fixed: the values of FIXED.
+    """Simulate with fixed steps and events.
 
-    look: warns of an h too large.
+    fixed: values of the arguments in FIXED_STEP_DEFAULTS. look: warns of an h too large.
     """
     h, steps, method, every, out = fixed
     if out is not None:

@@ -1,4 +1,4 @@
-"""What is not finite where a run begins: why some make no step."""
+"""Diagnosis of runs that make no step because a quantity is not finite at the start."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from .trajectory_data import Trajectory
 
 
 def infinite_at_start(run: Trajectory) -> str:
-    """Why no acceleration is finite there, in a sentence; "" where each is, or the run moved.
+    """Name the quantity that is not finite at the initial state, in a sentence.
 
-    An energy that alone overflows stops no motion.
+    Returns "" if all accelerations are finite there or the run made a step. An energy that
+    overflows while the accelerations are finite does not end a run.
     """
     if run.status != "not finite" or run.steps or not len(run):
         return ""
@@ -25,7 +26,7 @@ def infinite_at_start(run: Trajectory) -> str:
     except MotionError as lacking:
         if lacking.status != "not finite":
             return ""
-    except ValueError:  # inputs of a saved run, which are not known
+    except ValueError:  # the inputs of a saved run are unknown
         return ""
     what = "an acceleration"
     if not np.isfinite(model.potential_energy(q, **at)):
