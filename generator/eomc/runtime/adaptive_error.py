@@ -1,4 +1,8 @@
-"""The error of a run by a tolerance or among events: beside a finer one, and a moved start."""
+"""Error of adaptive runs and of runs with events.
+
+The error is the difference from a run at a hundredth of the tolerance. A run from a perturbed start
+shows how rounding errors grow.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +21,15 @@ from .input_schedule import ZeroOrderHold
 from .status import FULL, REMEDY
 
 GAUSS16_ORDER = 16
-COMPLETE_STATUSES = (
-    "ok",
-    "accumulated",
-)  # the statuses of runs that came as far as their motion goes
-_UNRESOLVED_ERROR = 0.1  # of a coordinate's scale: a result more wrong than that is none
-_SATURATED_DIFFERENCE = (
-    0.01  # of a scale: a difference that has become so large grows no more as it did
-)
-_PERTURBATION_ROUNDINGS = 4.0  # roundings, by which a start is moved where more fills the scale
-_TAIL_DIVISOR = 40  # a part of the rows, over which a difference does not vanish
-_TOLERANCE_RATIO = 100.0  # the tolerance over that of the run by which an error is found
-_MIN_REFERENCE_STEPS = 512  # steps of that, at least
-_MIN_CURVE_ROWS = 24  # rows along a run, at least, at which differences are seen
-_MIN_EXTRA_STEPS = 10  # steps, at least, in which a finer run looks for the event that ends the run
+COMPLETE_STATUSES = ("ok", "accumulated")  # of runs that reached the end of their motion
+_UNRESOLVED_ERROR = 0.1  # of a coordinate's scale: larger errors count as unresolved
+_SATURATED_DIFFERENCE = 0.01  # of a scale: larger differences no longer grow linearly
+_PERTURBATION_ROUNDINGS = 4.0  # perturbation of the start in roundings, if a larger one saturates
+_TAIL_DIVISOR = 40  # the final error is the largest one in the last 1/40 of the rows
+_TOLERANCE_RATIO = 100.0  # tolerance of the run over that of the reference run
+_MIN_REFERENCE_STEPS = 512  # of the reference run
+_MIN_CURVE_ROWS = 24  # at which differences between runs are computed
+_MIN_EXTRA_STEPS = 10  # by which the reference run may exceed the event that ended the run
 _EVENT_SHIFT_FACTOR = (
     4.0  # times that differences of states last, by which the same event may be moved
 )
@@ -62,13 +61,15 @@ def error_by_tighter_tolerance(
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
     finer, other = again.finer(begin, least)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving_mask(model)
-    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0  # nor is what sticks moved
+    moves[model.nq + modes[:, 1]] = (
+        begin[modes[:, 0]] != 0
+    )  # nor are velocities of sticking friction perturbed
     x = x[again.beside]
 
     base = again.curve()
 
     def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
-        """The difference that a nudge of the start makes along the run, nan behind an end."""
+        """Return the change of the states that results from a perturbation of the start."""
         most = (
             _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
         )  # of another motion, not its end
@@ -114,7 +115,7 @@ def error_by_tighter_tolerance(
 
 
 class _Rerun:
-    """A run once more, by another tolerance, in other steps or from another start."""
+    """Repeats a run with another tolerance, other steps or another initial state."""
 
     def __init__(
         self,
@@ -135,7 +136,7 @@ class _Rerun:
         self, tol: float, start: Array, h_most: float, steps: float = np.inf,
         end: float | None = None,
     ) -> tuple[Array, AdaptiveTrajectory | None]:  # fmt: skip
-        """The states at the rows, nan where the run has none, and the run itself."""
+        """Return the states at the rows of the run, nan where the rerun has none, and the rerun."""
         own = self.own
         out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
         out[own.t == own.t0] = start
@@ -160,7 +161,7 @@ class _Rerun:
         return rerun
 
     def _end(self, rows: Array, rerun: AdaptiveTrajectory) -> None:
-        """The last row where the same event ends both runs, the other a hair sooner or later."""
+        """Set the last row to the final state of the rerun if the same event ends both runs."""
         own = self.own
         if own.stopped and rerun.stopped == own.stopped and own.t[-1] == self.reached:
             event = rerun.events[own.stopped]
@@ -168,7 +169,7 @@ class _Rerun:
 
     @property
     def times(self) -> Array:
-        """Of `curve` and `states`: those of the rows, with others between where these are few."""
+        """Times of `curve` and `states`: those of the rows, and more if these are few."""
         between = np.linspace(self.own.t0, self.own.t[-1], _MIN_CURVE_ROWS + 1)[1:-1]
         own = self.own.t[self.kept].astype(float)
         few = between if len(own) < _MIN_CURVE_ROWS else between[:0]
@@ -181,7 +182,7 @@ class _Rerun:
         return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
 
     def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
-        """Those of another run at `times`, nan behind its end."""
+        """Return the states of a rerun at `times`, nan after its end."""
         own, start, times = self.own, start.astype(self.own._model.dtype), self.times
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
@@ -192,14 +193,14 @@ class _Rerun:
         return out
 
     def at_rows(self, states: Array) -> Array:
-        """What is at `times` at the rows of the run, nan at those beside jumps."""
+        """Return the states at the rows from those at `times`, nan at rows next to jumps."""
         out = np.full_like(self.x, np.nan)
         out[self.own.t == self.own.t0] = states[0]
         out[self.kept] = states[np.searchsorted(self.times, self.own.t[self.kept].astype(float))]
         return np.asarray(out[self.beside])
 
     def finer(self, begin: Array, least: float) -> tuple[Array, AdaptiveTrajectory | None]:
-        """The same by a finer run."""
+        """Return the states at the rows of a run with a tighter tolerance, and that run."""
         own, end = self.own, None
         if own.stopped:  # shorter steps may detect that event later, or not at all
             end = min(
@@ -208,14 +209,14 @@ class _Rerun:
         tol, shorter = _finer(own, least)
         rows, rerun = self(tol, begin, shorter, end=end)
         if own.status == "ok" and rerun is not None and rerun.status not in COMPLETE_STATUSES:
-            # short ones near singular positions
+            # this run had too short steps near singular positions
             rows, rerun = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
         return rows, rerun
 
 
 @dataclass(frozen=True)
 class _Events:
-    """How the events of a run differ from those of a finer one.
+    """Differences between the events of a run and those of a finer run.
 
     errors: by name |t - t of the finer run| of each event of the run, s, inf of those that the
     finer run does not detect. missed: by name the times of those that the finer run alone detects.
@@ -260,7 +261,7 @@ class _Events:
             r.limit - _ZENO_FRACTION * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit
         )
         until = min(until, *whole, np.inf)
-        # that friction sticks is a part of the state, and so of its error
+        # sticking of friction is a part of the state, and so of its error
         coordinates = (own._model.coordinates[k] for _, k in own._model._rows.modes)
         stick = {f"{c}_{what}" for c in coordinates for what in ("stops", "slips")}
         errors, missed, false = {}, {}, {}
@@ -288,7 +289,7 @@ class _Events:
         )
 
     def words(self, own: AdaptiveTrajectory) -> list[str]:
-        """What was missed, and what was detected in vain, a sentence each."""
+        """Return sentences on missed events and on falsely detected ones."""
         finer, remedy = "shorter steps", "a smaller h"
         if not own._by:
             finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"
@@ -305,14 +306,14 @@ class _Events:
 
 
 def _listed(events: dict[str, Array]) -> str:
-    """The first of some events, and how many more there are."""
+    """Describe the first of these events and the number of others."""
     name = min(events, key=lambda each: float(events[each][0]))
     more = sum(map(len, events.values())) - 1
     return f"event '{name}' at t = {events[name][0]:.9g} s{f' (and {more} more)' if more else ''}"
 
 
 def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
-    """The indices of those times of a and b that are nearest to one another, within a gap."""
+    """Return the indices of times of a and b that are mutually nearest and within `gap`."""
     if len(a) == len(b) and (np.abs(a - b) <= gap).all():
         return np.arange(len(a)), np.arange(len(b))
     if not (len(a) and len(b)):
@@ -329,9 +330,10 @@ def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
 
 
 def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
-    """Tolerance and longest step of a run to compare with: in other steps where there is no smaller
-    tolerance too, as rounding differs, and what comes and goes between two nodes shows. Of fixed
-    steps a quarter of their size."""
+    """Return the tolerance and longest step of the reference run; for fixed steps (tol, h / 4).
+
+    If no smaller tolerance exists, a larger one leads to other steps with other rounding errors.
+    """
     if own._by:
         return own.tol, own.h / 4
     tol = max(own.tol / _TOLERANCE_RATIO, least) if own.tol >= 2 * least else 4 * least
@@ -340,24 +342,26 @@ def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
 
 
 def _finite(rows: Array) -> Array:
-    """The rows as far as both runs came."""
+    """Return the rows at which both runs have states."""
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
 def _filled(rows: Array) -> Array:
-    """Differences at rows; behind those that a run came to the last of them."""
+    """Fill rows that are not finite with the last finite row."""
     is_finite = np.isfinite(rows).all(axis=1)
     filled: Array = np.nan_to_num(
         rows[np.maximum.accumulate(np.where(is_finite, np.arange(len(rows)), 0))]
     )
-    filled[-1] = filled[-1 - len(rows) // _TAIL_DIVISOR :].max(axis=0)  # it may vanish for a moment
+    filled[-1] = filled[-1 - len(rows) // _TAIL_DIVISOR :].max(
+        axis=0
+    )  # the difference may vanish for a moment
     return filled
 
 
 def _verdict(
     own: AdaptiveTrajectory, left: Array, rounding: Array, amplification: float, events: _Events
 ) -> str:
-    """What speaks against the run; its differences, and rounding, relative to the scales."""
+    """Return reasons to doubt the run. left, rounding: errors relative to the scales."""
     words = []
     if own.status not in COMPLETE_STATUSES:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")

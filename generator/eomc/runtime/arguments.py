@@ -1,4 +1,4 @@
-"""What a compiled scene is called with, checked and made what C takes.
+"""Checks of the arguments of a compiled scene and their conversion to arguments of C.
 
 Wrong shapes, unknown names and numbers that are not finite raise ValueError with the name of the
 argument.
@@ -23,12 +23,12 @@ Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 
-MIN_RESOLVED_TIMES = 256  # numbers in the span of a run, from which a tolerance can choose steps
-_MAX_LIST_NUMBERS = 32  # numbers that Python looks at sooner than NumPy
+MIN_RESOLVED_TIMES = 256  # floating-point times within an adaptive run
+_MAX_LIST_NUMBERS = 32  # below this size Python checks numbers faster than NumPy
 
 
 class Params:
-    """A scene's parameters, by name: `p = Params(m_c=3.0); p.m_c = 4.0`. Made by the module."""
+    """Parameters of a scene by name: `p = Params(m_c=3.0); p.m_c = 4.0`."""
 
     _names: tuple[str, ...] = ()
     _defaults: tuple[float, ...] = ()
@@ -63,7 +63,7 @@ class Params:
         return iter(self._names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # a copy too goes this way
+        # also used by copy
         return reduced("_model._create_params", dict(zip(self._names, self._values(), strict=True)))
 
     def __eq__(self, other: object) -> bool:
@@ -83,9 +83,9 @@ class Params:
 
 
 class Arguments:
-    """A compiled scene: its names and numbers, and what it is called with as C takes it."""
+    """A compiled scene: its names and dimensions, and conversion of arguments for C."""
 
-    _follows: Mapping[str, str] = {}  # formulas of starts over parameters
+    _follows: Mapping[str, str] = {}  # initial values that are formulas of parameters
 
     def __init__(
         self, extension: Any, *, name: str, title: str, dtype: str,
@@ -97,7 +97,7 @@ class Arguments:
         # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
         self._ffi, self._lib = extension.ffi, extension.lib
         real = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
-        # what any call needs: address(real, array), and the address of nothing
+        # for any call: address(real, array), and the null pointer
         self._c = (self._ffi.from_buffer, real, self._ffi.NULL)
         self.name, self.title, self.digest = name, title, digest
         self.dtype = np.dtype(dtype)
@@ -107,13 +107,11 @@ class Arguments:
         self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
-        self._shape = (
-            (self.nq,) if self.nq <= _MAX_LIST_NUMBERS else None
-        )  # of a state that is soon looked at
+        self._shape = (self.nq,) if self.nq <= _MAX_LIST_NUMBERS else None  # of a small state
         self._start = (self._constant(start[0]), self._constant(start[1]))
         self._p0 = self._constant(tuple(parameters.values()))
         self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
-        self._functions: dict[str, Any] = {}  # of a state: C function, shape, whether it reads qd
+        self._functions: dict[str, Any] = {}  # by name: C function, shape, whether it reads qd
         if follows:
             self._follows = follows
         names = {
@@ -129,12 +127,12 @@ class Arguments:
 
     @property
     def start(self) -> tuple[Array, Array]:
-        """(q, qd) where the scene starts."""
+        """The initial state (q, qd) of the scene."""
         q, qd = self._start
         return q.copy(), qd.copy()
 
     def _bytes(self, rows: int) -> int:
-        """What q and qd of so many rows take."""
+        """Return the size in bytes of q and qd of `rows` rows."""
         return rows * 2 * self.nq * self.dtype.itemsize
 
     def _constant(self, values: Sequence[float]) -> Array:
@@ -147,12 +145,12 @@ class Arguments:
         return null if array is None else address(real, array)
 
     def _input_pointers(self, u: Any, params: Any) -> tuple[Any, Any]:
-        """The addresses of inputs and parameters."""
+        """Return the pointers to inputs and parameters."""
         inputs = self._c[2] if u is None else self._pointer(self._inputs(u))
         return inputs, self._at[2] if params is None else self._pointer(self._parameters(params))
 
     def _listed(self, x: Any, shape: tuple[int | None, ...] | None) -> Any:
-        """Such numbers as a list, which C takes soonest; None for all that needs a closer look."""
+        """Return x as a list, which C takes fastest; None if x needs further checks."""
         if type(x) is ndarray and x.dtype is self.dtype and x.shape == shape:
             numbers = x.tolist()
             if isfinite(sum(numbers)):  # is quickest; it may overflow all the same
@@ -160,7 +158,7 @@ class Arguments:
         return None
 
     def _read(self, q: Any, qd: Any, many: bool = True) -> tuple[Any, Any, Array, Array]:
-        """What C reads a state, or many, from, and these as arrays."""
+        """Return what C reads q and qd from, of one or many states, and q and qd as arrays."""
         if (
             type(q) is type(qd) is ndarray and q.shape == qd.shape == self._shape
             and q.dtype is qd.dtype is self.dtype
@@ -172,7 +170,7 @@ class Arguments:
         return self._pointer(at), self._pointer(moving), at, moving
 
     def _numbers(self, value: ArrayLike, name: str) -> Array:
-        """A C-contiguous, aligned array of the module's numbers, of any shape."""
+        """Return a C-contiguous, aligned array of the module's precision, of any shape."""
         if not isinstance(value, list):
             without_mask(value, name)
         try:
@@ -191,7 +189,7 @@ class Arguments:
             raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
 
     def _array(self, value: ArrayLike, name: str, width: int, many: bool = True) -> Array:
-        """Finite numbers, (width,), or (n, width) too where there may be many."""
+        """Return an array of finite numbers, (width,), or also (n, width) if `many`."""
         if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
             array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
@@ -226,9 +224,9 @@ class Arguments:
         return at, moving
 
     def _checked_half(self, x0: Any, name: str) -> tuple[Array, Any]:
-        """A start, (nq,), and what C reads it from."""
+        """Return q0 or qd0, (nq,), as an array and what C reads it from."""
         if (numbers := self._listed(x0, self._shape)) is not None:
-            return x0, numbers  # an array, as was seen
+            return x0, numbers  # _listed accepts arrays only
         x = self._numbers(x0, name)
         if x.ndim == 2 and x.shape[1] == self.nq:
             raise ValueError(
@@ -271,7 +269,7 @@ class Arguments:
         return array
 
     def _parameter_rows(self, params: Any) -> Array:
-        """Parameters of many states or instances, a row each, (n, np); (1, np) for all."""
+        """Return parameters of many states or instances, (n, np), or (1, np) if they are equal."""
         if params is None or isinstance(params, Params):
             return self._parameters(params)[None]
         if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
@@ -296,7 +294,7 @@ class Arguments:
         return table
 
     def _inputs(self, u: Any, many: bool = False) -> Array | None:
-        """(nu,), or (n, nu) too where there may be many."""
+        """Return inputs (nu,), or also (n, nu) if `many`; None for the scene's signals."""
         if u is None:
             return None
         if not self.nu:
@@ -307,9 +305,10 @@ class Arguments:
         return self._array(u, "u", self.nu, many)
 
     def _by_name(self, u: Mapping[Any, Any]) -> Array:
-        """Inputs by name as arrays have them, (..., nu).
+        """Return inputs from a dict by name as an array, (..., nu).
 
-        All are to be given: held inputs and signals, which go on through a step, can't be mixed.
+        All inputs are required: inputs that are constant over a step cannot be mixed with signals,
+        which are evaluated within it.
         """
         u = by_name(u)
         for name in u:
@@ -349,7 +348,7 @@ class Arguments:
         return array
 
     def _movable(self, x: Array, name: str) -> None:
-        """A ValueError where C can't move these states in place."""
+        """Raise ValueError unless C can overwrite these states in place."""
         description = f"a {type(x).__name__}"
         if isinstance(without_mask(x, name), np.ndarray):
             right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
@@ -366,7 +365,7 @@ class Arguments:
         )
 
     def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
-        """Arrays for positions and velocities: those given, or new ones."""
+        """Return arrays for positions and velocities: those of `out`, or new ones."""
         if out is None:
             return empty(shape, self.dtype), empty(shape, self.dtype)
         if not isinstance(out, (tuple, list)) or len(out) != 2:
@@ -375,7 +374,7 @@ class Arguments:
 
 
 class StateArguments:
-    """t, u and parameters of one state or many, as C takes them: one for all states or one each.
+    """t, u and parameters of one or many states as arguments of C: shared or one for each state.
 
     rows: () or (n,). replacement: the argument in place of u, (width,) or (n, width).
     u_rows: the inputs, (nu,) or (n, nu), None for the signals. Raises ValueError.
@@ -415,11 +414,11 @@ class StateArguments:
             self._from_t = null if self.times is None else address(real, self.times)
 
     def time(self, k: int) -> float:
-        """The time of state k."""
+        """Return the time of state k."""
         return self.t if self.times is None else float(self.times[k])
 
     def pointers(self, k: int) -> tuple[float, Any, Any, Any]:
-        """The last arguments of a function in C, from state k on: t, u, p and strides."""
+        """Return the last arguments of a C function from state k on: t, u, p and strides."""
         if not self.own:
             return self.t, self.u, self.p, self.own
         if self.times is not None:
@@ -432,7 +431,7 @@ class StateArguments:
 
 
 def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
-    """A time for each row, (n,); None where there is one for all. Raises ValueError."""
+    """Return a time for each row, (n,), or None if t is a single number. Raises ValueError."""
     if not (rows and np.ndim(t)):
         return None
     without_mask(t, "t")
@@ -447,7 +446,7 @@ def _check_rows(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) ->
 
 
 def _finite(array: Array, words: str) -> Array:
-    """The array; a ValueError with these words and the place where a number is not finite."""
+    """Return the array; raise ValueError with the place of a number that is not finite."""
     if not np.isfinite(array).all():
         place = np.argwhere(~np.isfinite(array))[0].tolist()
         number = array[tuple(place)]
@@ -456,14 +455,14 @@ def _finite(array: Array, words: str) -> Array:
 
 
 def by_name(values: Mapping[Any, Any]) -> dict[str, Any]:
-    """By names: keys may be symbols of SymPy too, or its functions of time."""
+    """Return the values by name. Keys may be SymPy symbols or functions of time."""
     return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in values.items()}
 
 
 def without_mask(value: Any, name: str) -> Any:
-    """The value; a ValueError where it is an array with masked numbers, for these have none."""
-    ma: Any = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
-    masked = getattr(ma, "MaskedArray", ())  # another thread may be at that just now
+    """Return the value; raise ValueError if it is an array with masked numbers."""
+    ma: Any = sys.modules.get("numpy.ma")  # NumPy imports it on first use
+    masked = getattr(ma, "MaskedArray", ())  # another thread may be importing it
     if isinstance(value, masked) and ma.is_masked(value):
         raise ValueError(
             f"{name}: {ma.count_masked(value)} of {value.size} numbers are masked: "
@@ -473,7 +472,7 @@ def without_mask(value: Any, name: str) -> Any:
 
 
 def as_number(value: Any, name: str) -> float:
-    """A finite number, or a ValueError that names the argument."""
+    """Return a finite number; raise ValueError that names the argument."""
     if type(value) is float and isfinite(value):
         return value
     try:
@@ -488,7 +487,7 @@ def as_number(value: Any, name: str) -> float:
 
 
 def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
-    """A step size in the module's numbers, or a ValueError."""
+    """Return a step size > 0 in the precision of the module; raise ValueError otherwise."""
     if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
         return h
     size = as_number(h, name)
@@ -513,7 +512,7 @@ def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
         return {name: cut_table(x, 0, whole, count, axis) for name, x in u.items()}
     try:
         shape = np.shape(u)
-    except ValueError:  # no array; what takes it says so
+    except ValueError:  # no array; a later check raises an error
         return u
     column = nu == 0 or (nu == 1 and axis == 0)  # values of one input
     if len(shape) not in ({axis + 1} if nu == 0 else {axis + 2, axis + 2 - column}):
@@ -545,7 +544,7 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
 
 
 def as_period(period: Any, h: float) -> int:
-    """The steps in a control period, 1 where it is None, or a ValueError."""
+    """Return the number of steps in a control period (1 if None); raise ValueError otherwise."""
     if period is None:
         return 1
     count = as_number(period, "control_period") / h
@@ -559,19 +558,19 @@ def as_period(period: Any, h: float) -> int:
 
 
 def aligned(array: Array) -> Array:
-    """The array, copied where its numbers lie at addresses that C can't read them from."""
+    """Return the array, copied if it is not aligned for C."""
     return array if array.flags.aligned else array.copy()
 
 
 def as_flag(value: Any, name: str) -> bool:
-    """Whether something is asked for, or a ValueError: texts and lists are not taken for True."""
+    """Return a bool; raise ValueError for other types, such as texts and lists."""
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     raise ValueError(f"{name}: {value!r} is not True or False")
 
 
 def as_count(value: Any, name: str, least: int) -> int:
-    """A whole number, `least` or more, or a ValueError that names the argument."""
+    """Return an integer >= least; raise ValueError that names the argument."""
     if type(value) is int and value >= least:
         return value
     number = as_number(value, name)
@@ -581,7 +580,7 @@ def as_count(value: Any, name: str, least: int) -> int:
 
 
 def machine_memory() -> float:
-    """The bytes of memory that the machine has; a larger array may be handed out all the same."""
+    """Return the memory of the machine in bytes. The system may allocate larger arrays."""
     if sys.platform == "win32":
         return float("inf")
     try:
@@ -591,14 +590,14 @@ def machine_memory() -> float:
 
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
-    """What is wrong with a name, what there is, and what may be meant."""
+    """Return the message for an unknown name: the known names and a similar one."""
     if not known:
         return f"{argument}: there is no '{name}': this scene has none"
     return f"{argument}: '{name}' is not one of {', '.join(known)}{meant(name, known)}"
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
-    """start, the parts and end; as many of the parts as a line has room for."""
+    """Join start, the parts and end on one line; omit parts that do not fit."""
     whole = start + ", ".join(parts) + end
     if len(whole) <= width:
         return whole

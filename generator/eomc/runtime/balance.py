@@ -1,4 +1,4 @@
-"""Where a run's energy went: the work of inputs and forces along its rows, and what that leaves."""
+"""Energy balance of a run: work of inputs and forces along its rows, and the numerical error."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .package import reduced
 from .stepping import Stepping
 from .trajectory_data import Trajectory
 
-_MAX_ORDER = 8  # of an interpolating polynomial, and so the order of an integral, at most
-_MIN_ROWS = 2 * _MAX_ORDER + 1  # from which on every fourth shows something; below all may be wrong
-_MIN_ORDER = 0.5  # of the order that is taken for seen
-_MAX_RELATIVE_ERROR = 0.005  # of the largest part: an integral that is off by more tells nothing
-_ROWS_PER_STEP = 8  # rows for each step between jumps, beside
-_MIN_PIECE_ROWS = 4 * _MAX_ORDER + 1  # for a piece
+_MAX_ORDER = 8  # of the interpolating polynomials, and so of the quadrature
+_MIN_ROWS = 2 * _MAX_ORDER + 1  # fewer rows give no error estimate
+_MIN_ORDER = 0.5  # observed order of the quadrature is at least this
+_MAX_RELATIVE_ERROR = 0.005  # of the quadrature, for a balance that is reported
+_ROWS_PER_STEP = 8  # between jumps
+_MIN_PIECE_ROWS = 4 * _MAX_ORDER + 1  # rows of a piece between jumps
 _MAX_ROWS = 400_000  # rows of all pieces
 
 
@@ -46,7 +46,7 @@ class Balance:
 
     @property
     def words(self) -> str:
-        """What was put in, taken and lost, and the error, for people."""
+        """Describe supplied and dissipated energy and the numerical error in a sentence."""
         if not self.told:
             return "steps are too long to tell what was put in and what was lost"
         ways = (
@@ -67,7 +67,7 @@ class Balance:
 
 @dataclass(frozen=True)
 class _PowerSamples:
-    """Rows t (n,), q, qd (n, nq) that tell a run's power; u: its inputs, (nu,) or (n, nu)."""
+    """Samples t (n,), q, qd (n, nq) of a run for its power; u: inputs, (nu,) or (n, nu)."""
 
     model: Stepping
     params: Array
@@ -77,15 +77,16 @@ class _PowerSamples:
     u: Array | None
 
     def values(self, function: Callable[..., Any], **inputs: Any) -> Array:
-        """What a function of the states gives, (n, ...)."""
+        """Evaluate a function of the states, (n, ...)."""
         values = function(self.q, self.qd, t=self.t, params=self.params, **inputs)
         return np.asarray(values, float)
 
 
 def balance(run: Trajectory) -> Balance | None:
-    """The balance of a run; None where its rows don't tell its inputs, or something is infinite.
+    """Return the energy balance of a run.
 
-    That may be an energy or a force, at a start from which no step is made.
+    None if the inputs cannot be determined from the rows, or an energy or force is not finite, as
+    at an initial state from which no step is possible.
     """
     if not np.isfinite(run.jacobi).all():
         return None
@@ -105,7 +106,7 @@ def balance(run: Trajectory) -> Balance | None:
     if not all(np.isfinite(x).all() for x in (power, rest, forward, backward)):
         return None
     braking = np.sum((backward - forward) / 2 * rows.qd, axis=1).astype(float)
-    jumps = 1 + np.flatnonzero(np.diff(rows.t) == 0)  # the rows behind them
+    jumps = 1 + np.flatnonzero(np.diff(rows.t) == 0)  # the rows after jumps
     (work, off), (other, _), (lost, blur) = (
         _in_pieces(rows.t, y, jumps) for y in (power, rest, braking)
     )
@@ -121,9 +122,9 @@ def balance(run: Trajectory) -> Balance | None:
 
 
 def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """What takes a state to the one that moves back along the same way.
+    """Return the function that reverses the velocities of a state.
 
-    Friction that sticks has a mode beside each velocity, its sign.
+    The modes of Coulomb friction are signs of velocities and change their sign as well.
     """
     signs = np.ones(model.nq, model.dtype)
     signs[[at for at, _ in model._rows.modes]] = -1
@@ -131,7 +132,7 @@ def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array,
 
 
 def _rows(run: Trajectory) -> _PowerSamples | None:
-    """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
+    """Return samples whose power is smooth between jumps of the state or the inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
         states = _in_steps(run) or _between_jumps(
@@ -142,7 +143,7 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
     ends, values = _held(run)
     if not len(values):
         return None
-    after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # a jump
+    after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # rows after jumps
     periods, (ends, values) = ends, _cut(ends, values, run.t[after_jumps])
     each = (_ROWS_PER_STEP if hasattr(run, "tol") else 1) * ceil(run.steps / (len(periods) - 1)) + 1
     count = min(max(each, _MIN_ROWS), max(_MAX_ROWS // len(values), 2))
@@ -158,13 +159,13 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
-    """Pieces between times (n + 1,), with a value each, cut at other times too."""
+    """Split the pieces between times `ends` (n + 1,), with a value each, at times `at` too."""
     both = np.unique([*ends, *at])
     return both, values[np.searchsorted(ends, both[:-1], side="right") - 1]
 
 
 def _held(run: Any) -> tuple[Array, Array]:
-    """Times (n + 1,) between which a run holds its inputs, and these, (n, nu); none: unknown."""
+    """Return times (n + 1,) and the constant inputs between them, (n, nu); n = 0: unknown."""
     unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
     if hasattr(run, "tol"):
         values = run._held
@@ -184,22 +185,24 @@ def _held(run: Any) -> tuple[Array, Array]:
 
 
 def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
-    """t, q and qd, equally far apart in each step that fits a tolerance; its ends on two rows.
+    """Return equidistant t, q and qd within each adaptive step; its ends are on two rows.
 
-    Such steps are short where power is not smooth, as in a stop. Those of some roundings of the
-    time have their ends alone. None: fixed steps, or too many.
+    Such steps are short where power is not smooth, as in a joint stop. Steps of a few roundings of
+    the time have no inner rows. None for fixed steps, or if there are too many steps.
     """
     if not hasattr(run, "tol") or run.steps * _MIN_ROWS > _MAX_ROWS or not run._model.has_power:
         return None
     run = with_jumps(run)
-    if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows were asked for
+    if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows are at requested times
         run = _after_steps(run)
     t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
     intervals = np.diff(t)
     long = np.flatnonzero(intervals > _MIN_ROWS * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
     inner = np.arange(1, _MIN_ROWS - 1) / (_MIN_ROWS - 1)
     at = (t[long, None] + intervals[long, None] * inner).ravel()
-    between = 1 + np.flatnonzero(intervals[:-1] * intervals[1:])  # they end a step, and begin one
+    between = 1 + np.flatnonzero(
+        intervals[:-1] * intervals[1:]
+    )  # the end of a step and the beginning of another
     rows = np.sort([*range(len(t)), *between])
     places = np.repeat(np.searchsorted(rows, long, side="right"), len(inner))
     q, qd = np.insert(both[:, rows], places, np.array(run(at)), axis=1)
@@ -207,7 +210,7 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
 
 
 def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
-    """t, q, qd equally far apart, in each piece between jumps, which stand on two rows each."""
+    """Return equidistant t, q, qd in each piece between jumps; each jump has two rows."""
     run = with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
     if not len(jumps) or not run._model.has_power:
@@ -230,7 +233,7 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
 
 
 def with_jumps(run: Any) -> Any:
-    """The same run with both rows of each jump, also where others were asked for."""
+    """Return the run with both rows of each jump, also if its rows are at requested times."""
     event_indices = getattr(run, "_happened", ((),))[0]
     if not len(event_indices) or (np.diff(run.t) == 0).any():
         return run
@@ -238,14 +241,14 @@ def with_jumps(run: Any) -> Any:
 
 
 def _after_steps(run: Any) -> Any:
-    """The same run with a row after each step, and both of each jump."""
+    """Return the run with a row after each step and both rows of each jump."""
     return run._rerun(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:
-    """`_work`, of a power that is smooth between jumps alone; these: the rows behind them.
+    """Integrate a power that is smooth between jumps, as `_work`. jumps: the rows after them.
 
-    Pieces of as many rows, which are equally far apart in each, go together.
+    Pieces with the same number of equidistant rows are integrated together.
     """
     if not len(jumps):
         sums, off = _work(t, power)
@@ -263,9 +266,9 @@ def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:
 
 
 def _work(t: Array, power: Array) -> tuple[Array, Array]:
-    """The integral of a power (..., n) up to each row, (..., n), and how far it may be off, (...).
+    """Integrate a power (..., n) up to each row, (..., n), with an error bound, (...).
 
-    That is thrice what the integrals over every second and fourth row show, by their order.
+    The bound is three times the Richardson estimate from every second and every fourth row.
     """
     n = len(t)
 
@@ -289,9 +292,9 @@ def _work(t: Array, power: Array) -> tuple[Array, Array]:
 
 
 def _intervals(t: Array, y: Array) -> Array:
-    """The integral of y (..., n) from each row to the next, (..., n - 1), by polynomials.
+    """Integrate y (..., n) from each row to the next, (..., n - 1), by polynomial interpolation.
 
-    Each goes through some rows, which are equally far apart, but perhaps the last.
+    The rows are equidistant, except perhaps the last.
     """
     n, rows = len(t), min(_MAX_ORDER, len(t))
     k = np.arange(n - 1)
@@ -305,7 +308,7 @@ def _intervals(t: Array, y: Array) -> Array:
 
 
 def _weights(nodes: Array) -> Array:
-    """Of each interval between nodes, (n - 1, n), those whose sum with values is the integral."""
+    """Return the quadrature weights of each interval between nodes, (n - 1, n)."""
     n, middle, half = len(nodes), (nodes[0] + nodes[-1]) / 2, (nodes[-1] - nodes[0]) / 2 or 1.0
     x = (nodes - middle) / half
     powers = np.arange(1, n + 1)

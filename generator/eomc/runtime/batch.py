@@ -1,7 +1,6 @@
-"""Many trajectories of one scene at once: what a scene with `batch = true` adds in Python.
+"""Simulation of many instances of a scene, which `batch = true` adds to a module.
 
-Copied next to the compiled extension where the scene asks for it. Instances run in the lanes of
-vector registers and in threads; no result depends on either.
+Instances run in the lanes of vector registers and in threads; no result depends on either.
 """
 
 from __future__ import annotations
@@ -53,19 +52,20 @@ class BatchModel(Instances):
         max_evaluations: int | None = None, events: Mapping[str, Any] | None = None,
         **unknown: Never,
     ) -> BatchRun:  # fmt: skip
-        """Trajectories of many instances; see `simulate` for what is not here.
+        """Simulate many instances; for other arguments see `simulate`.
 
-        q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
+        q0, qd0: (batch, nq), or (nq,) for all instances. params: a dict of numbers or (batch,)
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
         (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step, or
         over each control_period; a dict of all inputs by name, numbers, (batch,), (batch, steps)
         or (1, steps).
-        threads: as many as there are processors where None. An instance that can't go on, or whose
-        start can't be assembled, has its own status and leaves the others alone. Ctrl-C raises
-        Interrupted with the run so far. tol: by steps that fit a tolerance, each instance its own.
-        times: (n,), the rows, within duration; without them those of adaptive steps are start
-        and end. max_evaluations: the number of accelerations after which an instance of adaptive
-        steps begins no further step; its status is "too long" then. events: as in `simulate`.
+        threads: number of threads; by default one for each processor. An instance that cannot
+        continue, or whose start cannot be assembled, has its own status and does not affect the
+        others. Ctrl-C raises Interrupted with the run so far. tol: tolerance of adaptive steps,
+        which differ between instances. times: (n,), times of the rows, within duration; by default
+        adaptive steps have rows at the start and the end. max_evaluations: the number of
+        evaluations of accelerations after which an instance with adaptive steps begins no further
+        step; its status is then "too long". events: as in `simulate`.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate_batch, dict(locals()))
@@ -108,7 +108,7 @@ class BatchModel(Instances):
         return self._finish(run, whole)
 
     def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
-        """A batch as `simulate_batch` returns it, with a warning of those that could not go on."""
+        """Return the run, with a warning if instances failed. Raises Interrupted unless `whole`."""
         if not whole:
             raise Interrupted(run)
         if words := run._no_convergence_message:
@@ -185,7 +185,7 @@ class BatchModel(Instances):
             if not work.run(threads, None):
                 raise KeyboardInterrupt
             return work.status
-        # too few for threads, or for a look at Ctrl-C: straight into C
+        # too few steps for threads and for checks of Ctrl-C: call C directly
         address, real, null = self._c
         status = np.empty(count, "i")
         self._batch_steps[method](

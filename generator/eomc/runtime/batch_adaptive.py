@@ -1,4 +1,4 @@
-"""Many trajectories by steps that fit a tolerance, each its own: `[run] tolerance` with `batch`."""
+"""Simulation of many instances with adaptive step-size control for each of them."""
 
 from __future__ import annotations
 
@@ -26,34 +26,30 @@ from .metadata import SOME
 from .slices import next_chunk
 from .status import FULL, STATUS
 
-_GROUP_SIZE, _SMALL_GROUP_SIZE = (
-    128,
-    16,
-)  # instances that a thread takes at once, of many and of few
+_GROUP_SIZE = 128  # instances that a thread simulates at once
+_SMALL_GROUP_SIZE = 16  # the same, for few instances
 _COUNTERS = ("steps", "evaluations", "rejected", "stiff_steps")
-MAX_EVALUATIONS = 2**31 - 1  # of an instance, that every machine's C counts
-_EVALUATIONS_PER_STATE = (
-    8 * 64
-)  # evaluations for a state between two steps: stages times sweeps, at most
-_FIRST_CHUNK_STEPS = 64  # steps of an instance before the first look at Ctrl-C
+MAX_EVALUATIONS = 2**31 - 1  # of an instance; fits in long on every machine
+_EVALUATIONS_PER_STATE = 8 * 64  # for a state between two steps: stages times iterations, at most
+_FIRST_CHUNK_STEPS = 64  # steps of an instance before the first check of Ctrl-C
 _NAMES = (
     "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
     "_stiff", "_period", "_by", "_max_evaluations",
 )  # fmt: skip
-_EVENT_FIELDS = ("event_instances", "which", "event_rows")  # in what is kept of a run
+_EVENT_FIELDS = ("event_instances", "which", "event_rows")  # of a saved run
 _ENDS = np.array([*STATUS, FULL])
 
 
 @dataclass(eq=False, repr=False)
 class AdaptiveBatchRun(BatchRun):
-    """Trajectories by steps that fit `tol`, or fixed ones in which events are seen.
+    """Trajectories with adaptive steps, or with fixed steps and events.
 
-    Rows are at the same times for all. evaluations, rejected, stiff_steps: of each instance,
-    (batch,). reached: the time to which each
-    has come, (batch,), s; rows behind it are nan, as where an event stops an instance, or where it
-    is "too long": where it took max_evaluations. events: by
-    name where and when each happened, t, q, qd, instance, of all instances one after the other.
-    Everything else as in a BatchRun.
+    In addition to the attributes of a BatchRun, whose rows are at the same times for all instances:
+
+    evaluations, rejected, stiff_steps : (batch,) counts of each instance.
+    reached : (batch,) time that each instance reached, s. Later rows are nan, as after an event
+        that stops an instance, or after max_evaluations (status "too long").
+    events : for each event t, q, qd and instance, by name, for one instance after the other.
     """
 
     tol: float = field(kw_only=True)
@@ -65,11 +61,11 @@ class AdaptiveBatchRun(BatchRun):
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
     _h_most: float = field(kw_only=True)
     _stiff: bool = field(kw_only=True)
-    _period: float = field(default=0.0, kw_only=True)  # over which a row of _u is held, if any is
+    _period: float = field(default=0.0, kw_only=True)  # control period, s; 0 without one
     _by: str = field(default="", kw_only=True)  # the method of fixed steps
     _max_evaluations: int = field(default=0, kw_only=True)  # 0: no limit
     _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
-    _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
+    _stopped: Array | None = field(default=None, kw_only=True)  # 1 + index of the event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
 
     @property
@@ -79,12 +75,12 @@ class AdaptiveBatchRun(BatchRun):
 
     @cached_property
     def status(self) -> Array:
-        """How each ended."""
+        """Status of each instance, (batch,)."""
         return np.asarray(_ENDS[self._codes])
 
     @cached_property
     def events(self) -> dict[str, BatchEventLog]:
-        """Where and when each of the scene's events happened, and in which instances."""
+        """Times, states and instances of each event of the scene, by name."""
         if self._happened is None:
             return ByName("events", (), ())
         nq, (instances, which, rows) = self._model.nq, self._happened
@@ -104,7 +100,7 @@ class AdaptiveBatchRun(BatchRun):
             (inputs, self._period), p, self._stiff, self._by,
         )  # fmt: skip
         work.leave(initial_failures(self))
-        if self._max_evaluations:  # what states between steps take is besides
+        if self._max_evaluations:  # without those of states between steps
             each = _EVALUATIONS_PER_STATE + 2 * model.nq + 1
             work.limit(self._max_evaluations + each * (len(times) + len(self.t)))
         if len(times) and not work.run(None, None):
@@ -113,7 +109,7 @@ class AdaptiveBatchRun(BatchRun):
         return work.rows
 
     def _late(self, times: Array) -> Array:
-        """Which of these times are behind the end of those that took too long, (batch, n)."""
+        """True at times after the end of instances with status "too long", (batch, n)."""
         ended = np.where(self._codes == STATUS.index("too long"), self.reached, np.inf)
         return np.asarray(times > ended[:, None])
 
@@ -125,12 +121,12 @@ class AdaptiveBatchRun(BatchRun):
 
     @property
     def limit(self) -> Array:
-        """The time to which jumps of each accumulate, (batch,), s; nan where none do."""
+        """The time at which events of each instance accumulate, (batch,), s; nan if they do not."""
         return np.full(len(self), np.nan) if self._limit is None else self._limit
 
     @property
     def message(self) -> str:
-        """What happened, in a sentence."""
+        """Result of the run in a sentence."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -181,7 +177,7 @@ def simulate(
     h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
     max_evaluations: int | None,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
+    """Simulate with adaptive steps. Returns the run and False if Ctrl-C interrupted it."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     limit = 0
     if max_evaluations is not None:
@@ -225,7 +221,7 @@ def stepped(
     progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """The same by fixed steps where there are events, which are seen in them."""
+    """Simulate with fixed steps and event location. Returns the same as `simulate`."""
     h = model.h if h is None else as_step_size(h, model.dtype)
     method, t0 = model._method(method), as_number(t0, "t0")
     rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
@@ -243,9 +239,10 @@ def _run(
     progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
     stiff: bool, period: float, span: float, method: str = "", limit: int = 0,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """From checked arguments. period: over which rows of u are held; 0: none is given. span: s.
+    """Simulate from checked arguments.
 
-    method: of fixed steps of the size `most`. limit: of the evaluations of an instance; 0: none.
+    period: control period of the rows of u, s; 0: none. span: duration, s. method: method of fixed
+    steps of size `most`; "": adaptive steps. limit: maximum of evaluations of an instance; 0: none.
     """
     no_signals(model, u, period or None)
     count = count_periods(span, period) if period else None
@@ -286,22 +283,22 @@ def _run(
 
 
 def no_signals(model: Instances, u: Any, control_period: Any) -> None:
-    """A ValueError where signals were to be held over control periods: batches follow them."""
+    """Raise ValueError if a control period is given without inputs u."""
     if u is None and control_period is not None and model.nu:
         raise ValueError("control_period: a batch follows the signals: give u, a row a period")
 
 
 class _Work:
-    """Instances on their way: where each is, its memory, and the rows of all."""
+    """State of a simulation: times, states, workspaces and rows of all instances."""
 
     def __init__(
         self, model: Instances, begin: Array, t0: float, times: Array,
         limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
         stiff: bool, method: str,
     ) -> None:  # fmt: skip
-        """limits: the end, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), a period.
+        """limits: end time, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), period.
 
-        method: of fixed steps.
+        method: method of fixed steps; "": adaptive steps.
         """
         self.model, (self.q, self.qd), self.times = model, begin, times
         (self.held, self.period), self.table, self.limits = inputs, table, limits
@@ -321,18 +318,18 @@ class _Work:
             self.rows[:, :, 0] = begin
 
     def limit(self, evaluations: int) -> None:
-        """So many evaluations of each instance at most, about; 0: no limit."""
+        """Limit the evaluations of each instance approximately; 0: no limit."""
         for memory in self.memory if evaluations else ():
             memory.max_evaluations = evaluations
 
     def leave(self, codes: Array | None) -> None:
-        """Those whose status is not 0 where they are: they make no step."""
+        """Set the status of each instance; those whose status is not 0 make no step."""
         if codes is not None:
             self.status[:] = codes
 
     @property
     def counts(self) -> dict[str, Array]:
-        """Steps and so on of each instance, (batch,), by their names in C."""
+        """Counters of each instance, (batch,), by their names in C."""
         ffi, memory = self.model._ffi, "adaptive_memory"
         kinds = dict.fromkeys(_COUNTERS, "l")
         if self.events:
@@ -350,7 +347,7 @@ class _Work:
         return self.events is not None and self.events.full
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
-        """All of it; False where Ctrl-C came in between."""
+        """Simulate all instances; return False if Ctrl-C interrupted the run."""
         count = len(self.q)
         group = _GROUP_SIZE if count > 8 * _GROUP_SIZE else _SMALL_GROUP_SIZE
         groups = [(at, min(group, count - at)) for at in range(0, count, group)]
@@ -361,7 +358,7 @@ class _Work:
         return whole
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
-        """Instances at, ..., at + count - 1 to the end, one control period after the other."""
+        """Simulate instances at, ..., at + count - 1 to the end, one control period at a time."""
         model, inputs = self.model, self.held
         u, periods, each = model._c[2], 1, 0
         if inputs is not None:
@@ -373,16 +370,16 @@ class _Work:
             if k + 1 < periods:
                 end = period_end(k, self.t0, self.period, model.dtype)
             if self._advance(at, count, end, u + k * model.nu if k else u, each, look):
-                return  # it was stopped
+                return  # interrupted
         self.open[at : at + count] = False
-        self.ended += count  # a figure for the bar; threads may lose one another's
+        self.ended += count  # for the progress bar only: not synchronised between threads
         look()
 
     def _advance(
         self, at: int, count: int, t_end: float, u: Any, u_instance: int,
         look: Callable[[], object],
     ) -> bool:  # fmt: skip
-        """These instances to a time, some steps of each at once; whether there is more to do."""
+        """Simulate these instances to t_end in chunks of steps; return True if interrupted."""
         end = at + count
         model, pointer = self.model, self.model._pointer
         n, many = len(self.times), _FIRST_CHUNK_STEPS

@@ -1,6 +1,6 @@
-"""Batches by fixed steps: rows after so many steps, or at any time.
+"""Simulation of many instances with fixed steps: rows after every few steps or at any times.
 
-A state between two steps is found by a shorter one from the first of them.
+A state between two steps is computed by a shorter step from the first of them.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _INTERRUPTED = STATUS.index("interrupted")
 
 @dataclass(eq=False, repr=False)
 class TimedBatchRun(BatchRun):
-    """Trajectories by fixed steps with rows at the times that were asked for.
+    """Trajectories with fixed steps and rows at requested times.
 
-    steps: those of size h. Rows behind the last good step of an instance are nan. Everything else
-    as in a BatchRun.
+    steps: number of steps of size h. Rows after the last successful step of an instance are nan.
+    All other attributes are those of a BatchRun.
     """
 
     _times: Array = field(kw_only=True)
@@ -62,12 +62,12 @@ class TimedBatchRun(BatchRun):
 
 
 class FixedStepRequest(NamedTuple):
-    """What a run by fixed steps was asked for; times (n,): rows there.
+    """Checked arguments of a run with fixed steps. times (n,): times of the rows, or None.
 
-    codes: the status of each at its start, (batch,), where one can't be assembled.
+    codes: status of each instance at its start, (batch,), if one cannot be assembled.
     """
 
-    step: Any  # of C
+    step: Any  # C function
     h: float
     t0: float
     steps: int
@@ -86,7 +86,7 @@ def simulate(
     table: Array,
     request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
-    """From checked arguments, and whether it is whole, not cut off by Ctrl-C."""
+    """Simulate from checked arguments. Returns the run and False if Ctrl-C interrupted it."""
     run = _by_steps if request.times is None else _at_times
     return run(model, starts, inputs, table, request)
 
@@ -98,7 +98,7 @@ def _by_steps(
     table: Array,
     request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
-    """Rows after every so many steps, and the last."""
+    """Simulate with rows after every `every` steps and at the end."""
     step, h, t0, steps, every, _, method, threads, progress, codes = request
     rows = 1 + steps // every + (steps % every > 0)
     (q, qd), (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), rows)
@@ -130,7 +130,7 @@ def _at_times(
     table: Array,
     request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
-    """Rows at the times that were asked for."""
+    """Simulate with rows at the requested times."""
     h, t0, method, times = request.h, request.t0, request.method, request.times
     assert times is not None
     places = parts(times, t0, h, request.steps)
@@ -151,7 +151,7 @@ def _at_times(
 
 
 def _at_rows(inputs: Array, step_indices: Array, steps: int) -> Array:
-    """What is held from so many steps on; a copy, as the caller's table may change."""
+    """Return a copy of the inputs that apply from each of these steps on."""
     if inputs.shape[1] == 1:
         return inputs.copy()
     return np.ascontiguousarray(inputs[:, np.minimum(step_indices, steps - 1)])
@@ -160,7 +160,7 @@ def _at_rows(inputs: Array, step_indices: Array, steps: int) -> Array:
 def _ends_and_rows(
     model: Instances, count: int, rows: int
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Room for q and qd at the ends, (batch, nq), and in the rows, (batch, rows, nq)."""
+    """Allocate q and qd at the ends, (batch, nq), and of the rows, (batch, rows, nq)."""
     nq, dtype = model.nq, model.dtype
     try:
         if count * rows * nq > LARGE and model._bytes(count * rows) > machine_memory():

@@ -1,4 +1,4 @@
-"""What many instances of a scene start with: their states, parameters and inputs, a row each."""
+"""Checks of the initial states, parameters and inputs of many instances."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ class Instances(Model):
     def __init__(self, extension: Any, **scene: Any) -> None:
         super().__init__(extension, **scene)
         self._whole = (self._ffi.typeof("long[]"), self._ffi.typeof("int[]"))  # done, status
-        # what takes a step of many, by the method
+        # C functions that step many instances, by method
         self._batch_steps = {x: self._stepper(x, "batch_step") for x in (None, *self.methods)}
-        # seconds a step of an instance, by the function that makes it and how many they are, to a
-        # power of two (few fill no register); they only cut work up
+        # measured seconds per step and instance, by function and log2 of the number of instances
+        # (few instances do not fill a register); used only to choose the size of chunks
         self._paces: dict[Any, float] = {}
 
     def step_batch(self, *_: Any, **__: Any) -> Any:
-        """One step of many instances, as `BatchModel` makes it."""
+        """Step many instances; implemented by `BatchModel`."""
         raise NotImplementedError
 
     def _instances(
         self, q0: Any, qd0: Any, params: Any, u: Any,
         steps: int | None, t0: float | None = None,
     ) -> tuple[tuple[Array, Array], Array, Array | None, Array | None]:  # fmt: skip
-        """((q, qd), parameters, inputs), one row an instance; a single one serves for all.
+        """Return ((q, qd), parameters, inputs, status), with one row for each instance.
 
-        q and qd may be what was given: they are to be read only, and not known to be finite. t0:
-        when they start, on the constraints. Behind them the status of each, (batch,), where one
-        can't be assembled there, else None.
+        A single row of parameters or inputs applies to all instances. q and qd may be the caller's
+        arrays, which must not be changed and may contain numbers that are not finite. If t0 is
+        given, the starts are assembled on the constraints at that time; status, (batch,), is None
+        if this succeeds for all.
         """
         start, table = self._start, self._parameter_rows(params)
         if (params is not None and self._follows) or is_by_name(q0, qd0):
@@ -66,7 +67,7 @@ class Instances(Model):
                 f"{one} for a table, {each} for as many instances"
             )
 
-        whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
+        whole = (count, self.nq)  # broadcast_to is slow even without effect
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
         codes = None
         if t0 is not None:
@@ -74,7 +75,7 @@ class Instances(Model):
         return (q, qd), table, inputs, codes
 
     def _rows_of(self, values: ArrayLike, name: str) -> Array:
-        """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
+        """Return states (nq,) or (n, nq); an array (n, nq) is returned without further checks."""
         if isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == self.nq:
             without_mask(values, name)
             if values.dtype in (self.dtype, np.float64) and values.flags.aligned:
@@ -82,7 +83,7 @@ class Instances(Model):
         return self._array(values, name, self.nq)
 
     def _input_rows(self, u: Any, steps: int | None) -> Array | None:
-        """(batch or 1, steps or 1, nu); steps None: inputs are held over the run."""
+        """Return inputs (batch or 1, steps or 1, nu); steps None: constant during the run."""
         if u is None:
             return None
         if not self.nu:

@@ -1,4 +1,4 @@
-"""Many runs at once in one picture: fans of quantiles, lines, ends over parameters."""
+"""Plots of many runs: bands of quantiles, lines, final values over parameters."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ _OF_ONE = {"phase", "section", "other", "labels"}
 
 
 def single_run_hint(runs: Any) -> str:
-    """Where to find what single runs have and batches have not."""
+    """Return a hint how to repeat an instance as a single run."""
     name = runs._model.name
     return f"is of one run: {name}.simulate(runs.q[k, 0], runs.qd[k, 0], params=...)"
 
 
 class Fans:
-    """What draws a batch."""
+    """Plots and animations of a batch."""
 
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
         lines: int | None = None, over: Any = None, wrap: bool | str | Sequence[str] = False,
         ax: Any = None, axes: Any = None, file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
-        """A panel for each name, the coordinates where none is given: fans over time.
+        """Plot bands of quantiles over time, with a panel for each name; default: coordinates.
 
-        quantiles: bands of the instances that have got so far; an odd one is a line. lines: so many
-        instances as lines instead. over: "instance", a parameter or numbers (batch,), over which
-        the last value of each is drawn instead. Else as `Run.plot`.
+        quantiles: limits of the bands of the instances that reached each time; the middle one of an
+        odd number is a line. lines: number of instances to draw as lines instead. over: "instance",
+        a parameter or numbers (batch,), over which the last value of each is drawn instead. Other
+        arguments are those of `Run.plot`.
         """
         for name in _OF_ONE & style.keys():
             raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
@@ -45,11 +46,11 @@ class Fans:
         self, file: File | None = None, *, names: Sequence[str] = (),
         instances: int | Sequence[int] = 6, scene: Any = None, title: str | None = None,
     ) -> Any:  # fmt: skip
-        """The motion of some instances, over each other and each in its colour, as `Run.animate`.
+        """Animate several instances in different colours; see `Run.animate`.
 
-        names: of the curves beside it, the coordinates and the energy where none is given.
-        instances: how many, spread evenly, or which, at most 24. One that has stopped stands where
-        it did. Raises KeyError for unknown names, EomcError for instances that there are not.
+        names: names of the curves; by default the coordinates and the energy. instances: a number
+        of evenly spaced instances, or their indices, at most 24. Instances that ended earlier keep
+        their last position. Raises KeyError for unknown names, EomcError for unknown instances.
         """
         page = require_eomc("report.animation")
         return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
@@ -84,8 +85,8 @@ def fan(
 
 
 def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:
-    """Between quantiles that lie as far from the middle, and the median."""
-    has_values = ~np.isnan(curve.values).all(axis=0)  # rows that some instance has
+    """Fill between pairs of quantiles and draw the median."""
+    has_values = ~np.isnan(curve.values).all(axis=0)  # rows with values of some instance
     t, values = t[has_values], curve.values[:, has_values]
     bands = np.nanquantile(values, quantiles, axis=0)
     colour = style.get("color", "C0")
@@ -102,7 +103,7 @@ def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style:
 
 
 def _over(run: Any, over: Any) -> tuple[str, Array]:
-    """What instances differ by: their number, a parameter, or numbers (batch,)."""
+    """Return label and values (batch,) of the axis: instance, parameter or given numbers."""
     if isinstance(over, str) and over == "instance":
         return "instance", np.arange(len(run), dtype=float)
     if isinstance(over, str):
@@ -119,7 +120,7 @@ def _over(run: Any, over: Any) -> tuple[str, Array]:
 
 
 def _ends(axes: Any, curve: Curve, label: str, x: Array, style: Any) -> None:
-    """The last row that each instance has."""
+    """Draw the last value of each instance over x."""
     good = np.isfinite(curve.values)
     last = curve.values.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
     y = np.where(good.any(axis=1), curve.values[np.arange(len(last)), last], np.nan)

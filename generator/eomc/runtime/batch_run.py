@@ -22,7 +22,9 @@ from .package import own_model, reduced
 from .status import SAID, STATUS
 
 _ENDS = np.array(STATUS)
-_FIELDS = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
+_FIELDS = (
+    "t0 q qd h steps codes every wanted params held method _u".split()
+)  # keys of saved fields, in order
 _OF_ONE = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
     "section": "section(...)",
@@ -34,11 +36,11 @@ class BatchRun(Values, Fans, Columns):
     """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
     status: "ok", "singular", "not finite", "no convergence", "locked" or "interrupted", one an
-    instance. The rows of an instance after its failure are nan: a row is stored where the instance
-    completed the steps to its time. Where a start can't be assembled, "locked", the first row is
-    the start as it was given. steps: how many each has made.
-    By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
-    by bit; a pickled one keeps all of them.
+    instance. The rows of an instance after its failure are nan: a row is stored if the instance
+    completed the steps to its time. If a start cannot be assembled (status "locked"), the first row
+    is the initial state of the caller. steps: number of completed steps of each instance. Columns
+    are available by name: run["theta_dot"], (batch, n). Two runs are equal if scene, settings and
+    rows are equal bit by bit.
     """
 
     _axes = ("instance", "t")
@@ -54,7 +56,7 @@ class BatchRun(Values, Fans, Columns):
     _params: Array  # (batch or 1, np)
     _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
     method: str
-    _u: Array | None = None  # (batch or 1, steps or 1, nu), where rows tell some of it only
+    _u: Array | None = None  # (batch or 1, steps or 1, nu), if _held has only a part of it
 
     @cached_property
     def t(self) -> Array:
@@ -64,31 +66,31 @@ class BatchRun(Values, Fans, Columns):
 
     @cached_property
     def status(self) -> Array:
-        """How each ended; made when it is asked for, since so many words take time."""
+        """Status of each instance, (batch,)."""
         return np.asarray(_ENDS[self._codes])
 
     @property
     def u(self) -> Array:
-        """The inputs as they acted at each row, (batch, n, nu), so within their limits.
+        """Applied inputs at each row, (batch, n, nu), saturated at their limits.
 
-        They are the signals there, or what was held from there on; in the last row what was held
-        over the last step.
+        These are the signals at the row, or the constant inputs of the step that begins there; in
+        the last row those of the last step.
         """
         return self._within(self._requested_inputs)
 
     @property
     def saturated(self) -> Array:
-        """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
+        """True for inputs beyond their limits at each row, (batch, n, nu); False for nan."""
         inputs = self._requested_inputs
         return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
 
     def _within(self, u: Array) -> Array:
-        """Inputs (batch, n, nu) within the limits of their instances."""
+        """Saturate inputs (batch, n, nu) at the limits of their instances."""
         return self._model._within(u, self._params)
 
     @property
     def _requested_inputs(self) -> Array:
-        """The inputs at each row, (batch, n, nu), whatever their limits."""
+        """Inputs at each row before saturation, (batch, n, nu)."""
         if self._held is None:
             return self._evaluate(self._model.signal, (self._model.nu,))
         inputs = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
@@ -96,10 +98,11 @@ class BatchRun(Values, Fans, Columns):
         return inputs
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """(q, qd) of all at any time within the run, t (...,): each (batch, ..., nq).
+        """Return (q, qd), each (batch, ..., nq), at times t (...,) within the run, s.
 
-        By steps of the method from the last row before, or by the same steps again, so as exact as
-        the run; nan where an instance did not come so far. Raises ValueError outside of the run.
+        The steps from the preceding row, or all steps, are repeated, so the states are as accurate
+        as the run; nan after the end of an instance. Raises ValueError for times outside of the
+        run.
         """
         times = within(self, t)
         asked, place = np.unique(times, return_inverse=True)
@@ -108,7 +111,7 @@ class BatchRun(Values, Fans, Columns):
         return q.reshape(shape), qd.reshape(shape)
 
     def _states(self, times: Array) -> Array:
-        """(2, batch, n, nq) at ascending times within the run, from the last row before each."""
+        """Return states (2, batch, n, nq) at ascending times, from the row before each."""
         inputs, every = self._held if self._u is None else self._u, self.every
         whole, rest = parts(times, self.t0, self.h, self._wanted)
         rows = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
@@ -123,14 +126,14 @@ class BatchRun(Values, Fans, Columns):
         return rows
 
     def __getattr__(self, name: str) -> Any:
-        """A column that the scene names; of what one run alone has, where to find it."""
+        """Return a column of the scene; the error for attributes of single runs has a hint."""
         if name in _OF_ONE and name not in self._named():
             raise AttributeError(f"{name} {single_run_hint(self)}.{_OF_ONE[name]}")
         return super().__getattr__(name)
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Where and when each event happened, by its name; of scenes without events none."""
+        """Times and states of events by name; empty for scenes without events."""
         return ByName("events", (), ())
 
     def _to_arrays(self) -> dict[str, Any]:
@@ -148,7 +151,7 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def message(self) -> str:
-        """What happened, in a sentence."""
+        """Result of the run in a sentence."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -158,7 +161,7 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def _no_convergence_message(self) -> str:
-        """How many could not go on, and why the first of them could not; "" where all did."""
+        """Number of failed instances and the reason of the first failure; "" if none failed."""
         if not self._codes.any():
             return ""
         k = int(self._codes.nonzero()[0][0])
@@ -166,11 +169,11 @@ class BatchRun(Values, Fans, Columns):
         return f"{self.message}; {first}: {self._why(k)}"
 
     def _end(self, k: int) -> float:
-        """The time that instance k has come to, s."""
+        """Return the time that instance k reached, s."""
         return float(self.t0 + self.h * self.steps[k])
 
     def _why(self, k: int) -> str:
-        """Why instance k could not go on."""
+        """Return the reason why instance k failed."""
         return SAID[str(_ENDS[self._codes[k]])]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -206,12 +209,12 @@ class BatchRun(Values, Fans, Columns):
 
 
 def initial_failures(run: BatchRun) -> Array:
-    """The status of those that made no step, (batch,), and 0 of the others."""
+    """Return the status of instances that failed at their start, (batch,); 0 for others."""
     return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
 def stepper_for(run: BatchRun, both: Array, inputs: Array | None, first: int = 0) -> BatchStepper:
-    """A run's stepper again, from its states behind so many steps."""
+    """Return the stepper that continues a run from its states `both` after `first` steps."""
     model: Any = run._model
     stepper = BatchStepper(model, run.method, both, run.t0, run.h, inputs, run._params, None, first)
     stepper.work.leave(initial_failures(run))

@@ -1,4 +1,4 @@
-"""What is computed from the rows of a batch: energies, outputs, what constraints have."""
+"""Quantities computed from the rows of a batch: energies, outputs, constraint forces."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .arguments import Array
 from .by_name import ByName
 from .metadata import ModelInfo
 
-_ROWS_PER_CALL = 2**16  # of all instances in one call: they share the processor's cache
+_ROWS_PER_CALL = 2**16  # rows of all instances in a call, which fit in the cache
 
 
 class Values:
-    """A part of `batch_run.BatchRun`: as in a single run, with the instances before all else."""
+    """Mixin of `batch_run.BatchRun`: quantities of a run with the instance as first axis."""
 
     _model: ModelInfo
     q: Array
@@ -28,19 +28,19 @@ class Values:
 
     @property
     def energy(self) -> Array:
-        """K + P, (batch, n), J. What is conserved may be `jacobi` instead."""
+        """Energy K + P, (batch, n), J. The conserved quantity may be `jacobi` instead."""
         return self._evaluate(self._model.energy, ())
 
     @property
     def jacobi(self) -> Array:
-        """qd.dK/dqd - K + P, (batch, n), J: the energy, where K is purely quadratic."""
+        """Jacobi integral qd.dK/dqd - K + P, (batch, n), J; the energy if K is quadratic in qd."""
         return self._evaluate(self._model.jacobi, ())
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
-        """The scene's outputs by their names, (batch, n) each, nan where rows are.
+        """Outputs of the scene by name, (batch, n) each, nan where rows are nan.
 
-        nan also where one needs accelerations and D is singular.
+        Outputs that depend on accelerations are also nan if D is singular.
         """
         names = self._model.outputs
         if not names:
@@ -50,7 +50,7 @@ class Values:
 
     @property
     def constraints(self) -> Mapping[str, Array]:
-        """What each constraint lacks, (batch, n), by name: rounding."""
+        """Residual of each constraint by name, (batch, n)."""
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "constraints", names,
@@ -59,7 +59,7 @@ class Values:
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
-        """The multiplier of each constraint, (batch, n), by name."""
+        """Lagrange multiplier of each constraint by name, (batch, n)."""
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "multipliers", names,
@@ -68,7 +68,7 @@ class Values:
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """What each [[loop]] does to its second body, by name, in the world's axes.
+        """Reaction of each [[loop]] on its second body by name, in world axes.
 
         Force and moment about the joint's point, (batch, n, 6); in the plane (batch, n, 3), force
         (2) and moment.
@@ -80,14 +80,14 @@ class Values:
         )
 
     def _evaluate_with_inputs(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
-        """What a function of the state and the inputs gives at all rows."""
+        """Evaluate a function of the state and the inputs at all rows."""
         return self._evaluate(function, shape, None if self._held is None else {"u": self._held})
 
     def _evaluate(
         self, function: Callable[..., Any], shape: tuple[int, ...],
         inputs: Mapping[str, Array] | None = None,
     ) -> Array:  # fmt: skip
-        """A function at all rows, (batch, n, ...), nan where these are; held: inputs, (..., nu)."""
+        """Evaluate a function at all rows, (batch, n, ...), nan at rows that are nan."""
         count, n = self.q.shape[:2]
         results = np.full((count, n, *shape), np.nan, self._model.dtype)
         t, each = np.broadcast_to(self.t, (count, n)), {"params": self._params[:, None]}
@@ -110,10 +110,10 @@ class Values:
 
 
 def _rows(x: Array) -> Array:
-    """(..., m) as rows, (n, m)."""
+    """Reshape (..., m) to rows (n, m)."""
     return x.reshape(-1, x.shape[-1]) if x.shape[-1] else x.reshape(int(np.prod(x.shape[:-1])), 0)
 
 
 def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:
-    """What `rows` gives, (batch, n, names, ...), by name; they are not asked for where none is."""
+    """Return the values of `rows`, (batch, n, names, ...), by name."""
     return ByName(what, names, np.ascontiguousarray(np.moveaxis(rows(), 2, 0)) if names else ())

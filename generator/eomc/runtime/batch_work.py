@@ -1,4 +1,4 @@
-"""The work of a batch: groups of instances in threads, in slices between looks at Ctrl-C."""
+"""Simulation of groups of instances in threads, in chunks between checks of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -14,19 +14,17 @@ from .arguments import Array, as_count
 from .batch_instances import Instances
 from .slices import next_chunk
 
-_GROUP_SIZE = 128  # instances, in the smallest group: some tiles, the last of them not full
-_MAX_TILES_PER_GROUP = 64  # at most in a group: threads ask for the next one seldom
-_GROUPS_PER_THREAD = 8  # groups of a thread, so that all end together
-MIN_STEPS_FOR_THREADS = 20_000  # steps in all from which threads pay
-_DEFAULT_STEP_SECONDS = (
-    1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
-)
-_POLL_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
-_FIRST_POLL_SECONDS = 0.02  # seconds before the first look
+_GROUP_SIZE = 128  # instances of the smallest group (a tile)
+_MAX_TILES_PER_GROUP = 64  # larger groups save calls
+_GROUPS_PER_THREAD = 8  # so that all threads end at about the same time
+MIN_STEPS_FOR_THREADS = 20_000  # steps of all instances; fewer are faster in one thread
+_DEFAULT_STEP_SECONDS = 1.5e-6  # per instance and coordinate, until a step was timed
+_POLL_SECONDS = 0.05  # between checks of Ctrl-C and updates of the progress bar
+_FIRST_POLL_SECONDS = 0.02  # before the first check
 
 
 class Work:
-    """One batch: groups of instances, each taken through all its steps in pieces."""
+    """A batch with fixed steps: groups of instances, simulated in chunks of steps."""
 
     def __init__(
         self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: Any,
@@ -35,7 +33,7 @@ class Work:
     ) -> None:  # fmt: skip
         self.model, self.step, self.count = model, step, len(q)
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
-        self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # the time of all, or of each
+        self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # start time of all or of each
         self.first = 0  # the step that `run` begins with
         self.held, self.table = inputs, table
         self.starts = starts
@@ -48,7 +46,7 @@ class Work:
         self.moved = 0
 
     def _places(self, at: int) -> tuple[Any, ...]:
-        """The addresses of an instance's q, qd and rows of both."""
+        """Return the pointers to q, qd and their rows of instance `at`."""
         first = self.model.nq * at
         q, qd, q_rows, qd_rows = self.at
         if not self.rows:
@@ -57,12 +55,12 @@ class Work:
         return q + first, qd + first, q_rows + row, qd_rows + row
 
     def leave(self, codes: Array | None) -> None:
-        """Those whose status is not 0 where they are: they make no step."""
+        """Set the status of instances whose code is not 0; these make no step."""
         if codes is not None:
             self.status[codes != 0], self.failed = codes[codes != 0], True
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
-        """All of it; False where Ctrl-C came in between."""
+        """Simulate all instances; return False if Ctrl-C interrupted the run."""
         count = self.count
         threads = as_threads(threads)
         if count * (self.steps - self.first) < MIN_STEPS_FOR_THREADS:
@@ -81,9 +79,9 @@ class Work:
         return run_groups(self, groups, threads, lambda: progress and progress(self.moved, total))
 
     def _begin_all(self, threads: int) -> None:
-        """The starts of all into what is moved, and into the first rows.
+        """Copy the initial states to the current states and the first rows.
 
-        Raises ValueError where one is not finite, before any is moved.
+        Raises ValueError before any step if one is not finite.
         """
         if self.starts is None:
             return
@@ -94,7 +92,7 @@ class Work:
         else:
             for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
                 future.result()
-        self.starts = None  # they have begun
+        self.starts = None  # copied only once
 
     def _begin(self, at: int, count: int) -> None:
         assert self.starts is not None
@@ -107,7 +105,7 @@ class Work:
                 self.model._array(start, name, self.model.nq)  # raises, and says where
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
-        """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
+        """Simulate instances at, ..., at + count - 1 through all steps, in chunks."""
         model = self.model
         pointer, null = model._pointer, model._c[2]
         end = at + count
@@ -123,7 +121,7 @@ class Work:
             u_instance = many * width if len(self.held) > 1 else 0
             u_step = width if many > 1 else 0
         first, kind = self.first, (self.step, count.bit_length())
-        # the first piece is short: another batch may have been quicker
+        # the first chunk is short: the measured speed may be that of an easier batch
         many = max(
             1,
             int(
@@ -142,14 +140,16 @@ class Work:
             duration = perf_counter() - call_start
             self.failed |= failed
             first += many
-            self.moved += many * count  # a figure for the bar; threads may lose one another's
+            self.moved += (
+                many * count
+            )  # for the progress bar only: not synchronised between threads
             model._paces[kind] = max(1e-10, duration / (many * count))
             many = next_chunk(many, duration, _POLL_SECONDS)
             look()
 
 
 class BatchStepper:
-    """Instances on their stepper by whole steps, with shorter ones to times between."""
+    """Steps instances by whole steps, and by shorter ones to times between them."""
 
     def __init__(
         self, model: Instances, method: str | None, both: Any, t0: float, h: float,
@@ -165,7 +165,10 @@ class BatchStepper:
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> bool:  # fmt: skip
-        """States so many steps on and a rest in s, (batch, n, nq) each; False: cut by Ctrl-C."""
+        """Write states after whole steps and a remainder in s; return False if interrupted.
+
+        places: numbers of steps (n,) and remainders (n,). into: q and qd, (batch, n, nq) each.
+        """
         work, (whole, rest) = self.work, places
         last = work.count * int(whole[-1])
         look = progress and (lambda done, _: progress(done, last))
@@ -179,11 +182,11 @@ class BatchStepper:
         return True
 
     def _between(self, rest: float) -> tuple[Array, Array]:
-        """The states so many seconds behind the last step, nan of who can't go on."""
+        """Return the states `rest` seconds after the last step; nan for failed instances."""
         work, (q, qd) = self.work, np.array(self.state)
         good, inputs = work.status == 0, work.held
         if not rest and not work.steps:
-            return q, qd  # as they were given, also where they can't be assembled
+            return q, qd  # initial states, also those that cannot be assembled
         if rest:
             n = work.steps
             u = None if inputs is None else inputs[:, min(n, inputs.shape[1] - 1)]
@@ -194,7 +197,7 @@ class BatchStepper:
 
 
 class Grouped(Protocol):
-    """Work that is done in groups: `_group` does one, and leaves off where `stop` is set."""
+    """Work in groups: `_group` processes one and returns early if `stop` is set."""
 
     stop: bool
 
@@ -204,7 +207,10 @@ class Grouped(Protocol):
 def run_groups(
     work: Grouped, groups: list[tuple[int, int]], threads: int, look: Callable[[], object]
 ) -> bool:
-    """All groups, in threads; look: called now and then. False where Ctrl-C came in between."""
+    """Process all groups in threads; return False if Ctrl-C interrupted them.
+
+    look: called at regular intervals.
+    """
     if threads == 1 or len(groups) == 1:
         try:
             for group in groups:
@@ -232,19 +238,19 @@ def run_groups(
 
 
 def as_threads(threads: Any) -> int:
-    """So many; as many as there are processors where None."""
+    """Return the number of threads; None: one for each processor."""
     if threads is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     return as_count(threads, "threads", 1)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-if hasattr(os, "register_at_fork"):  # a fork has the pools but none of their threads
+if hasattr(os, "register_at_fork"):  # a forked process has no threads of the pools
     os.register_at_fork(after_in_child=_pools.clear)
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads are kept for the next batch: starting them takes longer than a short one."""
+    """Return a pool of threads, which is reused since starting threads is slow."""
     if threads not in _pools:
         _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="eomc")
     return _pools[threads]

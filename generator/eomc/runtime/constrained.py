@@ -1,4 +1,4 @@
-"""Constraints of a compiled scene: what is zero, multipliers, reactions, states moved onto them.
+"""Constraints of a compiled scene: residuals, multipliers, reactions and projection.
 
 D qdd + C qd + g = tau + A^T lambda, with A = dphi/dq of holonomic rows phi(q, t) = 0 and dpsi/dqd
 of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in the scene's order.
@@ -22,7 +22,7 @@ REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/
 
 
 class ConstraintRows(NamedTuple):
-    """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
+    """Names of constraints and of loops with reactions; which of q, then qd a start fixes.
 
     holonomic: how many of the constraints are; they come first. redundant: which of them were left
     out, as the others imply them. modes: of friction that sticks, places of the modes among the
@@ -40,7 +40,7 @@ class ConstraintRows(NamedTuple):
 
 
 class Constrained(Frames):
-    """What scenes with [constraints] or [[loop]] have besides."""
+    """Methods of scenes with [constraints] or [[loop]]."""
 
     _rows = ConstraintRows()
 
@@ -57,13 +57,13 @@ class Constrained(Frames):
     def constraints(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """phi, and psi of rows that are not holonomic, (nc,): zero along every motion."""
+        """Residuals (nc,): phi of holonomic constraints and psi of others."""
         return self._of_rows("constraints", q, qd, t, params)
 
     def constraint_rates(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """A qd + dphi/dt, psi of rows that are not holonomic, (nc,): zero along every motion."""
+        """Rates (nc,): A qd + dphi/dt of holonomic constraints and psi of others."""
         return self._of_rows("constraint_rates", q, qd, t, params)
 
     def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
@@ -71,16 +71,16 @@ class Constrained(Frames):
         return values
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
-        """A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
+        """Jacobian A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
         jacobian: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
         return jacobian
 
     def tangent(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Changes of [q; qd] that keep the constraints, to the first order: (2 nq, k), orthonormal.
+        """Return an orthonormal basis T, (2 nq, k), of changes of [q; qd] within the constraints.
 
-        Of many states, (n, nq), they have a leading n; these have to leave equally many freedoms.
+        For many states, (n, nq), T is (n, 2 nq, k); k must be equal for all of them.
 
         Near an equilibrium with A, B of `linearize`, dz/dt = T^T A T z + T^T B u has no more
         states than the motion, x - x0 = T z. Raises ValueError where the scene was built without
@@ -115,13 +115,13 @@ class Constrained(Frames):
     def multipliers(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """lambda, (nc,), one a constraint as it is written. u None: the scene's signals.
+        """Lagrange multipliers lambda, (nc,). u None: the scene's signals.
 
-        A constraint that says what others say has 0. Raises MotionError as `acceleration` does.
+        Redundant constraints have 0. Raises MotionError as `acceleration` does.
         """
         values = self._multipliers(q, qd, t, u, params)
         if not np.isfinite(values).all():
-            self.acceleration(q, qd, t, u, params)  # which says where, and why
+            self.acceleration(q, qd, t, u, params)  # raises with place and reason
             at, k = np.argwhere(~np.isfinite(np.atleast_2d(values)))[0]
             where = state_text(*(np.atleast_2d(x)[at] for x in (q, qd)))
             words = f"the multiplier of {self._rows.names[k]} is not finite there"
@@ -131,14 +131,14 @@ class Constrained(Frames):
     def _multipliers(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """The same, nan where there are none: of rows of runs."""
+        """Return the multipliers, nan if they do not exist."""
         values: Array = self._evaluate("multipliers", q, qd, t, u, params)
         return values
 
     def reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> dict[str, Array]:
-        """What each [[loop]] does to its second body, by name, along the world's axes.
+        """Return the reaction of each [[loop]] on its second body by name, in world axes.
 
         Force and moment about the joint's point: (6,), in the plane (3,), the force (2) and the
         moment; N and N m. Raises ValueError where the scene has no loops, MotionError as
@@ -152,7 +152,7 @@ class Constrained(Frames):
     def _reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """Of all loops, (loops, 6), in the plane (loops, 3); nan where there are none."""
+        """Return reactions of all loops, (loops, 6), in the plane (loops, 3); nan if undefined."""
         return self._reactions_by(self._multipliers(q, qd, t, u, params), q, qd, t, params)
 
     def _reactions_by(
@@ -166,10 +166,10 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         held: Sequence[str] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) moved onto the constraints, by the least change in the metric of D.
+        """Project (q, qd) onto the constraints by the smallest change in the metric of D.
 
-        held: names of coordinates and velocities that stay as they are; None: nothing is held.
-        Raises MotionError, status "locked", where no such state is found.
+        held: names of coordinates and velocities that are fixed; None: all may change.
+        Raises MotionError, status "locked", if no such state is found.
         """
         if isinstance(held, str):
             held = (held,)
@@ -185,7 +185,7 @@ class Constrained(Frames):
     def _projected(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array]:
-        """The same; held: whether each of q and qd is, or empty."""
+        """Project a state or many. fixed: whether each of q and qd is fixed, or empty."""
         at, moving, codes = self._projected_rows(q, qd, t, params, fixed)
         if codes.any():
             k = int(codes.nonzero()[0][0])
@@ -206,7 +206,7 @@ class Constrained(Frames):
     def _projected_rows(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array, Array]:
-        """(q, qd, status): the same, with the status of each state; one that fails stays."""
+        """Return projected (q, qd) and the status of each state; failed ones are unchanged."""
         at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
         flags = self._ffi.new("int[]", [int(x) for x in fixed]) if fixed else self._c[2]
         acts, n = StateArguments(self, at.shape[:-1], t, None, params), self.nq
@@ -230,10 +230,10 @@ class Constrained(Frames):
     def _assembled_rows(
         self, q: Array, qd: Array, table: Array, t0: float
     ) -> tuple[Array, Array, Array | None]:
-        """The starts of many, (n, nq), and their status, (n,), None where all are assembled.
+        """Assemble many starts (n, nq); return them and their status, (n,), or None if all succeed.
 
-        table: their parameters, a row each or one for all. A start that can't be assembled stays
-        as it is given.
+        table: parameters, a row for each or one for all. A start that cannot be assembled is
+        unchanged.
         """
         if not self._rows.names:
             return q, qd, None
@@ -241,7 +241,7 @@ class Constrained(Frames):
         return q, qd, codes if codes.any() else None
 
     def _record_singular_steps(self, run: Any, method: str, work: Any) -> None:
-        """A run what its steps met, as their work in C has it."""
+        """Store the singular steps of a run, which C counted."""
         if not self._rows.names:
             return
         run.singular_steps = getattr(self._lib, f"{method}_singular")(work)
@@ -249,7 +249,7 @@ class Constrained(Frames):
             run.first_singular = run.t0 + getattr(self._lib, f"{method}_first")(work)
 
     def _assembled(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
-        """A start on the constraints: what the scene holds stays as it is given, the rest moves."""
+        """Return an initial state on the constraints; values that the scene fixes are unchanged."""
         q0, qd0 = self._completed(q0, 0), self._completed(qd0, 1)
         for x, name in ((q0, "q0"), (qd0, "qd0")):
             if x is not None:
@@ -262,7 +262,7 @@ class Constrained(Frames):
     def _project_start(
         self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
     ) -> tuple[Array, Array]:
-        """A start on the rows, and its modes as the velocities say that these leave."""
+        """Project a start onto the constraints and set friction modes from its velocities."""
         fixed = self._rows.held
         if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
             return self._projected(q, qd, t0, params, fixed)
@@ -274,7 +274,7 @@ class Constrained(Frames):
     def _project_starts(
         self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
-        """The same of many states, with the status of each; one that fails stays as given."""
+        """Project many starts; return their status too. Failed ones are unchanged."""
         fixed = self._rows.held
         if not self._rows.modes:
             return self._projected_rows(q, qd, t0, params, fixed)
@@ -286,26 +286,26 @@ class Constrained(Frames):
         return np.where(failed, q, found_q), np.where(failed, qd, found_qd), codes
 
     def _sliding(self, q: ArrayLike) -> Array:
-        """q in the modes in which all slides: no row of a mode holds."""
+        """Return q with all friction modes set to sliding."""
         q = np.array(q, self.dtype)
         q[..., [at for at, _ in self._rows.modes]] = 1
         return q
 
     @property
     def discrete_coordinates(self) -> tuple[str, ...]:
-        """The coordinates that only jumps change: the last ones, without velocities."""
+        """Coordinates that only state jumps change: the last ones, without velocities."""
         return self.coordinates[self.nq - len(self._rows.modes) - self._rows.discrete :]
 
     def _completed(self, x: Any, half: int) -> Any:
-        """q or qd, half 0 or 1, where it was given without what jumps set: as the scene has it."""
-        more = len(self._rows.modes) + self._rows.discrete  # in every call: no slice
+        """Append the scene's values of discrete coordinates to q (half 0) or qd (half 1)."""
+        more = len(self._rows.modes) + self._rows.discrete  # called often
         if not more or np.shape(x)[-1:] != (self.nq - more,):
             return x
         shape = (*np.shape(x)[:-1], more)
         return np.concatenate([x, np.broadcast_to(self._start[half][-more:], shape)], axis=-1)
 
     def _in_modes(self, q: Array, qd: Array) -> tuple[Array, Array]:
-        """A start whose modes are what its velocities say; one that is rounding is 0."""
+        """Set friction modes to the signs of their velocities; tiny velocities become 0."""
         at, of = np.array(self._rows.modes).T
         fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
         qd[..., of] *= np.abs(qd[..., of]) > np.maximum(REST_TOLERANCE * fastest, MIN_SPEED)

@@ -1,4 +1,4 @@
-"""What a run under constraints has besides: what rows lack, multipliers, reactions."""
+"""Residuals, multipliers and reactions of runs with constraints."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ import numpy as np
 from .arguments import Array
 from .by_name import ByName
 
-_MAX_ROUNDINGS = 2.0**26  # roundings of its terms: more is no rounding
-_MIN_SCALE = 1e-9  # of these terms
+_MAX_ROUNDINGS = (
+    2.0**26
+)  # residuals above this number of roundings of their terms violate a constraint
+_MIN_SCALE = 1e-9  # smallest scale of the terms
 
 
 class ConstrainedRun:
-    """A part of `trajectory.Run`. singular_steps: behind so many a constraint depends on others.
+    """Mixin of `trajectory.Run` with the quantities of constraints.
 
-    Its multiplier is large there, or 0, and the forces in the joints are not unique; the motion is
-    right.
-    first_singular: when the first of them ended, s; nan where there is none.
+    singular_steps: number of steps at whose end a constraint depends on others. Its multiplier is
+    large or 0 there, and joint forces are not unique; the motion is correct. first_singular: end
+    time of the first of these steps, s; nan without one.
     """
 
     _model: Any
@@ -35,7 +37,7 @@ class ConstrainedRun:
 
     @property
     def constraints(self) -> Mapping[str, Array]:
-        """What each constraint lacks along the run, (n,), by name: rounding."""
+        """Residual of each constraint along the run by name, (n,)."""
         names = self._model.constraint_names
         return ByName(
             "constraints", names, self._evaluate(self._model.constraints).T if names else ()
@@ -43,14 +45,14 @@ class ConstrainedRun:
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
-        """The multiplier of each constraint along the run, (n,), by name."""
+        """Lagrange multiplier of each constraint along the run by name, (n,)."""
         names = self._model.constraint_names
         values = self._evaluate_with_inputs(self._model._multipliers).T if names else ()
         return ByName("multipliers", names, np.ascontiguousarray(values))
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """What each [[loop]] does to its second body along the run, by name, in the world's axes.
+        """Reaction of each [[loop]] on its second body along the run by name, in world axes.
 
         Force and moment about the joint's point, (n, 6); in the plane (n, 3), force (2) and moment.
         """
@@ -62,9 +64,11 @@ class ConstrainedRun:
 
     @property
     def _broken(self) -> str:
-        """Which row does not hold at the end, in words, or "": one that was left out for others."""
+        """Message on a constraint that is violated at the end, or ""."""
         model, names = self._model, self._model.constraint_names
-        left_out = self.singular_steps or model._rows.redundant  # all else a step ends on
+        left_out = (
+            self.singular_steps or model._rows.redundant
+        )  # steps satisfy all other constraints
         if not left_out or not len(self.q) or self.status != "ok":
             return ""
         q, qd, t, p = self.q[-1], self.qd[-1], float(self.t[-1]), self._params
@@ -83,7 +87,7 @@ class ConstrainedRun:
 
     @property
     def _singular(self) -> str:
-        """What is to be said of rows that don't hold, or depend on others behind steps, or ""."""
+        """Message on violated or dependent constraints, or ""."""
         if broken := self._broken:
             return broken
         if not self.singular_steps:
