@@ -154,7 +154,7 @@ class SteppedRun(AdaptiveRun):
 
     @property
     def description(self) -> str:
-        """What steps they were, in words."""
+        """Size of the steps in words."""
         return f"h = {self.h:g} s"
 
     def __repr__(self) -> str:

@@ -61,18 +61,16 @@ def error_by_tighter_tolerance(
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
     finer, other = again.finer(begin, least)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving_mask(model)
-    moves[model.nq + modes[:, 1]] = (
-        begin[modes[:, 0]] != 0
-    )  # nor are velocities of sticking friction perturbed
+    # nor are the velocities of sticking friction perturbed
+    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0
     x = x[again.beside]
 
     base = again.curve()
 
     def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
         """Return the change of the states that results from a perturbation of the start."""
-        most = (
-            _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
-        )  # of another motion, not its end
+        # of another motion, not its end
+        most = _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
         return again.states(tol, begin + nudge, own._h_most, most) - base
 
     differences = [moved(moves * size * scale * signs)]
@@ -352,9 +350,8 @@ def _filled(rows: Array) -> Array:
     filled: Array = np.nan_to_num(
         rows[np.maximum.accumulate(np.where(is_finite, np.arange(len(rows)), 0))]
     )
-    filled[-1] = filled[-1 - len(rows) // _TAIL_DIVISOR :].max(
-        axis=0
-    )  # the difference may vanish for a moment
+    # the difference may vanish for a moment
+    filled[-1] = filled[-1 - len(rows) // _TAIL_DIVISOR :].max(axis=0)
     return filled
 
 

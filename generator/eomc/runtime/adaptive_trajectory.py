@@ -61,15 +61,12 @@ class AdaptiveTrajectory(Run):
     _by: str = field(default="", init=False)  # the method of fixed steps
     _last: tuple[float, Array] = field(default=(0.0, _NONE[1]), init=False)  # t, [q; qd] reached
     _stiff: bool = field(default=False, init=False)
-    _happened: tuple[Array, Array] = field(
-        default=_NONE, init=False
-    )  # event indices (n,), rows of t, q, qd
+    # event indices (n,), rows of t, q, qd
+    _happened: tuple[Array, Array] = field(default=_NONE, init=False)
     stopped: str = field(default="", init=False)
     limit: float = field(default=float("nan"), init=False)
     _period: float = field(default=0.0, init=False)  # control period, s; 0 without one
-    _held: Array | None = field(
-        default=None, init=False
-    )  # the inputs of each control period, (n, nu)
+    _held: Array | None = field(default=None, init=False)  # inputs of the periods, (n, nu)
     _periods: int = field(default=0, init=False)  # number of control periods in the run
 
     @property

@@ -135,9 +135,8 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
     """Return samples whose power is smooth between jumps of the state or the inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
-        states = _in_steps(run) or _between_jumps(
-            run
-        )  # all its rows: few may look smooth and not be
+        # all rows: a few of them may look smooth although the power is not
+        states = _in_steps(run) or _between_jumps(run)
         return _PowerSamples(model, run._params, *states, u)
     run = with_jumps(run)
     ends, values = _held(run)
@@ -200,9 +199,8 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     long = np.flatnonzero(intervals > _MIN_ROWS * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
     inner = np.arange(1, _MIN_ROWS - 1) / (_MIN_ROWS - 1)
     at = (t[long, None] + intervals[long, None] * inner).ravel()
-    between = 1 + np.flatnonzero(
-        intervals[:-1] * intervals[1:]
-    )  # the end of a step and the beginning of another
+    # the end of a step and the beginning of another
+    between = 1 + np.flatnonzero(intervals[:-1] * intervals[1:])
     rows = np.sort([*range(len(t)), *between])
     places = np.repeat(np.searchsorted(rows, long, side="right"), len(inner))
     q, qd = np.insert(both[:, rows], places, np.array(run(at)), axis=1)

@@ -26,8 +26,8 @@ from .metadata import SOME
 from .slices import next_chunk
 from .status import FULL, STATUS
 
-_GROUP_SIZE = 128  # instances that a thread simulates at once
-_SMALL_GROUP_SIZE = 16  # the same, for few instances
+# instances that a thread simulates at once, of many and of few
+_GROUP_SIZE, _SMALL_GROUP_SIZE = 128, 16
 _COUNTERS = ("steps", "evaluations", "rejected", "stiff_steps")
 MAX_EVALUATIONS = 2**31 - 1  # of an instance; fits in long on every machine
 _EVALUATIONS_PER_STATE = 8 * 64  # for a state between two steps: stages times iterations, at most

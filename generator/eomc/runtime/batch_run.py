@@ -22,9 +22,8 @@ from .package import own_model, reduced
 from .status import SAID, STATUS
 
 _ENDS = np.array(STATUS)
-_FIELDS = (
-    "t0 q qd h steps codes every wanted params held method _u".split()
-)  # keys of saved fields, in order
+# keys of saved fields, in order
+_FIELDS = "t0 q qd h steps codes every wanted params held method _u".split()
 _OF_ONE = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
     "section": "section(...)",
@@ -137,7 +136,7 @@ class BatchRun(Values, Fans, Columns):
         return ByName("events", (), ())
 
     def _to_arrays(self) -> dict[str, Any]:
-        """What a saved run keeps of it besides its columns; None: nothing."""
+        """Return the data of a saved run by name; None: not saved."""
         return dict(zip(_FIELDS, self._all()[1:], strict=True))
 
     @classmethod

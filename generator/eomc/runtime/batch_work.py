@@ -140,9 +140,8 @@ class Work:
             duration = perf_counter() - call_start
             self.failed |= failed
             first += many
-            self.moved += (
-                many * count
-            )  # for the progress bar only: not synchronised between threads
+            # for the progress bar only: not synchronised between threads
+            self.moved += many * count
             model._paces[kind] = max(1e-10, duration / (many * count))
             many = next_chunk(many, duration, _POLL_SECONDS)
             look()

@@ -38,9 +38,8 @@ class Columns:
         }
         names = ("energy", "jacobi") if self._model.has_jacobi else ("energy",)
         for name in names:
-            columns.setdefault(
-                name, partial(getattr, self, name)
-            )  # unless a coordinate has this name
+            # a coordinate may have this name
+            columns.setdefault(name, partial(getattr, self, name))
         return columns
 
     def _named(self) -> dict[str, Callable[[], Array]]:
