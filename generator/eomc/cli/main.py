@@ -22,7 +22,7 @@ from eomc.cli.terminal import fail, say
 COMMANDS = "build check dof export import list new report run show".split()
 
 
-class _Group(terminal.Group):
+class _Group(terminal.CommandGroup):
     """Prints errors that the user can correct without a traceback, with exit status 2."""
 
     def list_commands(self, context: click.Context) -> list[str]:

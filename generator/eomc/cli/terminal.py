@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from eomc.base.errors import Problem
 
 
-class Group(click.Group):
+class CommandGroup(click.Group):
     """A group of commands that handles closed or full output streams and missing encodings."""
 
     def main(self, *args: Any, **how: Any) -> Any:

@@ -22,7 +22,7 @@ UNROLLED_SIZE_LIMIT = 2500
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionTerms:
     """Terms of D qdd + bias = tau as atoms of a tape, with bias = C qd + g.
 
     Attributes
@@ -50,7 +50,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Equations(Motion):
+class Equations(MotionTerms):
     """The equations of motion of a system.
 
     Attributes
@@ -80,7 +80,7 @@ class Equations(Motion):
     rows: Constraints | None
 
 
-def equations(system: System, e: Energies, motion: Motion) -> Equations:
+def equations(system: System, e: Energies, motion: MotionTerms) -> Equations:
     """Complete D, bias, K and P to the equations of motion: C, Jacobi's integral and its time
     derivative.
     """

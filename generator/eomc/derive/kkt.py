@@ -31,7 +31,7 @@ DROPPED_PIVOT = sympy.Float("1e-9")  # replaces a dropped pivot, relative to its
 
 
 @dataclass(frozen=True)
-class Factors:
+class KktFactors:
     """L diag(d) L^T of a KKT matrix: indices below `count` are coordinates, the others constraints.
 
     Attributes
@@ -96,7 +96,7 @@ def factors(
     short: Callable[[Expr], Expr] = lambda atom: atom,
     switched: Container[int] = (),
     last: Container[int] = (),
-) -> Factors:
+) -> KktFactors:
     """Factor the KKT matrix of D and A.
 
     drop: relative pivot tolerance. faded: absolute pivot tolerance of each constraint. short:
@@ -157,7 +157,7 @@ def factors(
                         parts.setdefault((i, j), []).append(part)
         steps.append((k, inverse, column))
     rows = tuple(inverses[n + r] for r in range(len(A)))
-    return Factors(tape, n, tuple(steps), tuple(pivots), rows, switched_pivots, slides)
+    return KktFactors(tape, n, tuple(steps), tuple(pivots), rows, switched_pivots, slides)
 
 
 def _pattern(M: Mapping[tuple[int, int], Expr], size: int) -> Pattern:

@@ -30,7 +30,7 @@ from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
 from eomc.derive.constraints import Constraints, constraints
 from eomc.derive.energies import Energies, energies_on_tape, tangent_symbols
-from eomc.derive.equations import Equations, Motion, equations, raise_no_inertia
+from eomc.derive.equations import Equations, MotionTerms, equations, raise_no_inertia
 from eomc.derive.ldl import Rows, Solution, SolveResult, Vector, count_operations, solve
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import NotDifferentiableError, Stage, Tape
@@ -187,7 +187,7 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, SolveResult
     return result, articulated, composite
 
 
-def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -> SolveResult:
+def _by_articulated_bodies(system: System, recursion: Recursion, rest: MotionTerms) -> SolveResult:
     """Return accelerations by articulated bodies if all inertia belongs to joints with one
     coordinate each.
     """
@@ -264,7 +264,7 @@ def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
     return [(e.kinetic, S.NegativeOne), (e.potential, S.One), (e.linear_potential, S.One)]
 
 
-def _lagrange(system: System, e: Energies) -> Motion:
+def _lagrange(system: System, e: Energies) -> MotionTerms:
     """Derive D, bias, g, tau and b = tau - bias of the energies on a tape."""
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)
@@ -311,7 +311,7 @@ def _lagrange(system: System, e: Energies) -> Motion:
             )
         ]
     notes = _notes(tape, e, p, p_w, at_rest, D)
-    return Motion(D, tuple(bias), tuple(g), tuple(tau), tuple(b), quadratic, notes)
+    return MotionTerms(D, tuple(bias), tuple(g), tuple(tau), tuple(b), quadratic, notes)
 
 
 def _mass_matrix(

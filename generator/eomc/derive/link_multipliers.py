@@ -41,7 +41,7 @@ class UnsuitedError(Exception):
 
 
 @dataclass(frozen=True)
-class Point:
+class PointMass:
     """A position with kinetic energy mass*speed^2/2."""
 
     place: Expr
@@ -50,7 +50,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Group:
+class LinkGroup:
     """Increments of one angle phi = sum direction_i q_i: edd = slopes phidd + beta.
 
     across: rows n with n . slopes = 0.
@@ -119,7 +119,7 @@ class _Links(Vectors):
 
     # --- points ----------------------------------------------------------------------------------
 
-    def _points(self) -> list[Point]:
+    def _points(self) -> list[PointMass]:
         """Return the point masses. Raises UnsuitedError where K is not sum m_k w_k^2/2."""
         e, q = self.e, self.system.q
         speeds, places = [*e.points, *self.system.qd], [*e.points.values(), *q]
@@ -128,7 +128,7 @@ class _Links(Vectors):
             raise UnsuitedError("masses that depend on coordinates")
         momenta = self.tape.gradient(kinetic, speeds, stop)
         return [
-            Point(place, speed, self._mass(momentum, speed))
+            PointMass(place, speed, self._mass(momentum, speed))
             for place, speed, momentum in zip(places, speeds, momenta, strict=True)
             if momentum != 0
         ]
@@ -189,7 +189,7 @@ class _Links(Vectors):
             }
         return {symbol: S.One}
 
-    def _groups(self) -> list[Group]:
+    def _groups(self) -> list[LinkGroup]:
         """Group the increments by the angle that they depend on. There must be one angle per
         coordinate.
         """
@@ -215,13 +215,15 @@ class _Links(Vectors):
             raise UnsuitedError(f"positions depend on {len(members)} angles, of {n} coordinates")
         return [self._group(direction, slopes_by) for direction, slopes_by in members.items()]
 
-    def _group(self, direction: tuple[Expr, ...], slopes_by_member: Mapping[int, Expr]) -> Group:
+    def _group(
+        self, direction: tuple[Expr, ...], slopes_by_member: Mapping[int, Expr]
+    ) -> LinkGroup:
         """Return the group of increments with the angle sum direction_i q_i."""
         tape, system, slopes = self.tape, self.system, tuple(slopes_by_member.values())
         rates = {**system.rates, t: S.One}
         speeds = tape.forward([self.increments[a] for a in slopes_by_member], rates)
         beta = tuple(tape.forward(speeds, rates))
-        return Group(
+        return LinkGroup(
             direction, tuple(slopes_by_member), slopes, beta, self._perpendicular_rows(slopes)
         )
 

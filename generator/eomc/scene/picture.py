@@ -9,7 +9,7 @@ from eomc.scene.formulas import Formula
 
 
 @dataclass(frozen=True)
-class Place:
+class PicturePlace:
     """A point: three formulas in m, or, if `at` is None, the frame of the body or point `name`."""
 
     name: str
@@ -26,7 +26,7 @@ class Shape:
     """
 
     kind: str
-    places: tuple[Place, ...]
+    places: tuple[PicturePlace, ...]
     size: tuple[Formula, ...] = ()
     rotation: tuple[Turn, ...] = ()
 

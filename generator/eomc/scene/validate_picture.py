@@ -8,7 +8,7 @@ from typing import Any
 from eomc.base import names
 from eomc.scene.assembly import WORLD, Turn, Vector
 from eomc.scene.formulas import Formula, suggest
-from eomc.scene.picture import Picture, Place, Shape
+from eomc.scene.picture import Picture, PicturePlace, Shape
 from eomc.scene.schema import Document
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
 from eomc.scene.spelling import Place as Written
@@ -79,18 +79,18 @@ class _Picture:
                 large = tuple(self._size(path, entry) for entry in size)
                 yield Shape(kind, (place,), large, self._rotation(path, rotation))
 
-    def _place(self, path: Path, written: Written) -> Place:
+    def _place(self, path: Path, written: Written) -> PicturePlace:
         if not isinstance(written, str):
-            return Place("", self._vector(path, written))
+            return PicturePlace("", self._vector(path, written))
         if written in self.points:
-            return Place(written, self.points[written])
+            return PicturePlace(written, self.points[written])
         if written == WORLD or written in self.bodies:
-            return Place(written, None)
+            return PicturePlace(written, None)
         known = [*self.points, *self.bodies]
         near = suggest(written, known)
         remedy = near or ': add it to [picture.points], such as tip = ["x", "l*cos(theta)"]'
         self.check.report(path, f"'{written}' is no point{remedy}", text=written)
-        return Place(written, ORIGIN)
+        return PicturePlace(written, ORIGIN)
 
     def _vector(self, path: Path, entries: tuple[float | str, ...]) -> Vector:
         self.dimension = self.dimension or (len(entries) if len(entries) in (2, 3) else 0)
