@@ -16,7 +16,7 @@ from .events import EventLog
 from .initial_checks import infinite_at_start
 from .input_schedule import sample_zero_order_hold
 from .package import is_made_in_python, option
-from .status import SAID, state_text
+from .status import STATUS_MESSAGES, state_text
 from .stepping import Stepping
 from .trajectory import Run
 from .trajectory_data import LEFT_OUT
@@ -44,7 +44,7 @@ def failure_message(model: Stepping, status: str, fixed: str) -> str:
     """Explain the status of a run with adaptive steps, or with fixed steps of method `fixed`."""
     if status == "no convergence" and not fixed:
         return STEP_TOO_SHORT.format(FRICTION_REMEDIES[bool(model._rows.modes)].format(_friction()))
-    return SAID[status]
+    return STATUS_MESSAGES[status]
 
 
 @dataclass(eq=False, repr=False)

@@ -19,7 +19,7 @@ from .columns import Columns
 from .dense import parts, within
 from .model import Model
 from .package import own_model, reduced
-from .status import SAID, STATUS
+from .status import STATUS, STATUS_MESSAGES
 
 _ENDS = np.array(STATUS)
 # keys of saved fields, in order
@@ -173,7 +173,7 @@ class BatchRun(Values, Fans, Columns):
 
     def _why(self, k: int) -> str:
         """Return the reason why instance k failed."""
-        return SAID[str(_ENDS[self._codes[k]])]
+        return STATUS_MESSAGES[str(_ENDS[self._codes[k]])]
 
     def __reduce__(self) -> tuple[Any, ...]:
         kind = type(self)

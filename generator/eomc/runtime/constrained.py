@@ -16,7 +16,7 @@ from .arguments import Array, Parameters, StateArguments, not_one_of
 from .by_name import ByName
 from .frames import Frames
 from .package import option
-from .status import SAID, STATUS, MotionError, state_text
+from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 
 REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
@@ -195,7 +195,7 @@ class Constrained(Frames):
             fixed_names = [
                 n for n in fixed_names if n.removesuffix("_dot") not in self.discrete_coordinates
             ]
-            what = SAID[status] if status != "locked" else (
+            what = STATUS_MESSAGES[status] if status != "locked" else (
                 "no state near that obeys the constraints"
                 + (f" with {', '.join(fixed_names)} as given: leave one free" if fixed_names
                    else "")

@@ -1,4 +1,4 @@
-"""The state of a run at any time within it: a shorter step from the last one before."""
+"""State of a run at any time within it, by a shorter step from the last row before."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from .adaptive_arguments import as_numbers
 from .arguments import Array
 from .trajectory_data import Trajectory
 
-_AT = 1e-12  # of a step: so near a time is that of the step itself
+_STEP_TOLERANCE = 1e-12  # times closer to a step than this fraction of h coincide with it
 
 
 def within(run: Any, t: ArrayLike) -> Array:
-    """Times as an array, or a ValueError where one is outside of the run."""
+    """Return times as an array. Raises ValueError if one is outside of the run."""
     times = as_numbers(t, "t", np.dtype(float))
     begin, end = run.t0, float(run.t[-1])
     slack = 1e-12 * max(abs(begin), abs(end), end - begin)
@@ -40,15 +40,15 @@ def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
 
 
 def parts(times: Array, t0: float, h: float, most: int = 2**60) -> tuple[Array, Array]:
-    """The steps of size h to each of these times (n,), most of them, and what is left of it, s."""
+    """Return the number of whole steps to each time (n,), and the remaining time, s."""
     steps = (times - t0) / h
-    near = _AT + 4 * np.finfo(float).eps * steps  # times are rounded
+    near = _STEP_TOLERANCE + 4 * np.finfo(float).eps * steps  # times are rounded
     whole = np.minimum((steps + near).astype(int), most)
     return whole, np.where(steps - whole < near, 0.0, times - (t0 + whole * h))
 
 
 def _state(run: Trajectory, n: int, rest: float) -> Any:
-    """The state `rest` behind the n-th step."""
+    """Return the state `rest` seconds after step n."""
     model, row = run._model, min(n // run.every, len(run) - 1)
     q, qd, first = run.q[row], run.qd[row], row * run.every
     for k in range(first, n):
@@ -59,7 +59,7 @@ def _state(run: Trajectory, n: int, rest: float) -> Any:
 
 
 def _time_and_inputs(run: Trajectory, n: int) -> tuple[float, Any]:
-    """The time of the n-th step and the inputs over it."""
+    """Return the time of step n and its inputs."""
     t, u = run.t0 + n * run.h, run._u
     if u is None or (not callable(u) and not isinstance(u, str) and u.ndim == 1):
         return t, u

@@ -1,4 +1,4 @@
-"""The derivatives of steps, one or as many as a control period has."""
+"""Derivatives of one step, or of the steps of a control period."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy import empty
 from .arguments import Array, StateArguments
 from .package import option
 from .slices import slices
-from .status import SAID, STATUS, MotionError, state_text
+from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 from .stepping import Stepping
 
-_STEPS = 20_000  # steps times coordinates cubed in one call, some ms at most
+_STEPS = 20_000  # steps times coordinates cubed in one call of C, some ms at most
 
 
 def discretize(
     model: Stepping, method: str, q: Array, qd: Array, h: float, hold: int | None, t: Any, u: Any,
     params: Any,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """(Phi, Gamma) of a step, or where `hold` is given of so many under inputs that are held.
+    """Return (Phi, Gamma) of one step, or of `hold` steps with constant inputs.
 
-    q, qd: (nq,) or (n, nq), checked; t, u, params: of all, or a row for each state. With u None
-    the signals at the start of the period are held. Raises MotionError, ValueError.
+    q, qd: (nq,) or (n, nq), checked; t, u, params: of all, or a row for each state. If u is None
+    the inputs are the signals at the start of the period. Raises MotionError, ValueError.
     """
     if not hasattr(model._lib, f"{method}_derivative"):
         raise ValueError(
@@ -42,22 +42,22 @@ def discretize(
         model._pointer(x) if x.size else null for x in (Phi, Gamma, q, qd)
     )
     for k, many in slices(q.size // n, _STEPS // (steps * n**3) + 1):
-        now, held, p, own = acts.pointers(k)
-        found = derivative(
+        now, inputs, p, own = acts.pointers(k)
+        code = derivative(
             many, to_Phi + 4 * n**2 * k, to_Gamma + 2 * n * model.nu * k if model.nu else null,
-            from_q + n * k, from_qd + n * k, now, h, steps, held, p, own,
+            from_q + n * k, from_qd + n * k, now, h, steps, inputs, p, own,
         )  # fmt: skip
-        if found & 7:
-            done, step = divmod(found >> 3, steps)
+        if code & 7:
+            done, step = divmod(code >> 3, steps)
             _refuse(q.reshape(-1, n)[k + done], qd.reshape(-1, n)[k + done],
-                    acts.time(k + done), step, STATUS[found & 7])  # fmt: skip
+                    acts.time(k + done), step, STATUS[code & 7])  # fmt: skip
     return (Phi if K is None else Phi + Gamma @ K), Gamma
 
 
-def _refuse(q: Array, qd: Array, t: float, step: int, said: str) -> None:
-    """Raise MotionError for a state from which a step has no derivative; step: how many before."""
-    what = "a derivative is not finite there" if said == "not finite" else SAID[said]
+def _refuse(q: Array, qd: Array, t: float, step: int, status: str) -> None:
+    """Raise MotionError for a state without a derivative; step: number of steps before it."""
+    what = "a derivative is not finite there" if status == "not finite" else STATUS_MESSAGES[status]
     later = f" {step} steps later" if step else ""
     raise MotionError(
-        f"no derivative of a step{later} from t = {t:.9g}, {state_text(q, qd)}: {what}", said
+        f"no derivative of a step{later} from t = {t:.9g}, {state_text(q, qd)}: {what}", status
     )

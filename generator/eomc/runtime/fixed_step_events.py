@@ -1,4 +1,4 @@
-"""Runs by fixed steps of a scene with events, which are seen in them."""
+"""Runs by fixed steps with event detection."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .stepping import Stepping
 def simulate(
     model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
-    control_period: float | None, fixed: tuple[Any, ...], look: Callable[..., None],
+    control_period: float | None, fixed: tuple[Any, ...], check_stability: Callable[..., None],
 ) -> SteppedRun:  # fmt: skip
     """Simulate with fixed steps and events.
 
-    fixed: values of the arguments in FIXED_STEP_DEFAULTS. look: warns of an h too large.
+    fixed: values of the arguments in FIXED_STEP_DEFAULTS. check_stability: warns if h is too large.
     """
     h, steps, method, every, out = fixed
     if out is not None:
@@ -41,35 +41,42 @@ def simulate(
     hold = as_hold(u, control_period, h)
     if callable(u) and hold == h:
         warn_called_each_step(model)
-    held = input_schedule(model, u, hold, span, params, duration)
+    schedule = input_schedule(model, u, hold, span, params, duration)
     if span >= SOME * h and (method, h) not in model._warned:
-        look(q, qd, h, t0, held if isinstance(held, np.ndarray) else None, p, method)
+        check_stability(
+            q, qd, h, t0, schedule if isinstance(schedule, np.ndarray) else None, p, method
+        )
     first = 0 if rows is None else int(rows[0] == t0)
-    asked = None if rows is None else rows[first:]
-    found = adaptive.run(model, q, qd, t0, end, 0.0, asked, held, p, h, progress, method=method)
-    assert isinstance(found, SteppedRun)
+    output_times = None if rows is None else rows[first:]
+    run = adaptive.run(
+        model, q, qd, t0, end, 0.0, output_times, schedule, p, h, progress, method=method
+    )
+    assert isinstance(run, SteppedRun)
     if rows is None:
-        return found
-    both = np.concatenate([np.array([[q], [qd]])[:, :first], found._rows], axis=1)
-    stamps, (t, x) = rows[: both.shape[1]], found._last
-    if times is None and t > stamps[-1]:  # where it stopped on the way
+        return run
+    both = np.concatenate([np.array([[q], [qd]])[:, :first], run._rows], axis=1)
+    stamps, (t, x) = rows[: both.shape[1]], run._last
+    if times is None and t > stamps[-1]:  # an event stopped the run between two rows
         both, stamps = np.append(both, x.reshape(2, 1, -1), axis=1), np.append(stamps, t)
-    return found._at(stamps, both)
+    return run._at(stamps, both)
 
 
 def as_rows(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, *, listed: bool = False,
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """The times of the rows, None for all where they need not be listed; the span, s."""
+    """Return the times of the rows, and the span, s.
+
+    The times are None if there is a row after each step, unless `listed`.
+    """
     every = as_count(every, "every", 1)
     if times is not None:
         if steps is not None or every != 1:
             name = "every" if steps is None else "steps"
             raise ValueError(f"{name}: times say where rows are; give one or the other")
-        found = as_times(times, t0, model.dtype, duration)
-        check_time(model.dtype, t0, float(found[-1]) - t0, h)
-        return found, float(found[-1]) - t0
+        rows = as_times(times, t0, model.dtype, duration)
+        check_time(model.dtype, t0, float(rows[-1]) - t0, h)
+        return rows, float(rows[-1]) - t0
     count = model._steps(h, duration, steps)
     span = count * h
     check_time(model.dtype, t0, span, h)
@@ -79,7 +86,7 @@ def as_rows(
 
 
 def as_hold(u: Any, control_period: float | None, h: float) -> float | None:
-    """Over what time inputs are held, whole steps; None where they follow signals."""
+    """Return the time over which inputs are constant, whole steps; None for signals."""
     if u is None and control_period is None:
         return None
     return as_period(control_period, h) * h

@@ -1,8 +1,9 @@
 """Poses, velocities and Jacobians of bodies and points, inverse dynamics, momenta.
 
-All along the world's axes. A twist is the velocity of a frame's origin and the angular velocity,
-six numbers, in the plane three; a wrench a force there and a moment, in the same order. Shapes: q
-(nq,) or (n, nq), results of n states have a leading n; of all frames, nf behind it.
+All components are along the world's axes. A twist is the velocity of a frame's origin and the
+angular velocity, six numbers, in the plane three; a wrench is a force at the origin and a moment,
+in the same order. Shapes: q (nq,) or (n, nq); results for n states have a leading n, and results
+for all frames an axis nf after it.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ class Pose(NamedTuple):
 
 
 class Momentum(NamedTuple):
-    """Of all bodies that move: kg; its centre, m; momentum, kg m/s; that about the centre, kg m2/s.
+    """Momentum of all moving bodies, linear kg m/s, angular kg m2/s; mass, kg; centre of mass, m.
 
-    The velocity of the centre is linear/mass.
+    `angular` is about the centre of mass. The velocity of the centre is linear/mass.
     """
 
     mass: Any
@@ -46,7 +47,7 @@ class Momentum(NamedTuple):
 
 
 class Frames(Functions):
-    """What [run] asks for of bodies: `frames`, `inverse_dynamics`, `momentum`."""
+    """Functions of bodies that [run] enables: `frames`, `inverse_dynamics`, `momentum`."""
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -56,21 +57,21 @@ class Frames(Functions):
     def pose(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Pose:
-        """Where a body or point is and how it is turned; without `frame` all of them.
+        """Return the pose of a body or point, or of all frames if `frame` is None.
 
-        Raises ValueError for a frame that the scene did not ask for.
+        Raises ValueError for a frame that is not among the scene's `frames`.
         """
-        found = self._of("frame_poses", 1, frame, q, None, t, params)
+        poses = self._evaluate_frame("frame_poses", 1, frame, q, None, t, params)
         if self._plane:
-            return Pose(found[..., :2], found[..., 2])
-        return Pose(found[..., :3], found[..., 3:].reshape(*found.shape[:-1], 3, 3))
+            return Pose(poses[..., :2], poses[..., 2])
+        return Pose(poses[..., :3], poses[..., 3:].reshape(*poses.shape[:-1], 3, 3))
 
     def frame_velocity(
         self, q: ArrayLike, qd: ArrayLike, frame: str | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """The twist of a frame, (6,), in the plane (3,): m/s, rad/s."""
-        return self._of("frame_velocities", 1, frame, q, qd, t, params)
+        return self._evaluate_frame("frame_velocities", 1, frame, q, qd, t, params)
 
     def frame_acceleration(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike | None = None, frame: str | None = None,
@@ -81,14 +82,14 @@ class Frames(Functions):
         Without qdd at zero, which leaves dJ/dt qd: J qdd + that is the acceleration.
         """
         each = np.zeros(np.shape(q), self.dtype) if qdd is None else qdd
-        given = self._like(each, "qdd", (self.nq,), q)
-        return self._of("frame_accelerations", 1, frame, q, qd, t, params, given)
+        full = self._like(each, "qdd", (self.nq,), q)
+        return self._evaluate_frame("frame_accelerations", 1, frame, q, qd, t, params, full)
 
     def jacobian(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Array:
         """J of a frame, (6, nq), in the plane (3, nq): J qd is its twist."""
-        return self._of("frame_jacobians", 2, frame, q, None, t, params)
+        return self._evaluate_frame("frame_jacobians", 2, frame, q, None, t, params)
 
     def frame_forces(
         self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
@@ -116,9 +117,11 @@ class Frames(Functions):
         """
         if f_ext is not None and not self.frames:
             raise ValueError(f"f_ext acts at frames: build it with {option('frames')}")
-        given = self._like(qdd, "qdd", (self.nq,), q)
-        found: Array = self._evaluate("inverse_dynamics", q, qd, t, None, params, None, given)
-        return found if f_ext is None else found - self.frame_forces(q, f_ext, t=t, params=params)
+        accelerations = self._like(qdd, "qdd", (self.nq,), q)
+        forces: Array = self._evaluate(
+            "inverse_dynamics", q, qd, t, None, params, None, accelerations
+        )
+        return forces if f_ext is None else forces - self.frame_forces(q, f_ext, t=t, params=params)
 
     def momentum(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
@@ -129,7 +132,7 @@ class Frames(Functions):
         angular = x[..., -1] if self._plane else x[..., 7:]
         return Momentum(x[..., 0], x[..., 1 : 1 + d], x[..., 1 + d : 1 + 2 * d], angular)
 
-    # --- how they are called ---------------------------------------------------------------------
+    # --- calls of C ------------------------------------------------------------------------------
 
     @property
     def _plane(self) -> bool:
@@ -139,36 +142,36 @@ class Frames(Functions):
     def _width(self) -> int:
         return 3 if self._plane else 6
 
-    def _of(
+    def _evaluate_frame(
         self, name: str, axes: int, frame: str | None, q: ArrayLike, qd: ArrayLike | None, t: float,
-        params: Parameters, given: Array | None = None,
+        params: Parameters, extra: Array | None = None,
     ) -> Array:  # fmt: skip
-        """One frame's part of a function of all frames, with so many axes for each."""
+        """Evaluate a function of all frames; return the part of one, which has `axes` axes."""
         if not (frame is None or frame in self.frames):
             raise ValueError(not_one_of("frame", frame, self.frames))
-        found: Array = self._evaluate(name, q, qd, t, None, params, None, given)
+        values: Array = self._evaluate(name, q, qd, t, None, params, None, extra)
         if frame is None:
-            return found
-        one: Array = found.take(self.frames.index(frame), axis=found.ndim - 1 - axes)
+            return values
+        one: Array = values.take(self.frames.index(frame), axis=values.ndim - 1 - axes)
         return one
 
     def _like(self, x: ArrayLike, name: str, shape: tuple[int, ...], q: ArrayLike) -> Array:
-        """An array of numbers, a row for each state; the same for all where there is one."""
+        """Return x as an array with a row for each state; one row is repeated for all."""
         array, rows = self._numbers(x, name), np.shape(q)[:-1]
-        wanted = rows + shape
-        if array.shape not in (wanted, shape):
-            raise ValueError(f"{name}: shape {array.shape}, expected {wanted}")
+        expected = rows + shape
+        if array.shape not in (expected, shape):
+            raise ValueError(f"{name}: shape {array.shape}, expected {expected}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: not all numbers are finite")
-        full = np.broadcast_to(array, wanted).reshape(*rows, -1)
+        full = np.broadcast_to(array, expected).reshape(*rows, -1)
         return np.ascontiguousarray(full)
 
-    def _wrenches(self, given: Mapping[str, ArrayLike] | ArrayLike, q: ArrayLike) -> Array:
+    def _wrenches(self, wrenches: Mapping[str, ArrayLike] | ArrayLike, q: ArrayLike) -> Array:
         shape = (len(self.frames), self._width)
-        if not isinstance(given, Mapping):
-            return self._like(given, "wrenches", shape, q)
+        if not isinstance(wrenches, Mapping):
+            return self._like(wrenches, "wrenches", shape, q)
         each = np.zeros((*np.shape(q)[:-1], *shape), self.dtype)
-        for name, wrench in given.items():
+        for name, wrench in wrenches.items():
             if name not in self.frames:
                 raise ValueError(not_one_of("wrenches", name, self.frames))
             place = self.frames.index(name)

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from .arguments import Arguments, Array, Parameters, StateArguments, as_flag, as_number
 from .package import named_outputs, option
 from .slices import slices
-from .status import SAID, STATUS, MotionError, state_text
+from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 
-_ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
+_ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at most
 
 
 class StateFunction(NamedTuple):
@@ -68,15 +68,15 @@ FUNCTIONS: Mapping[str, StateFunction] = {
 
 
 class Functions(Arguments):
-    """The functions of a state that a compiled scene has."""
+    """The functions of a state of a compiled scene."""
 
     def _evaluate(
         self, name: str, q: ArrayLike, qd: ArrayLike | None, t: Any = 0.0, u: Any = None,
-        params: Any = None, out: Any = None, given: Array | None = None,
+        params: Any = None, out: Any = None, extra: Array | None = None,
     ) -> Any:  # fmt: skip
         """Evaluate a function of FUNCTIONS at one state, or at many in one call of C.
 
-        given: what the function takes in the place of u, one for all states or one each.
+        extra: the argument in place of u of some functions, one for all states or one each.
         """
         address, real, null = self._c
         if (bound := self._functions.get(name)) is None:
@@ -94,8 +94,8 @@ class Functions(Arguments):
                 from_q = address(real, at)
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
-        if rows or given is not None:
-            acts = StateArguments(self, rows, t, u, params, given)
+        if rows or extra is not None:
+            acts = StateArguments(self, rows, t, u, params, extra)
             to, size = address(real, result), result[:1].size if rows else 0
             for k, many in slices(rows[0] if rows else 1, _ROWS // self.nq**2 + 1):
                 if function is None:
@@ -119,8 +119,8 @@ class Functions(Arguments):
         call: a function of (first state, states) that returns 8 (states done) + status.
         """
         for k, many in slices(count, first):
-            if (found := call(k, many)) & 7:
-                return k + (found >> 3), STATUS[found & 7]
+            if (code := call(k, many)) & 7:
+                return k + (code >> 3), STATUS[code & 7]
         return count, "ok"
 
     def D(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
@@ -221,9 +221,9 @@ class Functions(Arguments):
             return np.asarray(self._evaluate("applied", q, qd, t, u, params))
         at, moving = self._state(q, qd)
         rows = at.shape[:-1]
-        held = StateArguments(self, rows, t, u, params).u_rows
-        given = self.signal(at, moving, t, params) if held is None else held
-        return np.asarray(np.broadcast_to(given, (*rows, self.nu)))
+        u_rows = StateArguments(self, rows, t, u, params).u_rows
+        inputs = self.signal(at, moving, t, params) if u_rows is None else u_rows
+        return np.asarray(np.broadcast_to(inputs, (*rows, self.nu)))
 
     def _within(self, u: Array, params: Any) -> Array:
         """Inputs (..., nu) within their limits: what becomes of the largest and least numbers.
@@ -265,28 +265,32 @@ class Functions(Arguments):
         Raises MotionError where D is singular or a result is not finite.
         """
         from_q, from_qd, at, moving = self._read(q, qd)
-        made = result = empty(at.shape, self.dtype)
+        values = result = empty(at.shape, self.dtype)
         if out is not None:
             result = self._out(out, at.shape)
-        to, function, done = self._pointer(made), self._lib.acceleration, 0
+        to, function, done = self._pointer(values), self._lib.acceleration, 0
         if at.ndim == 1:
             time, (inputs, p) = as_number(t, "t"), self._input_pointers(u, params)
-            found = function(1, to, from_q, from_qd, time, inputs, p, self._c[2])
-            said = STATUS[found & 7]
+            code = function(1, to, from_q, from_qd, time, inputs, p, self._c[2])
+            status = STATUS[code & 7]
         else:
             n, acts = self.nq, StateArguments(self, at.shape[:1], t, u, params)
-            done, said = self._all_rows(
+            done, status = self._all_rows(
                 lambda k, many: function(
                     many, to + n * k, from_q + n * k, from_qd + n * k, *acts.pointers(k)
                 ),
                 len(at), _ROWS // n**2 + 1,
             )  # fmt: skip
-        if said != "ok":
+        if status != "ok":
             where = state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
-            what = SAID[said] if said == "singular" else "the acceleration is not finite there"
-            raise MotionError(f"at {where}: {what}", said)
-        if made is not result:
-            result[...] = made
+            what = (
+                STATUS_MESSAGES[status]
+                if status == "singular"
+                else "the acceleration is not finite there"
+            )
+            raise MotionError(f"at {where}: {what}", status)
+        if values is not result:
+            result[...] = values
         return result
 
     @property
@@ -342,17 +346,21 @@ class Functions(Arguments):
         out = [(self._pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
         from_q, from_qd = self._pointer(q), self._pointer(qd)
         acts = StateArguments(self, rows, t, u, params)
-        done, said = self._all_rows(
+        done, status = self._all_rows(
             lambda k, many: self._lib.linearization(
                 many, *(to + k * size for to, size in out), from_q + n * k, from_qd + n * k,
                 *acts.pointers(k),
             ),
             q.size // n, _ROWS // n**3 + 1,
         )  # fmt: skip
-        if said != "ok":
-            what = SAID[said] if said == "singular" else "a derivative is not finite there"
+        if status != "ok":
+            what = (
+                STATUS_MESSAGES[status]
+                if status == "singular"
+                else "a derivative is not finite there"
+            )
             where = state_text(*(x.reshape(-1, n)[done] for x in (q, qd)))
-            raise MotionError(f"at {where}: {what}", said)
+            raise MotionError(f"at {where}: {what}", status)
         A[..., :n, n:] = np.eye(n)
         A[..., n:, :n], A[..., n:, n:], B[..., n:, :] = A_q, A_qd, B_u
         return A, B

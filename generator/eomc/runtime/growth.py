@@ -16,14 +16,14 @@ import numpy as np
 
 from .arguments import Array
 
-_STATES = 16  # of which D is the mean
-_DEFINITE = 1e-12  # of the largest eigenvalue of D: a smaller one counts as this
-_APART = 1e-6  # of the largest: differences at the start that are less apart are one
-_DIRECTIONS = 4  # of differences at the start, which a run each follows
+_STATES = 16  # number of rows of which D is the mean
+_DEFINITE = 1e-12  # smallest eigenvalue of D, relative to the largest
+_MIN_DISTANCE = 1e-6  # relative tolerance of the rank of the initial differences
+_DIRECTIONS = 4  # initial differences, each of which costs a run
 
 
 def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Array:
-    """The mean of D (n, n) over some of the rows q (rows, n) at t (rows,)."""
+    """Return the mean of D (n, n) over some of the rows q (rows, n) at t (rows,)."""
     rows = np.unique(np.linspace(0, len(q) - 1, _STATES).astype(int))
     return np.asarray(
         np.mean([model.D(q[k], t=float(t[k]), params=params) for k in rows], axis=0), float
@@ -51,32 +51,32 @@ def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
 
 
 def growth(root: Array, first: Array, last: Array) -> float:
-    """The largest factor from differences at the start (2n, k) to those at the end, (2n, k).
+    """Return the largest growth factor from initial (2n, k) to final (2n, k) differences.
 
-    Of all their linear combinations; inf where one is not finite.
+    The maximum is over all linear combinations; inf if a value is not finite.
     """
     if not (np.isfinite(first).all() and np.isfinite(last).all()):
         return float("inf")
     most = float(np.max(np.abs(last), initial=0.0)) or 1.0  # its square may overflow
-    inverse = np.linalg.pinv(root @ first, rcond=_APART)
+    inverse = np.linalg.pinv(root @ first, rcond=_MIN_DISTANCE)
     return most * float(np.linalg.norm(root @ (last / most) @ inverse, 2))
 
 
 def other_directions(root: Array, first: Array, moves: Array, rank: int) -> list[Array]:
-    """Differences (2n,) at the start, as large as the first and orthogonal to it in the norm.
+    """Return initial differences (2n,), as large as the first and orthogonal to it in the norm.
 
-    moves (2n,): 1 of what may differ, else 0; rank: the dimension of the space of differences.
+    moves (2n,): 1 for states that may differ, else 0; rank: dimension of the space of differences.
     """
-    random, found = np.random.default_rng(2), [first]
+    random, directions = np.random.default_rng(2), [first]
     size = float(np.linalg.norm(root @ first))
     widths = np.linalg.norm(root, axis=0)
     for _ in range(min(rank, _DIRECTIONS) - 1):
         d = moves * random.standard_normal(len(first)) / widths
-        for other in found:
+        for other in directions:
             w = root @ other
             d = d - other * float(w @ (root @ d)) / max(float(w @ w), np.finfo(float).tiny)
         length = float(np.linalg.norm(root @ d))
         if not 0 < length < np.inf:
             break
-        found.append(moves * d * (size / length))
-    return found[1:]
+        directions.append(moves * d * (size / length))
+    return directions[1:]

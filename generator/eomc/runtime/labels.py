@@ -58,10 +58,10 @@ def mathtext(name: str, rate: bool = False) -> str:
     '$\\mathrm{wrist\\ 1\\ joint}$'
     """
     words = name.replace("_", r"\ ")
-    still = rf"\mathrm{{{words}}}" if of_words(name) else tex(name)
-    if rate and still.startswith(r"\mathrm"):
-        return rf"$\mathrm{{d}}\,{still}/\mathrm{{d}}t$"
-    return f"${tex(name, 1) if rate else still}$"
+    symbol = rf"\mathrm{{{words}}}" if of_words(name) else tex(name)
+    if rate and symbol.startswith(r"\mathrm"):
+        return rf"$\mathrm{{d}}\,{symbol}/\mathrm{{d}}t$"
+    return f"${tex(name, 1) if rate else symbol}$"
 
 
 def rate_unit(unit: str, rate: bool) -> str:

@@ -1,4 +1,4 @@
-"""The facts of a compiled scene that runs need: its methods, its tolerance, its events."""
+"""Metadata of a compiled scene: methods, tolerance, events."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .constrained import ConstraintRows
 from .package import MODEL, option, reduced
 from .statics import Statics
 
-_MANY = 1000  # steps from which a run is not taken in one call
-CHUNK = 16_384  # steps times coordinates before the first look, some ms
-SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
+_MANY = 1000  # runs of fewer steps may take one call of C
+CHUNK = 16_384  # steps times coordinates of the first call of C, some ms
+SOME = 20  # runs of as many steps are checked against the stability limit, once per method and h
 
 
 class ModelInfo(Statics):
-    """A compiled scene with the facts that runs need of it."""
+    """A compiled scene with the metadata that runs need."""
 
-    source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
+    source: Any = None  # path or System that eomc.load built it from; pictures need it
 
     def __init__(
         self, extension: Any, *, h: float, duration: float,
@@ -30,21 +30,21 @@ class ModelInfo(Statics):
         self.events = events
         self._rows = ConstraintRows(*constrained)
         self.methods = tuple(methods)
-        self._facts = dict(methods)
+        self._method_data = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
-        self._warned: set[Any] = set()  # methods with a step size, and u
-        self._room = 0  # for the steps of an adaptive run
-        self._passes_over = False  # whether fixed steps see no events, as `check` needs them
+        self._warned: set[Any] = set()  # (method, step size) and "u", of warnings already issued
+        self._room = 0  # capacity for rows of an adaptive run
+        self._passes_over = False  # True: fixed steps ignore events, as `check` needs
 
     @property
     def orders(self) -> dict[str, int]:
         """The order of each method."""
-        return {name: order for name, (order, *_) in self._facts.items()}
+        return {name: order for name, (order, *_) in self._method_data.items()}
 
     @property
     def stability_limits(self) -> dict[str, tuple[float, float]]:
         """The stability limits of each method: h omega undamped, h lambda decaying."""
-        return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
+        return {name: (turn, decay) for name, (_, _, turn, decay) in self._method_data.items()}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced(MODEL)
@@ -53,7 +53,7 @@ class ModelInfo(Statics):
         return self
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
-        """A method's step and loop in C, steps at once, stages; what is kept and counted."""
+        """Return a method's step and loop in C, steps per call, stages, workspace type, counter."""
         step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
         work = self._ffi.typeof(f"{name}_work *")
         counted = getattr(self._lib, f"{name}_evaluations", None)
@@ -63,11 +63,11 @@ class ModelInfo(Statics):
         return step, run, short, stages, work, counted
 
     def _called(self, method: str, steps: Any, calls: Any) -> Any:
-        """Accelerations of so many steps among events, and calls of a step's function."""
-        return 2 * steps + self._facts[method][1] * calls
+        """Return the number of evaluations: of steps with events, and of further step calls."""
+        return 2 * steps + self._method_data[method][1] * calls
 
     def _method(self, method: str | None) -> str:
-        """The name of a method that the module has."""
+        """Return the name of a method of the module; None: the first. Raises ValueError."""
         if method is None:
             return self.methods[0]
         if not isinstance(method, str) or method not in self.methods:
@@ -78,5 +78,5 @@ class ModelInfo(Statics):
         return method
 
     def _stepper(self, method: str | None, what: str) -> Any:
-        """The C function of a method: its step, run or batch."""
+        """Return the C function of a method: its step, run or batch."""
         return getattr(self._lib, f"{self._method(method)}_{what}")

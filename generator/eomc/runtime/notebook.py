@@ -1,4 +1,4 @@
-"""What a notebook shows of a run: its end, its verdict and a small picture."""
+"""HTML summary of a run for notebooks: final state, verdict and a small picture."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 from .labels import plain
 from .plugins import require_eomc
 
-SHOWN = 12  # coordinates in the table, at most
+SHOWN = 12  # maximum number of coordinates in the table
 
 
 def html(run: Any) -> str:
-    """A run as HTML; free text of the scene is escaped, no request leaves it."""
+    """Return a run as HTML; free text of the scene is escaped, and nothing is loaded from URLs."""
     model = run._model
     words = [f"{run.steps} steps of {run.method}, {run.description}"]
     words += [f"to t = {run.t[-1]:g} s"] if len(run) else []
@@ -67,12 +67,12 @@ def _picture(run: Any) -> str:
         file = io.BytesIO()
         figure.savefig(file, format="png")
     data = base64.b64encode(file.getvalue()).decode("ascii")
-    said = "over time: " + ", ".join(shown) + ("; and the mechanism" if drawn else "")
-    return f'<img alt="{escape(said, quote=True)}" src="data:image/png;base64,{data}">'
+    description = "over time: " + ", ".join(shown) + ("; and the mechanism" if drawn else "")
+    return f'<img alt="{escape(description, quote=True)}" src="data:image/png;base64,{data}">'
 
 
 def _mechanism(run: Any) -> Any:
-    """What draws the mechanism of a run; None where nothing says what it looks like."""
+    """Return the object that draws the mechanism of a run; None without eomc or shapes."""
     try:
         return require_eomc("report.picture").of_run(run)
     except ImportError:

@@ -9,13 +9,13 @@ import numpy as np
 
 from .arguments import Array, as_flag, as_number, not_one_of
 
-_ROUNDING = 16  # of the largest number, where it jumps: from a value, or at rest on it
+_ROUNDING = 16  # ulp of the largest value: distance from a level within which a row lies on it
 
 
 def as_section(
     known: Iterable[str], name: str, value: Any, rising: Any, period: Any
 ) -> tuple[float, bool | None, float | None]:
-    """value, rising and period as `crossings` takes them. Raises KeyError and ValueError."""
+    """Check value, rising and period, and return them. Raises KeyError and ValueError."""
     if name not in known:
         raise KeyError(not_one_of("section", name, tuple(known)))
     value = as_number(value, "value")
@@ -29,9 +29,9 @@ def as_section(
 def crossings(
     columns: Mapping[str, Array], name: str, value: float, rising: bool | None, period: float | None
 ) -> dict[str, Array]:
-    """See `Run.section`: all columns where one of them crosses a value, by cubics through rows.
+    """Interpolate all columns where one crosses a value, by cubics through rows; see `Run.section`.
 
-    Two rows of the same time are those of a jump: cubics end there, and the jump crosses nothing.
+    Two rows of the same time are a jump: no cubic spans it, and a jump is no crossing.
     """
     t, column = columns["t"], columns[name]
     f, n = np.asarray(column, float) - value, len(t)
@@ -63,22 +63,22 @@ def crossings(
 
 
 def _sides(f: Array, near: float, period: float | None) -> Array:
-    """How many values are below each of f (n,), of 0 or of whole periods from there on.
+    """Return the number of levels below each of f (n,); levels are 0, or multiples of the period.
 
-    What is as near as this to a value stays on the side from which it came.
+    A row within `near` of a level stays on the side of the row before.
     """
     turns = np.zeros(len(f)) if period is None else np.round(f / period)
-    found = (f > 0).astype(float) if period is None else np.ceil(f / period)
+    sides = (f > 0).astype(float) if period is None else np.ceil(f / period)
     for k in np.flatnonzero(abs(f - turns * (period or 0.0)) <= near):
-        found[k] = turns[k] + bool(k and found[k - 1] > turns[k])
-    return found
+        sides[k] = turns[k] + bool(k and sides[k - 1] > turns[k])
+    return sides
 
 
 def _weights(nodes: Array, at: Array) -> Array:
-    """Lagrange's of four nodes (n, 4) at n places."""
-    made = np.ones_like(nodes)
+    """Return the Lagrange weights of four nodes (n, 4) at `at` (n,)."""
+    weights = np.ones_like(nodes)
     for i in range(4):
         for j in range(4):
             if i != j:
-                made[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
-    return made
+                weights[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
+    return weights

@@ -1,4 +1,4 @@
-"""The step size against the stability limit of its method, and against the run."""
+"""Check the step size against the stability limit of the method and the duration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .metadata import ModelInfo
 
 
 def beyond_end(h: float, duration: float) -> str | None:
-    """A sentence where one step is longer than the whole run is to be."""
+    """Return a message if one step is longer than the duration, else None."""
     if not 0 < duration < h * (1 - 1e-12):
         return None
     return (
@@ -24,23 +24,23 @@ def beyond_end(h: float, duration: float) -> str | None:
 def advice(
     model: ModelInfo, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
 ) -> str | None:
-    """A sentence where h is beyond the stability limit of the method at a state, else None.
+    """Return a message if h is beyond the stability limit of the method at a state, else None.
 
     The limit is that of the eigenvalues of the linearised motion: largest |imaginary part| and
-    fastest decay against the method's two limits. A mode that is as fast as the differences are
-    short comes from a jump of the forces, and is not counted.
+    fastest decay against the method's two limits. A mode whose speed depends on the width of the
+    finite differences comes from a discontinuity of the forces and does not count.
     """
     undamped, decaying = model.stability_limits[method]
-    found = _modes(model, q, qd, t, u, params, 1.0)
-    if found is None:
+    modes = _fastest_modes(model, q, qd, t, u, params, 1.0)
+    if modes is None:
         return None
-    turning, decay = found
+    turning, decay = modes
     longest = min(
         undamped / turning if turning else math.inf, decaying / decay if decay else math.inf
     )
     if not 0 < longest < abs(h):
         return None
-    if (again := _modes(model, q, qd, t, u, params, 100.0)) is None:
+    if (again := _fastest_modes(model, q, qd, t, u, params, 100.0)) is None:
         return None
     if max(again) < max(turning, decay) / 2:
         return None
@@ -54,15 +54,14 @@ def advice(
     )
 
 
-def _modes(
+def _fastest_modes(
     model: ModelInfo, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
 ) -> tuple[float, float] | None:
-    """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
+    """Return (largest |Im|, fastest decay) of the eigenvalues at a state, 1/s, or None.
 
-    From the module's own derivatives where they are the motion's, else from differences of the
-    acceleration, `wide` times the usual distance apart. Under constraints the slower of two: of
-    all changes, some of which every step takes back, and of those that rows allow, which turn with
-    the motion.
+    The linearisation is the module's own where available, else a finite difference of the
+    acceleration, whose width is `wide` times the usual one. With constraints there are two
+    spectra, of all perturbations and of those tangent to the constraints; the slower one counts.
     """
     n, x = model.nq, np.concatenate([q, qd]).astype(float)
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
@@ -79,33 +78,36 @@ def _modes(
         turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
         return float(turning), float(decay)
 
-    found: list[tuple[float, float]] = []  # where there are none the run itself reports it
+    modes: list[tuple[float, float]] = []  # if empty, the run itself reports the error
     with suppress(ArithmeticError, np.linalg.LinAlgError):
-        found.append(spectrum(np.eye(2 * n)))
+        modes.append(spectrum(np.eye(2 * n)))
     if model.constraint_names:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
-            found.append(spectrum(_allowed(model, x, t, params, near)))
-    return min(found, key=max, default=None)
+            modes.append(spectrum(_tangent_basis(model, x, t, params, near)))
+    return min(modes, key=max, default=None)
 
 
-def _allowed(model: ModelInfo, x: Array, t: float, params: Any, near: Array) -> Array:
-    """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal."""
+def _tangent_basis(model: ModelInfo, x: Array, t: float, params: Any, near: Array) -> Array:
+    """Return an orthonormal basis (2 nq, k) of the tangent space of the constraints.
+
+    Perturbations of x = [q; qd] are in units of `near`.
+    """
     n, holonomic = model.nq, model._rows.holonomic
     least = math.sqrt(float(np.finfo(model.dtype).eps))
     q, qd = (half.astype(model.dtype) for half in (x[:n], x[n:]))
     A = model.constraint_jacobian(q, t=t, params=params).astype(float)
     sizes = np.maximum(np.linalg.norm(A * near[n:], axis=1), 1e-300)  # rows have units of their own
     back = A * near[n:] / sizes[:, None]
-    of_q = _kernel((A * near[:n] / sizes[:, None])[:holonomic], least)
+    of_q = _null_space((A * near[:n] / sizes[:, None])[:holonomic], least)
     places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.dtype)
     rates = model.constraint_rates(places, np.tile(qd, (len(places), 1)), t, params).astype(float)
     follow = -np.linalg.pinv(back, rcond=least) @ ((rates[1:] - rates[0]) / sizes).T
-    of_qd = _kernel(back, least)
+    of_qd = _null_space(back, least)
     whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
     return np.asarray(np.linalg.qr(whole)[0])
 
 
-def _kernel(A: Array, least: float) -> Array:
-    """What A makes zero, (n, k), orthonormal: to `least` of its largest singular value."""
+def _null_space(A: Array, least: float) -> Array:
+    """Return an orthonormal basis (n, k) of the null space; `least`: relative tolerance."""
     _, sizes, rows = np.linalg.svd(A)
     return np.asarray(rows[np.sum(sizes > least * np.max(sizes, initial=0)) :].T)

@@ -1,4 +1,4 @@
-"""How runs and calls end: their statuses in words, and the errors that tell them."""
+"""Statuses of runs and calls, their messages, and the exceptions that report them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from .arguments import Array
 from .package import reduced
 
-PART = 0.4  # of the machine's memory: where a run ends, what was kept is copied once
-FULL = "out of memory"  # the status of a run that ends since no more can be kept
+PART = 0.4  # fraction of the memory that a run may fill; its rows are copied once at the end
+FULL = "out of memory"  # status of a run that ends because its rows fill the memory
 REMEDY = (
     f"rows and events fill {100 * PART:.0f} % of this machine's memory: keep fewer rows with "
     "times=, or, where events never cease, end sooner with duration="
@@ -19,7 +19,7 @@ STATUS = (
     "ok", "singular", "not finite", "no convergence", "accumulated", "locked", "interrupted",
     "too long",
 )  # fmt: skip
-SAID = {
+STATUS_MESSAGES = {
     "singular": "D is not positive definite there, so no acceleration exists",
     "not finite": "the state would no longer be finite: the step may be too long, "
     "or the motion runs into a singularity",
@@ -35,7 +35,7 @@ SAID = {
 
 
 class MotionError(ArithmeticError):
-    """There is no acceleration or step at a state; `status` says why, as that of a run."""
+    """No acceleration or step exists at a state; `status` is the reason, as of a run."""
 
     def __init__(self, message: str, status: str) -> None:
         super().__init__(message)
@@ -45,12 +45,12 @@ class MotionError(ArithmeticError):
         return reduced("status.MotionError", str(self), self.status)
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the message alone, without the calls inside the package."""
+        """Return the text that IPython prints: the message without the traceback."""
         return [f"{type(self).__name__}: {self}"]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a simulation; `run` holds what was done until then."""
+    """Ctrl-C during a simulation; `run` is the run up to there."""
 
     def __init__(self, run: Any) -> None:
         super().__init__(run.message)
@@ -60,12 +60,12 @@ class Interrupted(KeyboardInterrupt):
         return reduced("status.Interrupted", self.run)
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the message alone, without the calls inside the package."""
+        """Return the text that IPython prints: the message without the traceback."""
         return [f"{type(self).__name__}: {self}"]
 
 
 def state_text(q: Array, qd: Array) -> str:
-    """A state in a message."""
+    """Format a state for a message."""
 
     def text(x: Array) -> str:
         return np.array2string(x + 0.0, precision=6, threshold=12)  # no -0

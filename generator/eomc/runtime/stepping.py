@@ -1,4 +1,4 @@
-"""Steps of a compiled scene: one by each method, and how many fixed ones a run has."""
+"""Single steps of a compiled scene, and the number of fixed steps of a run."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from .arguments import (
 from .metadata import ModelInfo
 from .package import warn
 from .stability import beyond_end
-from .status import SAID, STATUS, MotionError, state_text
+from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 
 _MOST = 2**60  # steps, so that C can return four times as many
 
 
 class Stepping(ModelInfo):
-    """A compiled scene that makes steps."""
+    """A compiled scene with step functions."""
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Parameters = None, method: str | None = None,
         out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
+        """Return (q, qd) after one step of size h; u, (nu,) or a dict, is constant over the step.
 
-        u None: the scene's signals, followed through the step. Events are not seen. Raises
-        MotionError where the step can't be made; `out` is untouched then.
+        u None: the scene's signals, as functions of time in the step. Events are not detected.
+        Raises MotionError if the step fails; `out` is unchanged then.
         """
         from_q, from_qd, at, moving = self._read(q, qd, many=False)
         h = self.h if h is None else as_step_size(h, self.dtype)
@@ -50,16 +50,17 @@ class Stepping(ModelInfo):
             ends = self._pair(out, at.shape)
             to_q, to_qd = address(real, ends[0]), address(real, ends[1])
         step = self._loops[self._method(method)][0]
-        found = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
-        if found:
-            said = STATUS[found]
+        code = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
+        if code:
+            status = STATUS[code]
             raise MotionError(
-                f"no step from t = {t:.9g}, {state_text(at, moving)}: {SAID[said]}", said
+                f"no step from t = {t:.9g}, {state_text(at, moving)}: {STATUS_MESSAGES[status]}",
+                status,
             )
         return ends
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
-        """So many fixed steps."""
+        """Return the number of fixed steps from `steps` or `duration`."""
         steps = None if steps is None else as_count(steps, "steps", 0)
         if steps is not None:
             if duration is not None:
@@ -85,11 +86,11 @@ class Stepping(ModelInfo):
         self, t0: float, h: float, steps: int, u: Any, control_period: float | None,
         duration: float | None, times: Array | None, axis: int = 0,
     ) -> tuple[Any, int]:  # fmt: skip
-        """Inputs, and over how many steps a row of them is held.
+        """Return the inputs, and the number of steps for which a row of them is constant.
 
-        A table for the duration is cut where the last of the times is earlier. Raises ValueError
-        where times t0 + k h are not apart: in single precision at the start alone, as rows have
-        times in double precision.
+        A table for the duration is cut if the last output time is earlier. Raises ValueError if
+        times t0 + k h are not distinct: in single precision at the start only, as the times of
+        rows are in double precision.
         """
         if steps:
             check_time(self.dtype, t0, h, h)
@@ -101,5 +102,5 @@ class Stepping(ModelInfo):
         return u, hold
 
     def _trajectory(self, *_: Any) -> Any:
-        """A run by fixed steps from checked arguments, as `Model` makes it."""
+        """Run by fixed steps from checked arguments; `Model` implements it."""
         raise NotImplementedError

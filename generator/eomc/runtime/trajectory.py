@@ -1,4 +1,4 @@
-"""What users have of a run: its state at any time, its error, its balance, its pictures."""
+"""The public interface of a run: states at any time, error, balance and pictures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .package import warn
 from .plot import plot
 from .plugins import require_eomc
 from .section import as_section, crossings
-from .status import SAID, Interrupted, state_text
+from .status import STATUS_MESSAGES, Interrupted, state_text
 from .trajectory_data import Trajectory
 
 NOISE = (
@@ -36,39 +36,41 @@ class Run(Trajectory):
     """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
 
     status: "ok", "singular", "not finite", "no convergence", under constraints "locked", or
-    "interrupted"; a run that is not ok
-    ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
-    when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
-    many. evaluations: of accelerations. error: an Estimate, where it was asked for.
+    "interrupted". A run with another status than "ok" ends with its last valid state; `message`
+    gives the time and the reason. energy (n,): K + P, computed at the first access. steps: number
+    of steps of size h by `method`, with a row after `every` so many. evaluations: number of
+    evaluations of accelerations. error: an Estimate, if it was requested.
 
-    Runs are equal where their scene, settings and rows are, bit by bit. A pickled run keeps all of
-    that, its parameters and its inputs, but not a u that is a function: estimate() is refused then.
-    Where it is read again, it belongs to the build that pickled it; where that is gone, to the
-    present one, with a warning, if the names of its columns are the same there.
+    Runs are equal if their scenes, settings and rows are equal, bit by bit. A pickled run contains
+    all of these, its parameters and its inputs, except a u that is a function; then estimate()
+    raises ValueError. An unpickled run belongs to the build that pickled it. If that build no
+    longer exists, it belongs to the present build, with a warning, if the columns have the same
+    names.
     """
 
     error: Estimate | None = field(default=None, init=False)
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """(q, qd) at any time within the run, t (...,): each (..., nq).
+        """Return (q, qd) at times t (...,) within the run, each (..., nq).
 
-        By a shorter step of the method from the last one before, so of its order. Raises ValueError
-        outside of the run, or where u was a function and rows don't tell what it gave.
+        A shorter step of the method from the last row before yields the state, with the order of
+        the method. Raises ValueError outside of the run, or if u was a function whose values are
+        not stored at each step.
         """
         return states(self, t)
 
-    stopped = ""  # by which event
+    stopped = ""  # name of the event that ended the run
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Where and when each event happened, by its name; of scenes without events none."""
+        """Occurrences of each event by its name; empty for scenes without events."""
         return ByName("events", (), ())
 
     def balance(self) -> Balance | None:
-        """What inputs and forces put in and what was lost, J, and the error that this leaves.
+        """Return the energy balance: work of inputs and forces, losses and the error left, J.
 
-        What jumps of events put in or took stands apart. None where rows don't tell the inputs, of
-        a function with `every`, or where an energy or a force is not finite.
+        The work of jumps is a separate term. None if the inputs at the rows are unknown, as those
+        of a function with `every`, or if an energy or a force is not finite.
         """
         return balance(self)
 
@@ -112,7 +114,7 @@ class Run(Trajectory):
 
     @property
     def _drawn(self) -> Run:
-        """Itself, with rows near enough for curves."""
+        """The run with rows close enough for curves."""
         return self
 
     def _repr_html_(self) -> str:
@@ -176,12 +178,12 @@ class Run(Trajectory):
         return self.error
 
     def _repeated(self) -> None:
-        """Raise ValueError where the run can't be done again."""
+        """Raise ValueError if the run cannot be repeated."""
         if isinstance(self._u, str):
             raise ValueError(f"estimate: {self._u}")
         if callable(self._u) and self._applied is not None and len(self) and self.t[0] == self.t0:
-            now = evaluate_law(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
-            if not np.array_equal(now, self._applied[0]):
+            u_at_start = evaluate_law(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
+            if not np.array_equal(u_at_start, self._applied[0]):
                 raise ValueError(NOISE)
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
@@ -189,15 +191,16 @@ class Run(Trajectory):
 
     @property
     def message(self) -> str:
-        """What happened, in a sentence."""
+        """The outcome of the run, in a sentence."""
         if self.status == "ok":
             return f"{self.steps} steps of {self.h:g} s"
+        reason = infinite_at_start(self) or STATUS_MESSAGES[self.status]
         return (
             f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
-            f"{state_text(self.q[-1], self.qd[-1])}: {infinite_at_start(self) or SAID[self.status]}"
+            f"{state_text(self.q[-1], self.qd[-1])}: {reason}"
         )
 
     @property
     def _remark(self) -> str:
-        """What is to be said of a run that is whole, or ""."""
+        """Warning for a run with status "ok", or ""."""
         return self._singular
