@@ -53,7 +53,7 @@ def robot_data(name: str) -> Path:
 def system(made: Scene, title: str = "") -> Any:
     """What pictures ask of a System."""
     return SimpleNamespace(
-        scene=made, pictured=None, name=made.name, title=title or made.title, outputs=(),
+        scene=made, picture_scene=None, name=made.name, title=title or made.title, outputs=(),
         coordinates=made.coordinates, parameters=(*made.parameters,), inputs=(), q=made.coordinates,
         discrete=(),
     )  # fmt: skip

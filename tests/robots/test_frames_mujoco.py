@@ -66,7 +66,7 @@ class Ours:
     def frames(self, what: str, *given: Array) -> Array:
         made = self.motions
         found = self.values(made.tape, getattr(made, what), *given)
-        return found if what == "forces" else found.reshape(len(self.system.asked), -1)
+        return found if what == "forces" else found.reshape(len(self.system.output_frames), -1)
 
 
 def near(found: Array, expected: Array, what: str, of: float = 0.0) -> None:
@@ -82,7 +82,7 @@ def test_robots(name: str, free: bool, tmp_path: Path) -> None:
     robot = prepared_for_scene(both.robot)
     ours = Ours(both.text())
     names = [b.name for b in sorted(robot.bodies, key=lambda b: b.point)]
-    assert [f.name for f in ours.system.asked] == names
+    assert [f.name for f in ours.system.output_frames] == names
     inside = {b.name: k for k, b in enumerate(robot.bodies)}
     # the same bodies in the order of the file's
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, both.robot.bodies[inside[x]].name)

@@ -59,7 +59,7 @@ def wrenches(system: System) -> list[Symbol]:
     They end in an underscore, so no name of a scene coincides with them.
     """
     entries = "fx fy mz" if system.plane else "fx fy fz mx my mz"
-    count = len(system.asked)
+    count = len(system.output_frames)
     return [symbol(f"{entry}{k}_") for k in range(count) for entry in entries.split()]
 
 
@@ -67,7 +67,7 @@ def motions(system: System) -> Motions:
     """Derive the kinematics of the frames that the system requests."""
     entries = wrenches(system)
     tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(entries, Stage.TIME))
-    kinematics = Sweep(tape, system, system.asked)
+    kinematics = Sweep(tape, system, system.output_frames)
     frames = [kinematics.frame(f) for f in kinematics.frames]
     jacobians: list[Expr] = []
     for frame in frames:

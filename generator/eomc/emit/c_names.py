@@ -78,7 +78,7 @@ class Target:
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
         outputs += [f"EVENT_{e.name}" for e in self.system.events]
         outputs += [f"CONSTRAINT_{c.name}" for c in self.system.constraints]
-        names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.asked)]
+        names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.output_frames)]
         preferred = [f"{self.PREFIX}_{name}" for name in names]
         return dict(zip(names, _unique(preferred, reserved), strict=True))
 

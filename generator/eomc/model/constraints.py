@@ -1,4 +1,4 @@
-"""Rows of constraints: those of positions, those linear in the rates, and what no row can be."""
+"""Classification and checks of constraints: holonomic, linear in the velocities, or invalid."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from eomc.model.loops import Closed
 from eomc.model.numeric import compiled
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
-NEAR = 1e-9  # m, or rad: a row that is off by less is zero
-ROUNDING = 1e-13  # of a loop's size, or of 1 where its row is of axes: it has not moved
-BENDING = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
-PLACES = 4  # at which rows of loops are compared
-LONGEST = 80  # characters of a position that a message writes out
+NEAR = 1e-9  # m, or rad: smaller residuals count as zero
+ROUNDING = 1e-13  # relative to the loop's length (1 for axis equations): smaller changes
+NONSMOOTH = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
+SAMPLES = 4  # at which loop equations are compared
+MAX_FORMULA_LENGTH = 80  # characters of a formula in a message
 
 NOTHING_MOVES = (
     "has no coordinates or rates, so that no motion can make it zero: write what is to be zero, "
@@ -36,11 +36,11 @@ _DRIFTS = "is the rate of a position, and where rates alone are held, the positi
 
 @dataclass(frozen=True)
 class Degree:
-    """How an expression depends on rates.
+    """Degree of an expression in the velocities.
 
-    degree: 0, 1, or 2 for all that is not linear. moves: what else it varies with: 0 nothing, 1 the
-    time, 2 coordinates. exact: of degree 1, sums of rates and dot(...) with constant factors, and
-    functions of time: the rate of a position.
+    degree: 0, 1, or 2 for any nonlinear expression. moves: other dependence: 0 constant, 1 on
+    time, 2 on coordinates. exact: whether it is the time derivative of a position: a sum of
+    velocities and dot(...) with constant factors and functions of time.
     """
 
     degree: int = 0
@@ -53,7 +53,7 @@ _NONLINEAR = Degree(2, 2)
 
 
 class VelocityDegree:
-    """How expressions depend on rates, definitions followed."""
+    """Degrees of expressions in the velocities, with definitions substituted."""
 
     def __init__(
         self, coordinates: Iterable[Coordinate], definitions: Iterable[tuple[Symbol, Expr]]
@@ -65,14 +65,14 @@ class VelocityDegree:
             self.known[name] = self.of(e)
 
     def of(self, e: Expr) -> Degree:
-        """That of an expression over coordinates, rates, t, parameters and the definitions."""
-        found = self.known.get(e)
-        if found is None:
-            found = self._made(e, [self.of(part) for part in e.args])
-            self.known[e] = found
-        return found
+        """Return the degree of an expression over symbols of the system."""
+        degree = self.known.get(e)
+        if degree is None:
+            degree = self._combine(e, [self.of(part) for part in e.args])
+            self.known[e] = degree
+        return degree
 
-    def _made(self, e: Expr, parts: Sequence[Degree]) -> Degree:
+    def _combine(self, e: Expr, parts: Sequence[Degree]) -> Degree:
         degree = max((p.degree for p in parts), default=0)
         moves = max((p.moves for p in parts), default=0)
         if isinstance(e, dot):
@@ -86,8 +86,8 @@ class VelocityDegree:
         if isinstance(e, sympy.Mul):
             degree = sum(p.degree for p in parts)
             factors = [p for p in parts if p.degree == 0]
-            still = all(p.moves == 0 for p in factors)
-            return Degree(min(degree, 2), moves, degree == 1 and still and self._exact(parts))
+            constant = all(p.moves == 0 for p in factors)
+            return Degree(min(degree, 2), moves, degree == 1 and constant and self._exact(parts))
         return _NONLINEAR
 
     @staticmethod
@@ -96,9 +96,10 @@ class VelocityDegree:
 
 
 class Rows:
-    """What rows are, and what is wrong with them, over a system's coordinates and definitions.
+    """Classification and checks of constraints over a system's coordinates and definitions.
 
-    values: of the parameters. fault, doubt: called with a row and what is wrong with it.
+    values: of the parameters. fault, doubt: called with a constraint and a message, an error or a
+    warning.
     """
 
     def __init__(
@@ -117,76 +118,81 @@ class Rows:
         self.depends = VelocityDegree(coordinates, definitions)
 
     def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
-        """The rows, holonomic ones first, each told what it is."""
+        """Return the constraints with `holonomic` set, holonomic ones first."""
         holonomic, others = [], []
         for row in rows:
-            found = self.depends.of(row.formula)
-            if found.moves < 2:
+            degree = self.depends.of(row.formula)
+            if degree.moves < 2:
                 self.fault(row, NOTHING_MOVES)
-            elif found.degree > 1:
+            elif degree.degree > 1:
                 self.fault(row, NOT_LINEAR)
-            elif found.degree == 0:
+            elif degree.degree == 0:
                 holonomic.append(row)
             else:
-                if found.exact:
+                if degree.exact:
                     self.doubt(row, _DRIFTS + _instead(row.formula, self.coordinates))
                 others.append(replace(row, holonomic=False))
         return (*holonomic, *others)
 
     def settled(self, closed: Closed) -> Closed:
-        """A loop without the rows that no coordinate changes; each is reported."""
+        """Return a loop without its constant equations, each of which is reported."""
         fixed = [self._fixed(row.formula) for row in closed.rows]
         if closed.points and None in fixed:
             hardly = self._hardly_moved(closed)
             fixed = [b if a is None else a for a, b in zip(fixed, hardly, strict=True)]
-        kept, still = loops.settled(closed, fixed)
-        far = [(row, value) for row, value in still if not abs(value) <= NEAR]
+        reduced, constant = loops.settled(closed, fixed)
+        far = [(row, value) for row, value in constant if not abs(value) <= NEAR]
         for row, value in far:
             why = f"can't close: its row {row.name} is {value:.6g} wherever its bodies move"
             self.fault(row, f"{why}: check its points and axes")
-        if not kept.rows and not far:
-            self.fault(still[0][0], "its bodies do not move against each other: leave it out")
-        elif still and not far:
-            row, names = still[0][0], ", ".join(row.name for row, _ in still)
-            what = "a row that is" if len(still) == 1 else "rows that are"
+        if not reduced.rows and not far:
+            self.fault(constant[0][0], "its bodies do not move against each other: leave it out")
+        elif constant and not far:
+            row, names = constant[0][0], ", ".join(row.name for row, _ in constant)
+            what = "a row that is" if len(constant) == 1 else "rows that are"
             why = f"has {what} zero wherever its bodies move, left out: {names}"
             self.doubt(row, f"{why}; what they would carry is not determined, and counts as zero")
-        return kept
+        return reduced
 
     def _fixed(self, e: Expr) -> float | None:
-        """The value of what no coordinate changes; None of anything else."""
+        """Return the value of an expression that depends on no coordinate; None otherwise."""
         if self.depends.of(e).moves == 2:
             return None
         known: dict[Expr, Expr] = {name: sympy.Float(v) for name, v in self.values.items()}
         for name, formula in needed(self.definitions, [e]):
             known[name] = formula.xreplace(known)
         value = e.xreplace(known).evalf()
-        return float(value) if value.is_number else math.inf  # of t: no such loop stays closed
+        return (
+            float(value) if value.is_number else math.inf
+        )  # a function of t: the loop does not stay closed
 
     def _hardly_moved(self, closed: Closed) -> list[float | None]:
-        """The values of a loop's rows that change by rounding alone, None of others.
+        """Return the values of a loop's equations that change by rounding only, None for others.
 
-        Where axes and points are given in doubles, those of a plane mechanism that is tilted in
-        space are parallel to sixteen digits, and rows across the plane change by what is left, at
-        other parameters too.
+        Axes of a planar mechanism that is tilted in space are parallel to sixteen digits only, if
+        they are given in doubles. The equations across the plane then change by rounding, also at
+        other parameters.
         """
-        wanted = [*(x for point in closed.points for x in point), *(r.formula for r in closed.rows)]
-        known = needed(self.definitions, wanted)
-        if any(e.has(*BENDING) for e in (*wanted, *(formula for _, formula in known))):
-            return [None] * len(closed.rows)  # such a row may be level for a while
+        expressions = [
+            *(x for point in closed.points for x in point),
+            *(r.formula for r in closed.rows),
+        ]
+        known = needed(self.definitions, expressions)
+        if any(e.has(*NONSMOOTH) for e in (*expressions, *(formula for _, formula in known))):
+            return [None] * len(closed.rows)  # such an equation may be constant locally
         names = [*self.values, t, *(c.q for c in self.coordinates)]
-        of = compiled(names, wanted, "math", known)
-        draw, found = random.Random(1), list[list[float]]()
-        for _ in range(PLACES):
+        of = compiled(names, expressions, "math", known)
+        draw, samples = random.Random(1), list[list[float]]()
+        for _ in range(SAMPLES):
             p = [x + 0.1 * draw.uniform(-1, 1) * (abs(x) or 1.0) for x in self.values.values()]
             q = [c.start + draw.uniform(-1, 1) for c in self.coordinates]
-            with suppress(ArithmeticError, ValueError, TypeError):  # no value, or none that is real
-                found.append([float(x) for x in of(*p, draw.random(), *q)])
-        if len(found) < 2:
+            with suppress(ArithmeticError, ValueError, TypeError):  # no real value
+                samples.append([float(x) for x in of(*p, draw.random(), *q)])
+        if len(samples) < 2:
             return [None] * len(closed.rows)
-        size = max(math.hypot(*place[k : k + 3]) for place in found for k in (0, 3))
+        size = max(math.hypot(*place[k : k + 3]) for place in samples for k in (0, 3))
         sizes = {"m": size, "m^2": size**2}
-        columns = list(zip(*found, strict=True))[6:]
+        columns = list(zip(*samples, strict=True))[6:]
         return [
             column[0] if max(column) - min(column) <= ROUNDING * sizes.get(row.unit, 1) else None
             for row, column in zip(closed.rows, columns, strict=True)
@@ -194,12 +200,12 @@ class Rows:
 
 
 def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:
-    """What to write in place of the rate of a position."""
+    """Return the advice to write the position in place of its time derivative."""
     positions: Mapping[Expr, Expr] = {c.qd: c.q for c in coordinates}
     terms = sympy.Add.make_args(rate)
     plain = all(term.has(dot) or term.free_symbols & positions.keys() for term in terms)
     position = rate.replace(dot, lambda e: e).xreplace(positions)
     shown = str(position)
-    if not plain or len(shown) > LONGEST:
+    if not plain or len(shown) > MAX_FORMULA_LENGTH:
         return "write the position itself, less its value at the start"
     return f"write the position itself, {shown}, less its value at the start"

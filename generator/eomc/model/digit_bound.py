@@ -1,8 +1,8 @@
-"""How large a formula's exact numbers become, found in doubles before SymPy makes them.
+"""Bounds on the number of digits of a formula's exact numbers, computed before SymPy does.
 
-Numbers of a scene are exact fractions, and definitions hide from the reader of one formula that
-thirty squarings of the number 3 have half a billion digits. The same tree that gives a SymPy
-expression is first evaluated in this algebra: upper bounds, a few operations on floats each.
+Numbers of a scene are exact fractions. Thirty squarings of the number 3, spread over definitions,
+have half a billion digits. The tree from which the SymPy expression is built is therefore evaluated
+with upper bounds first, which takes a few floating-point operations per node.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from eomc.scene.formulas import MAX_LOG10, Formula, FormulaError
 
 MAX_DIGITS = 10_000  # of an exact number
 
-_ROOT = 20.0  # digits: what sqrt(2), sin(1) or pi count for in the numbers made of them
+_IRRATIONAL_DIGITS = 20.0  # assumed for irrational numbers such as sqrt(2), sin(1) and pi
 _TOO_LONG = (
     f"makes exact numbers of more than {MAX_DIGITS:,} digits, with what it is made of: "
     "write the large powers out as decimals"
@@ -27,28 +27,28 @@ _RANGE = f"is not between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size, as numbers m
 
 @dataclass(frozen=True)
 class Bound:
-    """What is known of a value before it is made.
+    """A bound on the digits of a value.
 
-    value: the number that it is, None where it varies. digits: at most so many has the number, or
-    what stands before it.
+    value: the number in double precision, None if it varies. digits: upper bound on the digits of
+    the number, or of the coefficient.
     """
 
     value: float | None = None
     digits: float = 0.0
 
     def __add__(self, other: Bound) -> Bound:
-        return _made(lambda a, b: a + b, self.digits + other.digits, self, other)
+        return _bounded(lambda a, b: a + b, self.digits + other.digits, self, other)
 
     def __sub__(self, other: Bound) -> Bound:
-        return _made(lambda a, b: a - b, self.digits + other.digits, self, other)
+        return _bounded(lambda a, b: a - b, self.digits + other.digits, self, other)
 
     def __mul__(self, other: Bound) -> Bound:
-        return _made(lambda a, b: a * b, self.digits + other.digits, self, other)
+        return _bounded(lambda a, b: a * b, self.digits + other.digits, self, other)
 
     def __truediv__(self, other: Bound) -> Bound:
         if other.value == 0:
             raise FormulaError("divides by zero")
-        return _made(lambda a, b: a / b, self.digits + other.digits, self, other)
+        return _bounded(lambda a, b: a / b, self.digits + other.digits, self, other)
 
     def __neg__(self) -> Bound:
         return Bound(None if self.value is None else -self.value, self.digits)
@@ -64,16 +64,16 @@ class Bound:
                     "exponent: write 0, or give the base another value"
                 )
             return VARIES
-        root = 0.0 if other.value.is_integer() else _ROOT
+        root = 0.0 if other.value.is_integer() else _IRRATIONAL_DIGITS
         digits = 1.0 if self.value in (0, 1) else self.digits * max(abs(other.value), 1) + root
-        return _made(lambda a, b: a**b, digits, self, other)
+        return _bounded(lambda a, b: a**b, digits, self, other)
 
 
 VARIES = Bound()
 
 
-def _made(function: Callable[..., Any], digits: float, *parts: Bound) -> Bound:
-    """A size within the bounds. Raises FormulaError."""
+def _bounded(function: Callable[..., Any], digits: float, *parts: Bound) -> Bound:
+    """Apply a function to bounded values. Raises FormulaError beyond MAX_DIGITS."""
     if not digits <= MAX_DIGITS:
         raise FormulaError(_TOO_LONG)
     numbers = [part.value for part in parts]
@@ -107,24 +107,26 @@ def _call(name: str) -> Callable[..., Bound]:
     def bound_of_call(*parts: Bound) -> Bound:
         if any(part.value is None for part in parts):
             return VARIES
-        return _made(function, sum(p.digits for p in parts) + (0 if rational else _ROOT), *parts)
+        return _bounded(
+            function, sum(p.digits for p in parts) + (0 if rational else _IRRATIONAL_DIGITS), *parts
+        )
 
     return bound_of_call
 
 
 _ALGEBRA: Mapping[str, Any] = {
     "number": _literal,
-    "pi": Bound(math.pi, _ROOT),
+    "pi": Bound(math.pi, _IRRATIONAL_DIGITS),
     "dot": lambda _: VARIES,
     **{name: _call(name) for name in formulas.FUNCTIONS if name != "dot"},
 }
 
 
 def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
-    """The size of a formula's value; names that are not known vary.
+    """Return the bound of a formula's value; names that are not in `known` vary.
 
-    Raises FormulaError where it is no number that a double can be, or needs too many digits.
+    Raises FormulaError where the value is out of the range of doubles or has too many digits.
     """
-    found = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
-    assert isinstance(found, Bound)
-    return found if found.value is not None else VARIES
+    result = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
+    assert isinstance(result, Bound)
+    return result if result.value is not None else VARIES

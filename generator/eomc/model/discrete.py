@@ -1,8 +1,8 @@
-"""Parameters that jumps set: discrete variables, constant between events.
+"""Discrete variables: parameters that state jumps set, constant between events.
 
 Each becomes a coordinate, so that runs, batches and C have its value at any time. It is no
-coordinate of Lagrange's: nothing is differentiated along it, its rate counts as 0, and
-x_dot**2/2 in K, which stands beside all else, leaves it at rest.
+generalized coordinate: no derivative with respect to it is taken and its velocity is 0. The term
+x_dot**2/2 in K, which is decoupled from all others, keeps D regular and the variable at rest.
 """
 
 from __future__ import annotations
@@ -15,48 +15,52 @@ from eomc.model.symbols import Coordinate, Parameter
 
 
 def add_discrete_coordinates(system: Made) -> Made:
-    """The system whose parameters that jumps set are discrete variables, behind its coordinates.
+    """Return the system with parameters that jumps set as additional, discrete coordinates.
 
-    Raises SceneError where a name that one needs is taken, one is a limit of an input, or an
-    event watches nothing else.
+    Raises SceneError where a name that is needed is in use, an input limit depends on such a
+    parameter, or an event function depends on nothing else.
     """
     jumped = {name for event in system.events for name, _ in event.jump}
-    found = [p for p in system.parameters if p.name in jumped]
-    if not found:
+    jumped_parameters = [p for p in system.parameters if p.name in jumped]
+    if not jumped_parameters:
         return system
-    if problems := _taken(system, found) + _limiting(system, found) + _idle(system, found):
+    if (
+        problems := _taken(system, jumped_parameters)
+        + _limiting(system, jumped_parameters)
+        + _idle(system, jumped_parameters)
+    ):
         raise SceneError(problems)
-    more = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in found)
-    energy = sum(c.qd**2 for c in more) / 2
+    variables = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in jumped_parameters)
+    energy = sum(c.qd**2 for c in variables) / 2
     tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic + energy)
     return replace(
         system,
-        coordinates=(*system.coordinates, *more),
+        coordinates=(*system.coordinates, *variables),
         kinetic=system.kinetic + energy,
-        forces=system.forces and (*system.forces, *[0 * energy] * len(more)),
-        parameters=tuple(p for p in system.parameters if p not in found),
-        discrete=tuple(p.name for p in found),
+        forces=system.forces and (*system.forces, *[0 * energy] * len(variables)),
+        parameters=tuple(p for p in system.parameters if p not in jumped_parameters),
+        discrete=tuple(p.name for p in jumped_parameters),
         tree=tree,
     )
 
 
-def _taken(system: Mechanics, found: list[Parameter]) -> list[Problem]:
-    """Names of the scene's that the rates of discrete variables need."""
+def _taken(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem]:
+    """Report names of the scene that coincide with velocities of discrete variables."""
     known = {*system.names, *(s.name for s, _ in system.definitions)}
     known |= {o.name for o in system.outputs}
     return [
         system.problem(
             f"parameters.{p.name}", f"a jump sets it, which needs the name '{name}': rename yours"
         )
-        for p in found
+        for p in jumped_parameters
         for name in (f"{p.name}_dot", f"{p.name}_ddot")
         if name in known
     ]
 
 
-def _limiting(system: Mechanics, found: list[Parameter]) -> list[Problem]:
-    """Inputs whose limits depend on discrete variables."""
-    names = {p.name for p in found}
+def _limiting(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem]:
+    """Report inputs whose limits depend on discrete variables."""
+    names = {p.name for p in jumped_parameters}
     return [
         system.problem(
             f"inputs.{u.name}.limits",
@@ -68,13 +72,13 @@ def _limiting(system: Mechanics, found: list[Parameter]) -> list[Problem]:
     ]
 
 
-def _idle(system: Mechanics, found: list[Parameter]) -> list[Problem]:
-    """Events of discrete variables alone, which nothing carries through zero between jumps."""
-    jumped, still = {p.name for p in found}, {p.name for p in system.parameters}
+def _idle(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem]:
+    """Report event functions of discrete variables alone, which are constant between jumps."""
+    jumped, constant = {p.name for p in jumped_parameters}, {p.name for p in system.parameters}
     problems = []
     for k, event in enumerate(system.events, start=1):
         names = {str(s) for s in event.when.free_symbols}
-        if names & jumped and names <= still:
+        if names & jumped and names <= constant:
             problems.append(
                 system.problem(
                     f"event.{k}.when",
@@ -87,12 +91,12 @@ def _idle(system: Mechanics, found: list[Parameter]) -> list[Problem]:
 
 
 def with_constant_parameters(system: Made) -> Made:
-    """The system with parameters in place of its discrete variables, which nothing sets."""
+    """Return the system without events, with parameters in place of its discrete variables."""
     if not system.discrete:
         return system
     own = [c for c in system.coordinates if c.name not in system.discrete]
-    more = [c for c in system.coordinates if c.name in system.discrete]
-    energy = sum(c.qd**2 for c in more) / 2
+    variables = [c for c in system.coordinates if c.name in system.discrete]
+    energy = sum(c.qd**2 for c in variables) / 2
     tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic - energy)
     forces = zip(system.coordinates, system.forces or (), strict=False)
     return replace(
@@ -102,7 +106,7 @@ def with_constant_parameters(system: Made) -> Made:
         forces=tuple(force for c, force in forces if c.name not in system.discrete),
         parameters=(
             *system.parameters,
-            *(Parameter(c.name, c.start, c.unit, c.note) for c in more),
+            *(Parameter(c.name, c.start, c.unit, c.note) for c in variables),
         ),
         discrete=(),
         events=(),
@@ -111,11 +115,13 @@ def with_constant_parameters(system: Made) -> Made:
 
 
 def with_parameters_as_states(system: Made, core: Made) -> Made:
-    """The system with start and rows of its `core`, which has parameters and is assembled."""
-    more = [c for c in system.coordinates if c.name in system.discrete]
+    """Return the system with initial values and constraints of `core`, its assembled form with
+    parameters in place of discrete variables.
+    """
+    variables = [c for c in system.coordinates if c.name in system.discrete]
     return replace(
         system,
-        coordinates=(*core.coordinates, *more),
+        coordinates=(*core.coordinates, *variables),
         constraints=core.constraints,
         closure=core.closure,
         warnings=core.warnings,

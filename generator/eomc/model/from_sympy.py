@@ -206,7 +206,11 @@ class Maker:
         whole = sympy.srepr(sorted(made_of.items())) + drawn_text + str(self.frictions or "")
         digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(
-            **made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn, own_symbols=own
+            **made_of,
+            digest=digest,
+            renamed=tuple(self.renamed),
+            picture_scene=drawn,
+            own_symbols=own,
         )
 
     def _energies(

@@ -1,6 +1,6 @@
 """A mechanical system over symbols: coordinates, definitions, K, P, forces, constraints, events.
 
-Knows nothing of where it comes from, of TOML or of C.
+Independent of the source of the system, TOML or Python, and of the generated C.
 """
 
 from __future__ import annotations
@@ -63,21 +63,21 @@ class Mechanics:
     """d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd, over named definitions.
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `linear_potential` is a(q, t).qd, what a generalized potential has
-    besides P (generalized_potential.py); it is no part of the energy. `forces` holds Q, one
-    expression a coordinate; to it come the forces F that are `applied` at positions y, pairs (y,
-    F), each with F dy/dq. `constraints`: what is zero, holonomic ones first; with A their
-    derivatives along q (along qd, where not holonomic) and multipliers lambda, A^T lambda stands
-    beside Q; `reactions` are of the loops. `tree`: the bodies that are held by joints, whose
+    `dot(e)` stands for de/dt. `linear_potential` is a(q, t).qd, the part of a generalized potential
+    that is linear in the velocities (generalized_potential.py), no part of the energy. `forces`:
+    Q, one expression for each coordinate. `applied`: forces F at positions y, as pairs (y, F), each
+    of which adds F dy/dq to Q. `constraints`: expressions that are zero, holonomic ones first; with
+    their Jacobian A (with respect to q, or to qd if nonholonomic) and the multipliers lambda,
+    A^T lambda is added to Q. `reactions`: of the loops. `tree`: the bodies with joints, whose
     energies are part of K and P. `frames`: of bodies and points, in space or in the `plane`.
-    `digest` names what the system was made from; `renamed` says which names C could not bear:
-    (given, used) pairs. `scene`: what it was read from, where it was. `pictured`: where it was made
-    in Python with a picture, a scene of its names and that alone. `closure`: what its constraints
-    leave, once its start is assembled. `modes`: of friction that sticks, the last coordinates.
-    `discrete`: coordinates before them that jumps alone change, which no derivative is taken along.
-    `again`: `make` with what made it; other arguments take the place of those. `own_symbols`: the
-    symbols, functions of time and their derivatives that the user gave to `make`, by the names that
-    they have here.
+    `digest`: hash of the source of the system. `renamed`: names that C does not allow, as (given,
+    used) pairs. `scene`: the scene from which the system was read, if any. `picture_scene`: for a
+    system made in Python with a picture, a scene of its names and the picture only. `closure`:
+    properties of the constraints, once initial values are assembled. `modes`: stick-slip friction
+    modes, the last coordinates. `discrete`: names of discrete coordinates, placed before the modes;
+    no derivative with respect to them is taken. `again`: `make` with its arguments, any of which
+    can be replaced. `own_symbols`: the symbols, functions of time and their derivatives that the
+    user gave to `make`, by their names in the system.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Mechanics:
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
     scene: Scene | None = field(default=None, compare=False, repr=False)
-    pictured: Scene | None = field(default=None, compare=False, repr=False)
+    picture_scene: Scene | None = field(default=None, compare=False, repr=False)
     closure: ConstraintSummary | None = field(default=None, compare=False, repr=False)
     modes: tuple[FrictionMode, ...] = ()
     discrete: tuple[str, ...] = ()
@@ -135,14 +135,14 @@ class Mechanics:
 
     @property
     def rates(self) -> dict[Symbol, Symbol]:
-        """The velocities of all that moves between events, by their coordinates."""
+        """The velocities by coordinate, without discrete coordinates."""
         return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
 
     @property
     def solved(self) -> tuple[tuple[tuple[int, float], ...], ...]:
-        """What accelerations are solved for: sums of constraints, (place, weight) of each.
+        """The equations to solve with: sums of constraints, as (index, weight) pairs.
 
-        One constraint each, but for those of `closure.sums`; these come first of all.
+        Those of `closure.sums` come first; the others are single constraints.
         """
         sums = self.closure.sums if self.closure else ()
         mixed = {k for row in sums for k, w in enumerate(row) if w}
@@ -154,44 +154,45 @@ class Mechanics:
 
     @property
     def rotations(self) -> tuple[tuple[int, ...], ...]:
-        """Of each loop with rotation errors, the places of the rows that have one."""
+        """The indices of the constraints with a rotation error, for each loop that has some."""
         rows = [(k, c.loop) for k, c in enumerate(self.constraints) if c.rotation_error is not None]
         return tuple(tuple(k for k, _ in some) for _, some in groupby(rows, key=lambda row: row[1]))
 
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
-        """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
+        """Return a problem at a key such as `energy.kinetic`, with its line if there is a scene."""
         if self.place is None:
             message, key = in_words_of_python(message), argument_of(key)
             return Problem(message, key, f"System {self.name}", severity=severity)
         return self.place(key, message, severity=severity)
 
     def at(self, parameters: Mapping[str, float]) -> Self:
-        """The system with other values for some of its parameters."""
+        """Return the system with other values for some of its parameters."""
         changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
         return replace(self, parameters=changed)
 
     @property
-    def asked(self) -> tuple[Frame, ...]:
-        """The frames whose poses, velocities and Jacobians are wanted, in the order of [run]."""
-        wanted, known = self.run.frames, {f.name: f for f in self.frames}
-        return self.frames if wanted is True else tuple(known[name] for name in wanted or ())
+    def output_frames(self) -> tuple[Frame, ...]:
+        """The frames whose poses, velocities and Jacobians are generated, in the order of [run]."""
+        names, known = self.run.frames, {f.name: f for f in self.frames}
+        return self.frames if names is True else tuple(known[name] for name in names or ())
 
     @property
     def own_events(self) -> tuple[Event, ...]:
-        """Those of the scene: friction that sticks has two more for each of its modes, behind."""
+        """The events of the scene, without the two transitions of each friction mode."""
         return self.events[: len(self.events) - 2 * len(self.modes)]
 
     @property
     def reads_qdd(self) -> bool:
         """Whether functions may read accelerations."""
-        return bool(self.outputs or self.events or self.asked or self.run.inverse_dynamics)
+        return bool(self.outputs or self.events or self.output_frames or self.run.inverse_dynamics)
 
     @property
     def names(self) -> frozenset[str]:
-        """Those of coordinates, velocities, inputs, parameters, and of accelerations where
-        functions may read them: no value may take one."""
-        given = (*self.q, *self.qd, *self.u, *(self.qdd if self.reads_qdd else ()))
-        return frozenset([*(x.name for x in given), *(p.name for p in self.parameters)])
+        """Names that no other value may have: coordinates, velocities, inputs, parameters, and
+        accelerations if functions may read them.
+        """
+        variables = (*self.q, *self.qd, *self.u, *(self.qdd if self.reads_qdd else ()))
+        return frozenset([*(x.name for x in variables), *(p.name for p in self.parameters)])
 
     @property
     def u(self) -> tuple[Symbol, ...]:
@@ -199,7 +200,7 @@ class Mechanics:
         return tuple(i.symbol for i in self.inputs)
 
     def beyond_float(self) -> list[Problem]:
-        """Faults of numbers that a system in single precision can't have."""
+        """Report numbers that are out of range in single precision."""
         if self.run.real != "float":
             return []
         faults = []
@@ -234,4 +235,6 @@ class Mechanics:
         return faults
 
 
-Made = TypeVar("Made", bound=Mechanics)  # of functions that change a system of any class
+Made = TypeVar(
+    "Made", bound=Mechanics
+)  # of functions that return a changed system of the same class

@@ -1,4 +1,4 @@
-"""Where forces jump or bend, or may do so to steps that are longer than it takes."""
+"""Detection of non-smooth functions, and of smooth ones that may be steep relative to a step."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from eomc.model.symbols import dot
 from eomc.model.system import System
 
 KINDS = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
-STEEP = (*KINDS, sympy.tanh, sympy.atan)  # corners to steps longer than they are wide
+STEEP = (*KINDS, sympy.tanh, sympy.atan)  # tanh and atan act as jumps if they are narrow
 
 
 def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
-    """The functions in the scene that jump or bend, by name; "" where all is smooth."""
+    """Return the names of the non-smooth functions in the system; "" if there are none."""
     s = system
     exprs = (
         *(s.kinetic, s.potential, s.linear_potential, s.dissipation, *s.forces),
@@ -23,15 +23,16 @@ def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
         *(i.signal for i in s.inputs),
         *(c.formula for c in s.constraints if not c.switched),
     )
-    found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
-    return ", ".join(sorted(found))
+    names = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
+    return ", ".join(sorted(names))
 
 
 def has_steep_terms(system: System) -> bool:
-    """Whether there are corners, or what may be one to a long step.
+    """Return True if forces are non-smooth, or may be steep relative to a long step.
 
-    That is tanh or atan of anything, and whatever is not a polynomial, sine or cosine in the
-    velocities, such as friction that is smoothed by v/sqrt(v**2 + w**2) or Stribeck's exp(-v**2).
+    Steep are tanh and atan of any argument, and functions of the velocities that are not
+    polynomials, sines or cosines, such as friction smoothed by v/sqrt(v**2 + w**2), or the Stribeck
+    term exp(-v**2).
     """
     if nonsmooth_functions(system, STEEP):
         return True
@@ -44,12 +45,12 @@ def has_steep_terms(system: System) -> bool:
         *(i.signal for i in s.inputs),
     )  # fmt: skip
     return any(
-        (f.free_symbols & fast or f.has(dot)) and not _gentle(f)
+        (f.free_symbols & fast or f.has(dot)) and not _is_gentle(f)
         for e in exprs
         for f in e.atoms(sympy.Function, sympy.Pow)
     )
 
 
-def _gentle(f: sympy.Expr) -> bool:
-    whole = f.is_Pow and f.exp.is_Integer and f.exp > 0
-    return bool(whole or isinstance(f, (dot, sympy.sin, sympy.cos)))
+def _is_gentle(f: sympy.Expr) -> bool:
+    natural_power = f.is_Pow and f.exp.is_Integer and f.exp > 0
+    return bool(natural_power or isinstance(f, (dot, sympy.sin, sympy.cos)))

@@ -1,4 +1,4 @@
-"""Limits of inputs: formulas see what acts, min(max(u, least), most), in place of the input."""
+"""Saturation of inputs: formulas use min(max(u, least), most) in place of the input u."""
 
 from __future__ import annotations
 
@@ -11,31 +11,35 @@ from eomc.model.symbols import symbol
 
 
 def saturate_inputs(system: Made) -> Made:
-    """The system with a definition for each limited input, `force_limited`, used in its place."""
+    """Return the system with each limited input replaced by a definition, as `force_limited`."""
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
-    made: dict[Symbol, Symbol] = {}
+    limited_symbols: dict[Symbol, Symbol] = {}
     for i in system.inputs:
         if any(x is not None for x in i.limits):
             name = f"{i.name}_limited"
             while name in names:
                 name += "_too"
             names.add(name)
-            made[i.symbol] = symbol(name)
-    if not made:
+            limited_symbols[i.symbol] = symbol(name)
+    if not limited_symbols:
         return system
-    limited = [(made[i.symbol], i.limited) for i in system.inputs if i.symbol in made]
+    limited = [
+        (limited_symbols[i.symbol], i.limited) for i in system.inputs if i.symbol in limited_symbols
+    ]
     return replace(
         system,
-        definitions=(*limited, *((s, e.xreplace(made)) for s, e in system.definitions)),
-        forces=tuple(e.xreplace(made) for e in system.forces),
-        applied=tuple((y, force.xreplace(made)) for y, force in system.applied),
+        definitions=(*limited, *((s, e.xreplace(limited_symbols)) for s, e in system.definitions)),
+        forces=tuple(e.xreplace(limited_symbols) for e in system.forces),
+        applied=tuple((y, force.xreplace(limited_symbols)) for y, force in system.applied),
         events=tuple(
             replace(
                 e,
-                when=e.when.xreplace(made),
-                jump=tuple((name, to.xreplace(made)) for name, to in e.jump),
+                when=e.when.xreplace(limited_symbols),
+                jump=tuple((name, to.xreplace(limited_symbols)) for name, to in e.jump),
             )
             for e in system.events
         ),
-        outputs=tuple(replace(o, formula=o.formula.xreplace(made)) for o in system.outputs),
+        outputs=tuple(
+            replace(o, formula=o.formula.xreplace(limited_symbols)) for o in system.outputs
+        ),
     )

@@ -1,4 +1,4 @@
-"""What a system is written in: coordinates, parameters, inputs, the time, rates as they stand."""
+"""Symbols of a system: coordinates, parameters, inputs, outputs, events, constraints, time."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from sympy import Expr, Symbol
 
 t = Symbol("t", real=True)
 
-# behind a name: a direction's entry along it; no name of a user's ends so
+# suffix of the component of a direction along a variable; users' names do not end in it
 ALONG = "_along_"
-MULTIPLIER = "_lambda_"  # likewise behind a constraint's name, its Lagrange multiplier
-PARTS = ("_lack_", "_pivot_")  # and what that is made of
+MULTIPLIER = "_lambda_"  # suffix of a constraint's Lagrange multiplier
+PARTS = ("_lack_", "_pivot_")  # suffixes of the numerator and denominator of a multiplier
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
-    """The total time derivative of its argument, kept as it stands until it is asked for."""
+    """The total time derivative of its argument, not evaluated."""
 
     nargs = 1
     is_real = True
 
     @classmethod
     def eval(cls, inner: Any) -> Any:
-        """Zero of a number, which does not change."""
+        """Return zero for a number."""
         return sympy.S.Zero if inner.is_number else None
 
     def _latex(self, printer: Any, exp: str = "") -> str:
@@ -35,26 +35,26 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
 
 
 class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as the tape has it
-    """1/pivot where the pivot is more than a limit, else 0: (pivot, limit)."""
+    """The function (pivot, limit): 1/pivot if the pivot exceeds the limit, else 0."""
 
     nargs = 2
     is_real = True
 
     @classmethod
     def eval(cls, pivot: Expr, limit: Expr) -> Expr | None:
-        """Of numbers a number."""
+        """Evaluate for numbers."""
         if not (pivot.is_number and limit.is_number):
             return None
         return 1 / pivot if pivot > limit else sympy.S.Zero
 
     def fdiff(self, argindex: int = 1) -> Expr:
-        """That of 1/pivot; the limit does not count."""
+        """Return the derivative of 1/pivot; the limit is constant."""
         return -(self**2) if argindex == 1 else sympy.S.Zero
 
 
-@lru_cache(maxsize=10_000)  # SymPy takes ten times as long to find one that it has
+@lru_cache(maxsize=10_000)  # SymPy takes ten times as long for a symbol that exists
 def symbol(name: str) -> Symbol:
-    """The symbol of a name; all of a system's symbols are real."""
+    """Return the symbol of a name; all symbols of a system are real."""
     return Symbol(name, real=True)
 
 
@@ -63,7 +63,7 @@ class Coordinate:
     """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s.
 
     start_fixed, rate_fixed: whether the assembly of consistent initial values keeps them as given.
-    follows, rate_follows: the formulas of start and rate where these are of parameters, else "".
+    follows, rate_follows: formulas of start and rate if these depend on parameters, else "".
     """
 
     name: str
@@ -88,7 +88,7 @@ class Coordinate:
 
     @property
     def qdd(self) -> Symbol:
-        """The acceleration's symbol, `<name>_ddot`, which outputs alone have."""
+        """The acceleration's symbol, `<name>_ddot`, which occurs in outputs only."""
         return symbol(f"{self.name}_ddot")
 
 
@@ -113,7 +113,7 @@ class Parameter(_Named):
 
 @dataclass(frozen=True)
 class Output(_Named):
-    """A quantity that is asked for; its formula is over everything, accelerations too."""
+    """An output of the model; its formula may use all variables, accelerations too."""
 
     formula: Expr
     unit: str = ""
@@ -122,9 +122,9 @@ class Output(_Named):
 
 @dataclass(frozen=True)
 class Input(_Named):
-    """A quantity given from outside at every step; `signal` is its value by default.
+    """An external input, given at each step; `signal` is its default value.
 
-    limits: the least and largest value that acts, None where there is none.
+    limits: saturation limits (lower, upper), None where there is none.
     """
 
     unit: str = ""
@@ -134,19 +134,20 @@ class Input(_Named):
 
     @property
     def limited(self) -> Expr:
-        """What acts: the input within its limits."""
-        least, most = self.limits
-        within = self.symbol if least is None else sympy.Max(self.symbol, least)
-        return within if most is None else sympy.Min(within, most)
+        """The input saturated at its limits."""
+        lower, upper = self.limits
+        value = self.symbol if lower is None else sympy.Max(self.symbol, lower)
+        return value if upper is None else sympy.Min(value, upper)
 
 
 @dataclass(frozen=True)
 class Event(_Named):
-    """Where `when` crosses zero, "rising", "falling" or "both"; action: "record", "stop", "jump".
+    """An event with the event function `when`; direction: "rising", "falling" or "both".
 
-    jump: what coordinates and velocities are then, by their names. begins: what is above zero where
-    it happens, wherever `when` is, as a run or the motion behind a jump begins. above: whether
-    `when` can't leave zero downwards: where it seems to, that comes behind a short way upwards.
+    action: "record", "stop" or "jump". jump: new values of coordinates, velocities and parameters,
+    by name. begins: an expression that triggers the event if it is positive at the start of a run
+    or after a jump. above: whether `when` cannot become negative immediately after it was zero; a
+    sign change there means that it was positive for a short time.
     """
 
     when: Expr
@@ -161,14 +162,15 @@ class Event(_Named):
 
 @dataclass(frozen=True)
 class Constraint(_Named):
-    """What is zero along every motion: a formula over t, coordinates, parameters and definitions.
+    """A constraint equation formula = 0 over t, coordinates, parameters and definitions.
 
-    holonomic: of positions and t alone; else it is linear in the rates. loop: the [[loop]] that the
-    row is of. redundant: whether the other rows say the same, so that none is solved for it.
-    switched: whether it holds in some modes only, and is zero by itself in the others.
-    rotation_error: of a loop's row of axes, the component of 2 tan(a/2) n along the axis that the
-    row is named after, where the second frame is out by an angle a about n, and cos(a/2)^2: zero
-    only where the joint is closed as is meant; a start is assembled with it.
+    holonomic: whether it depends on positions and t only; else it is linear in the velocities.
+    loop: name of the [[loop]] to which it belongs. redundant: whether other constraints imply it,
+    so that it has no multiplier. switched: whether it is active in some friction modes only and
+    identically zero in the others. rotation_error: for an axis equation of a loop, the component of
+    2 tan(a/2) n along the axis after which it is named, where the rotation error is an angle a
+    about n, and cos(a/2)^2. It is zero only if the joint is closed; initial values are assembled
+    with it.
     """
 
     formula: Expr
@@ -182,20 +184,20 @@ class Constraint(_Named):
 
     @property
     def multiplier(self) -> Symbol:
-        """The row's Lagrange multiplier, in reactions."""
+        """The constraint's Lagrange multiplier, in reactions."""
         return multiplier_of(self.name)
 
     @property
     def parts(self) -> tuple[Symbol, ...]:
-        """Of one that is switched, in events: its multiplier times its pivot, and this, >= 0."""
+        """For a switched constraint, in events: multiplier times pivot, and the pivot (>= 0)."""
         return tuple(symbol(f"{self.name}{part}") for part in PARTS)
 
 
 @dataclass(frozen=True)
 class FrictionMode:
-    """A coordinate that is 1, -1 or 0, as another slides forwards, backwards or sticks.
+    """A discrete coordinate: 1, -1 or 0 as another one slides forwards, backwards or sticks.
 
-    at, of: the places of both among the coordinates.
+    at: index of the discrete coordinate. of: index of the other one.
     """
 
     at: int
@@ -204,11 +206,11 @@ class FrictionMode:
 
 @dataclass(frozen=True)
 class Reaction(_Named):
-    """What a [[loop]] does to the second of its bodies, over definitions and multipliers.
+    """The reaction of a [[loop]] on its second body, over definitions and multipliers.
 
-    values: the force (2) and the moment about the joint's point in the plane; force (3) and moment
-    (3) in space, along the world's axes. branches: 1 where the joint is closed as it is meant;
-    rows of its axes hold after some other turns too, where one of these is 0 or -1.
+    values: force (2) and moment about the joint's point in the plane; force (3) and moment (3) in
+    space, in world axes. branches: expressions that are 1 if the joint is closed. At other
+    rotations that satisfy the axis equations, one of them is 0 or -1.
     """
 
     values: tuple[Expr, ...]
@@ -217,12 +219,12 @@ class Reaction(_Named):
 
 
 def multiplier_of(row: str) -> Symbol:
-    """The Lagrange multiplier of a constraint of that name."""
+    """Return the Lagrange multiplier of the constraint with a name."""
     return symbol(f"{row}{MULTIPLIER}")
 
 
 def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
-    """Each definition over no other, by its symbol."""
+    """Return each definition with the others substituted, by its symbol."""
     known: dict[Expr, Expr] = {}
     for name, e in definitions:
         known[name] = e.xreplace(known)
@@ -232,13 +234,13 @@ def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
 def needed(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:
-    """The definitions that `ends` depend on, in their order."""
+    """Return the definitions on which `ends` depend, in their order."""
     known: Mapping[Symbol, Expr] = dict(definitions)
-    found: set[Symbol] = set()
+    required: set[Symbol] = set()
     queue = [s for end in ends for s in end.free_symbols]
     while queue:
         name = queue.pop()
-        if name in known and name not in found:
-            found.add(name)
+        if name in known and name not in required:
+            required.add(name)
             queue.extend(known[name].free_symbols)
-    return [(name, e) for name, e in definitions if name in found]
+    return [(name, e) for name, e in definitions if name in required]

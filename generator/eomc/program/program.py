@@ -209,7 +209,7 @@ def _events(system: System, taken: Candidate) -> Iterator[Function]:
 
 def _requested(system: System) -> Iterator[Function]:
     """Yield the functions that [run] requests: frames, inverse dynamics and momenta."""
-    frames = [f.name for f in system.asked]
+    frames = [f.name for f in system.output_frames]
     if frames:
         found = motions(system)
         entries = ("x", "y", "angle") if system.plane else ("x", "y", "z")

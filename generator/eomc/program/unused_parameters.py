@@ -43,7 +43,7 @@ def _key_of(system: System, parameter: Symbol) -> str:
         roots = _tables(system.scene, parameter.name)
         first = system.scene.used.get(parameter.name, [()])[0]
         return ".".join(first) if roots and roots <= {"energy", "forces"} else ""
-    drawn = system.pictured and parameter.name in system.pictured.used
+    drawn = system.picture_scene and parameter.name in system.picture_scene.used
     places = (
         f"energy.{key}"
         for name, key in SCENE_KEYS.items()

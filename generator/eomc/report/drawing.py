@@ -53,7 +53,7 @@ def _draw(system: System, t: Array, q: Array) -> Drawing | None:
     values: dict[str, Any] = {p.name: p.value for p in system.parameters}
     columns = zip(system.coordinates, q.T, strict=True)
     values |= {c.name: own for c, own in columns if c.name in system.discrete}
-    scene = system.scene or system.pictured
+    scene = system.scene or system.picture_scene
     declared = sketch.draw_declared(scene, values, t, q) if scene else None
     return declared or _draw_named_points(system, t, q)
 

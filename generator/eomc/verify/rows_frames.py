@@ -34,7 +34,7 @@ def report(check: Comparison, scene: Scene) -> None:
             largest = partial(check.largest, measure, STATES)
             check.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
 
-        if check.system.asked:
+        if check.system.output_frames:
             row("poses of frames", LIMIT, frames.poses)
             row("velocities of frames", LIMIT, frames.velocities)
             row("accelerations of frames", TWICE, frames.accelerations)
@@ -66,7 +66,7 @@ class _Frames:
 
     def __init__(self, check: Comparison, module: Any, scene: Scene) -> None:
         self.check, self.module, self.scene = check, module, scene
-        self.names = [f.name for f in check.system.asked]
+        self.names = [f.name for f in check.system.output_frames]
         self.plane = check.system.plane
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:

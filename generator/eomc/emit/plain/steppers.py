@@ -101,7 +101,7 @@ def header(
         outputs=indexed(plain, s.outputs, "OUT_"),
         constraints=indexed(plain, s.constraints, "CONSTRAINT_"),
         events=indexed(plain, s.events, "EVENT_"),
-        frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.asked),
+        frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.output_frames),
         parameters=parameters(plain),
         implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
         timed=target.driven,
