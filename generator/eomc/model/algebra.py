@@ -32,13 +32,13 @@ UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
 
 def expression(formula: Formula, known: Mapping[str, Expr]) -> Expr:
-    """The formula's expression. Raises FormulaError where that is no real, finite one."""
+    """Return the expression of a formula. Raises FormulaError unless it is real and finite."""
     try:
-        found = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))
+        value = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))
     except (ArithmeticError, ValueError, TypeError) as fault:
         raise FormulaError(str(fault)) from None
-    if found.has(*UNDEFINED):
+    if value.has(*UNDEFINED):
         raise FormulaError("divides by zero")
-    if found.has(sympy.I):
+    if value.has(sympy.I):
         raise FormulaError("has no real value")
-    return found
+    return value

@@ -1,4 +1,4 @@
-"""What Python callers give to System.make: the same as scenes may say, and faults in words."""
+"""Checks and conversion of the arguments of System.make, with the rules of scenes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _FUNCTIONS = (
     *(sympy.Heaviside, sympy.Min, sympy.Max, dot),
 )
 _KNOWN = (sympy.Add, sympy.Mul, sympy.Pow, Symbol, sympy.Number, sympy.NumberSymbol, *_FUNCTIONS)
-_INSTEAD = {
+_REPLACEMENTS = {
     "asinh": "log(x + sqrt(x**2 + 1))",
     "acosh": "log(x + sqrt(x**2 - 1))", "atanh": "log((1 + x)/(1 - x))/2", "acot": "atan(1/x)",
     "ITE": "Heaviside(x), Min or Max",
@@ -45,12 +45,12 @@ _INSTEAD = {
 
 
 def fault(role: str, message: str) -> EomcError:
-    """The error to raise."""
+    """Return the error to raise for an argument."""
     return EomcError(f"System.make: {role}: {message}")
 
 
 def called(name: object, role: str) -> str:
-    """A name as text. Raises EomcError where it is none, or can be none in C and Python."""
+    """Return a name as text. Raises EomcError where it is not a valid name in C and Python."""
     if not isinstance(name, (str, Symbol)):
         raise fault(role, f"{name!r} is not a name")
     if why := names.fault(str(name)):
@@ -58,8 +58,8 @@ def called(name: object, role: str) -> str:
     return str(name)
 
 
-# what scenes, runs and newcomers call the arguments of System.make
-_CALLED = {
+# other names of the arguments of System.make, in scenes, runs and textbooks
+_ALIASES = {
     "method": "methods", "start": "coordinates", "K": "kinetic", "T": "kinetic", "P": "potential",
     "V": "potential", "params": "parameters", "loads": "forces", "tol": "tolerance",
     "event": "events",
@@ -73,19 +73,19 @@ LAGRANGIAN = (
 
 
 def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
-    """A TypeError where System.make has not such an argument, with what may be meant."""
+    """Raise TypeError for an argument that System.make does not have, with the closest name."""
     for name in unknown:
         known = [*known]
         if name in ("L", "lagrangian", "Lagrangian"):
             raise TypeError(f"System.make has no argument '{name}': {LAGRANGIAN}")
-        near = formulas.suggest(_CALLED.get(name, name), known)
+        near = formulas.suggest(_ALIASES.get(name, name), known)
         raise TypeError(
             f"System.make has no argument '{name}'{near or ': it has ' + ', '.join(known)}"
         )
 
 
 def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collection[str]) -> None:
-    """An EomcError where a unit is of nothing that there is, or in degrees but of no output."""
+    """Raise EomcError for the unit of an unknown name, or in degrees for what is no output."""
     known = [*known]
     for name, unit in units.items():
         if name not in known:
@@ -103,7 +103,7 @@ def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collect
 
 
 def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "") -> Expr:
-    """A formula as scenes have it; rule: what it is made of, in words. Raises EomcError."""
+    """Parse a formula as in scenes. rule: allowed names, for the message. Raises EomcError."""
     try:
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
@@ -118,34 +118,34 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
 def undeclared(
     role: str, strange: Sequence[str], known: Iterable[str], rule: str = ""
 ) -> EomcError:
-    """The error where an expression has names that nobody declared, or that a rule forbids."""
+    """Return the error for names that are not declared, or that a rule forbids."""
     known = [*known]
-    meant = formulas.suggest(strange[0], known)
+    suggestion = formulas.suggest(strange[0], known)
     if strange[0] in known:
-        meant = f"; the '{strange[0]}' declared there is another symbol: take the same one"
+        suggestion = f"; the '{strange[0]}' declared there is another symbol: take the same one"
     why = "not declared: name it among coordinates, parameters, inputs or definitions"
     if rule:
         why = f"can't be used here: {rule}"
-    return fault(role, f"{', '.join(strange)} {why}{meant}")
+    return fault(role, f"{', '.join(strange)} {why}{suggestion}")
 
 
-def expression(given: Any, role: str) -> Expr:
-    """A SymPy expression, or a number as one. Raises EomcError for anything else."""
+def expression(value: Any, role: str) -> Expr:
+    """Return the value as a SymPy expression. Raises EomcError where that is not possible."""
     try:
-        expr = sympy.sympify(given)
+        expr = sympy.sympify(value)
     except (sympy.SympifyError, TypeError, AttributeError, ValueError, RecursionError):
         expr = None
     if isinstance(expr, (sympy.MatrixBase, sympy.MatrixExpr)):
         rows, columns = expr.shape
         raise fault(role, f"give one expression, not a matrix of {rows} by {columns}: its entry")
     if not isinstance(expr, Expr):
-        raise fault(role, f"{given!r} is not an expression")
+        raise fault(role, f"{value!r} is not an expression")
     return expr
 
 
 def check_functions(expr: Expr, role: str) -> None:
-    """Raise EomcError where `expr` has a function that C code is not made of."""
-    queue, seen = [expr], {expr}
+    """Raise EomcError where `expr` has a function that C code cannot evaluate."""
+    queue, visited = [expr], {expr}
     while queue:
         part = queue.pop()
         if not isinstance(part, _KNOWN):
@@ -153,13 +153,13 @@ def check_functions(expr: Expr, role: str) -> None:
             if name in formulas.NOT_ELEMENTARY:
                 why = in_words_of_python(formulas.NOT_ELEMENTARY[name])
                 raise fault(role, f"{name} can't be used: {why}")
-            instead = f": write {_INSTEAD[name]}" if name in _INSTEAD else ""
+            instead = f": write {_REPLACEMENTS[name]}" if name in _REPLACEMENTS else ""
             known = ", ".join(f.__name__ for f in _FUNCTIONS)
             raise fault(role, f"{name} can't be used{instead}; functions are {known}")
         if isinstance(part, sympy.Heaviside) and part.args[1] != sympy.S.Half:
             raise fault(role, f"{part}: Heaviside(x) is 1/2 at 0, without another value")
-        more = [arg for arg in part.args if arg not in seen]
-        seen.update(more)
+        more = [arg for arg in part.args if arg not in visited]
+        visited.update(more)
         queue += more
 
 
@@ -168,9 +168,10 @@ def check_smooth(
 ) -> None:
     """Raise EomcError where `expr`, which is differentiated, has a function that jumps.
 
-    fixed: symbols that do not vary, in which such functions do not jump. what: it is, in words.
+    fixed: constant symbols, of which such functions are constant. what: a name of the expression
+    for the message.
     """
-    queue, seen = [expr], {expr}
+    queue, visited = [expr], {expr}
     while queue:
         part = queue.pop()
         for jump in part.atoms(sympy.sign, sympy.Heaviside):
@@ -183,47 +184,47 @@ def check_smooth(
                     "itself in forces",
                 )
         more = [definitions[s] for s in part.free_symbols if s in definitions]
-        queue += [e for e in more if e not in seen]
-        seen.update(more)
+        queue += [e for e in more if e not in visited]
+        visited.update(more)
 
 
-def number(given: Any, role: str, rule: str = "it is made of numbers") -> float:
-    """A finite number, or a formula of numbers. Raises EomcError."""
-    if isinstance(given, str):
-        given = from_text(given, role, {}, rule)
-    if isinstance(given, Expr) and given.free_symbols:
-        raise undeclared(role, sorted(map(str, given.free_symbols)), (), rule)
+def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
+    """Return a finite number, also from a formula of numbers. Raises EomcError."""
+    if isinstance(value, str):
+        value = from_text(value, role, {}, rule)
+    if isinstance(value, Expr) and value.free_symbols:
+        raise undeclared(role, sorted(map(str, value.free_symbols)), (), rule)
     try:
-        value = float(given)
-    except (TypeError, ValueError, OverflowError, IndexError):  # as SymPy has it
-        raise fault(role, f"must be a number, here {given!r}") from None
-    if not math.isfinite(value):
-        raise fault(role, f"must be a finite number, here {value}")
-    return value
+        result = float(value)
+    except (TypeError, ValueError, OverflowError, IndexError):  # SymPy raises each of these
+        raise fault(role, f"must be a number, here {value!r}") from None
+    if not math.isfinite(result):
+        raise fault(role, f"must be a finite number, here {result}")
+    return result
 
 
-def start(given: Any, role: str) -> tuple[Any, Any]:
-    """A start and a rate, as they were given; None where there is none."""
-    pair = given if isinstance(given, (tuple, list)) else (given, None)
+def start(value: Any, role: str) -> tuple[Any, Any]:
+    """Return the initial value and velocity; None where none is given."""
+    pair = value if isinstance(value, (tuple, list)) else (value, None)
     if len(pair) != 2:
-        raise fault(role, f"give a start, or a pair (start, rate), here {given!r}")
+        raise fault(role, f"give a start, or a pair (start, rate), here {value!r}")
     return pair[0], pair[1]
 
 
-def mapping(given: Any, role: str, example: str) -> Mapping[Any, Any]:
-    """A mapping from symbols. Raises EomcError."""
-    if not isinstance(given, Mapping):
-        raise fault(role, f"give a dict, such as {example}, here {given!r}")
-    return {symbol_of(key, role): value for key, value in given.items()}
+def mapping(value: Any, role: str, example: str) -> Mapping[Any, Any]:
+    """Return a mapping with symbols as keys. Raises EomcError."""
+    if not isinstance(value, Mapping):
+        raise fault(role, f"give a dict, such as {example}, here {value!r}")
+    return {symbol_of(key, role): entry for key, entry in value.items()}
 
 
-def by_name(given: Any, role: str, example: str) -> dict[str, Any]:
-    """A mapping from symbols, by their names. Raises EomcError."""
-    return {name_of(one): value for one, value in mapping(given, role, example).items()}
+def by_name(value: Any, role: str, example: str) -> dict[str, Any]:
+    """Return a mapping with the names of its symbols as keys. Raises EomcError."""
+    return {name_of(one): entry for one, entry in mapping(value, role, example).items()}
 
 
 def name_of(one: Any) -> str:
-    """What a symbol, or a function of time, is called."""
+    """Return the name of a symbol or of a function of time."""
     return str(one.func.__name__ if isinstance(one, AppliedUndef) else one)
 
 
@@ -232,27 +233,27 @@ def or_empty(value: Any) -> Any:
     return {} if value is None else value
 
 
-def symbols(given: Any, role: str, default: Any) -> dict[Any, Any]:
-    """Symbols to what belongs to them; a list of symbols alone gives each the default."""
-    if isinstance(given, Mapping):
-        return dict(mapping(given, role, ""))
-    if not isinstance(given, (list, tuple, set, frozenset)):
-        raise fault(role, f"give a list or dict of symbols, here {given!r}")
-    return {symbol_of(one, role): default for one in given}
+def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
+    """Return a dict with symbols as keys; a list of symbols gives each the default."""
+    if isinstance(value, Mapping):
+        return dict(mapping(value, role, ""))
+    if not isinstance(value, (list, tuple, set, frozenset)):
+        raise fault(role, f"give a list or dict of symbols, here {value!r}")
+    return {symbol_of(one, role): default for one in value}
 
 
-def symbol_of(given: Any, role: str) -> Any:
-    """A symbol, a function of time as dynamicsymbols makes them, or a name as a symbol."""
-    if not isinstance(given, (str, Symbol, AppliedUndef)):
-        raise fault(role, f"{given!r} is not a symbol")
-    return symbol(given) if isinstance(given, str) else given
+def symbol_of(value: Any, role: str) -> Any:
+    """Return a symbol or a function of time (dynamicsymbols) as it is, or a name as a symbol."""
+    if not isinstance(value, (str, Symbol, AppliedUndef)):
+        raise fault(role, f"{value!r} is not a symbol")
+    return symbol(value) if isinstance(value, str) else value
 
 
 def run(
     h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
     tolerance: Any, events: bool, inverse_dynamics: Any,
 ) -> Run:  # fmt: skip
-    """How the system is run. Raises EomcError where that is not possible."""
+    """Return the settings of a run. Raises EomcError for invalid ones."""
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:
             raise fault(name, f"must be greater than zero, here {value!r}")

@@ -46,17 +46,17 @@ class Chains:
         return path if path[-1] == WORLD else [*path, WORLD]
 
     def common(self, one: str, other: str) -> str:
-        """The nearest body from which both hang, or the world where that does not move.
+        """Return the closest common ancestor of two bodies, or the world if that does not move.
 
-        What is between them, seen from there, is the same however it moves.
+        The relative pose of the two bodies does not depend on the motion of the ancestor.
         """
         others = self.path(other)
-        found = next(name for name in self.path(one) if name in others)
-        moves = any(self.steps[name].motions for name in self.path(found) if name in self.steps)
-        return found if moves else WORLD
+        ancestor = next(name for name in self.path(one) if name in others)
+        moves = any(self.steps[name].motions for name in self.path(ancestor) if name in self.steps)
+        return ancestor if moves else WORLD
 
     def seen(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
-        """Where a body is, and how it is turned, in the frame of one that it hangs from."""
+        """Return the position and rotation of a body in the frame of one of its ancestors."""
         at, R, angle, path = ZERO, ONE, S.Zero, self.path(name)
         for body in reversed(path[: path.index(base)]):
             step = self.steps[body]

@@ -42,14 +42,14 @@ class _Formulas:
         self.known: dict[str, Expr] = {"t": t}
         for c in scene.coordinates:
             self.known |= {n: symbol(n) for n in (c.name, f"{c.name}_dot")}
-        given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
-        self.known |= {name: symbol(name) for name in given}
+        names = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
+        self.known |= {name: symbol(name) for name in names}
         self.problems: list[Problem] = []
         self.doubts: list[Problem] = []
         self.sizes: dict[str, digit_bound.Bound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
-        """The expression of the formula at a key; zero where it is at fault."""
+        """Return the expression of the formula at a key; zero where it is invalid."""
         name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
             self.sizes[name] = digit_bound.VARIES
@@ -61,7 +61,7 @@ class _Formulas:
             return sympy.S.Zero
 
     def definitions(self) -> tuple[list[tuple[Symbol, Expr]], Terms]:
-        """Constants become known; then definitions in their order, and what bodies add."""
+        """Evaluate constants; return the definitions in their order, and the terms of bodies."""
         scene, known = self.scene, self.known
         for constant in scene.constants:
             known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
@@ -85,7 +85,7 @@ class _Formulas:
         return made, builder.terms if builder else Terms()
 
     def potential(self, definitions: Sequence[tuple[Symbol, Expr]]) -> tuple[Expr, Expr]:
-        """The potential energy of [energy], and what is linear in the velocities beside it."""
+        """Return the potential energy of [energy] and its part that is linear in the velocities."""
         key, formula = "energy.potential", self.scene.potential
         whole = self.value(key, formula)
         if self.problems:  # a formula without a value is 0
@@ -158,16 +158,16 @@ class _Formulas:
         if self.problems:  # a formula without a value is 0
             return (), ()
         values = {p.name: p.value for p in self.scene.parameters}
-        found = constraints.Rows(
+        checks = constraints.Rows(
             coordinates,
             definitions,
             {symbol(name): value for name, value in values.items()},
             lambda row, message: self.problems.append(problem(row, message, "error")),
             lambda row, message: self.doubts.append(problem(row, message, "warning")),
         )
-        kept = [found.settled(loop) for loop in closed]
-        rows += [row for loop in kept for row in loop.rows]
-        return found.sorted(rows), tuple(r for loop in kept for r in loop.reactions)
+        loops = [checks.settled(loop) for loop in closed]
+        rows += [row for loop in loops for row in loop.rows]
+        return checks.sorted(rows), tuple(r for loop in loops for r in loop.reactions)
 
     def outputs(
         self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
@@ -194,40 +194,40 @@ def _forces(
     scene: Scene, rows: Sequence[Constraint], reactions: Sequence[Reaction],
     sticks: Sequence[Friction],
 ) -> dict[str, Expr]:  # fmt: skip
-    """Multipliers and entries of reactions, by what outputs call them."""
-    found: dict[str, Expr] = {}
+    """Return multipliers and components of reactions by their names in outputs."""
+    expressions: dict[str, Expr] = {}
     if scene.assembly:
         plane = scene.assembly.plane
         entries = {r.name: r.values for r in reactions}
         for loop in scene.assembly.loops:
-            # of rows that no motion changes, which are left out
-            found |= {f"lambda_{row}": sympy.S.Zero for row in loop.rows(plane).values()}
+            # zero for constant equations, which have no multiplier
+            expressions |= {f"lambda_{row}": sympy.S.Zero for row in loop.rows(plane).values()}
             names = loop.reactions(plane)
-            found |= dict(zip(names, entries.get(loop.name, ()), strict=bool(names)))
-    found |= {f"lambda_{row.name}": row.multiplier for row in rows}
-    held = (f"{friction.coordinate}_sticks" for friction in sticks)
-    return found | {f"lambda_{name}": multiplier_of(name) for name in held}
+            expressions |= dict(zip(names, entries.get(loop.name, ()), strict=bool(names)))
+    expressions |= {f"lambda_{row.name}": row.multiplier for row in rows}
+    sticking = (f"{friction.coordinate}_sticks" for friction in sticks)
+    return expressions | {f"lambda_{name}": multiplier_of(name) for name in sticking}
 
 
 def from_scene(scene: Scene) -> System:
-    """The scene's formulas as SymPy expressions, constants folded in. Raises SceneError."""
-    made = _Formulas(scene)
-    value = made.value
-    definitions, more = made.definitions()
+    """Convert a scene to a system of SymPy expressions. Raises SceneError."""
+    scene_formulas = _Formulas(scene)
+    value = scene_formulas.value
+    definitions, more = scene_formulas.definitions()
     kinetic = value("energy.kinetic", scene.kinetic)
-    potential, linear_potential = made.potential(definitions)
+    potential, linear_potential = scene_formulas.potential(definitions)
     start, rate = scene.start()
     forces = {name: value(f"forces.{name}", formula) for name, formula in scene.forces.items()}
     zero = sympy.S.Zero
     kinetic_energy = sympy.Add(kinetic, more.kinetic, *more.tree_kinetic)
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
-    rubs, sticks = made.frictions(more)
+    rubs, sticks = scene_formulas.frictions(more)
     coordinates = tuple(
         Coordinate(c.name, c.unit, q, qd, c.note, c.start_fixed, c.rate_fixed, *_follows(scene, c))
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
     )
-    rows, reactions = made.constraints(coordinates, definitions, more.closed)
-    held = _forces(scene, rows, reactions, sticks)
+    rows, reactions = scene_formulas.constraints(coordinates, definitions, more.closed)
+    multipliers = _forces(scene, rows, reactions, sticks)
     system = System(
         name=scene.name,
         coordinates=coordinates,
@@ -244,22 +244,22 @@ def from_scene(scene: Scene) -> System:
         frames=tuple(more.frames),
         plane=bool(scene.assembly and scene.assembly.plane),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
-        inputs=tuple(made.inputs()),
+        inputs=tuple(scene_formulas.inputs()),
         definitions=tuple(definitions),
-        events=tuple(made.events()),
+        events=tuple(scene_formulas.events()),
         constraints=rows,
         reactions=reactions,
-        outputs=tuple(made.outputs(kinetic_energy, potential_energy, held)),
+        outputs=tuple(scene_formulas.outputs(kinetic_energy, potential_energy, multipliers)),
         run=scene.run,
         title=scene.title,
         note=scene.note,
         file=scene.file,
         digest=scene.digest,
-        warnings=(*scene.warnings, *made.doubts, *_at_the_start(scene)),
+        warnings=(*scene.warnings, *scene_formulas.doubts, *_at_the_start(scene)),
         place=scene.problem,
         scene=scene,
     )
-    if faults := made.problems or system.beyond_float():
+    if faults := scene_formulas.problems or system.beyond_float():
         raise SceneError(faults)
     return add_stick_slip(
         add_discrete_coordinates(saturation.saturate_inputs(check_event_functions(system))), sticks
@@ -267,7 +267,7 @@ def from_scene(scene: Scene) -> System:
 
 
 def _follows(scene: Scene, c: Written) -> Iterator[str]:
-    """The formulas of start and rate over parameters, each "" where it has none of them."""
+    """Yield the formulas of start and rate that depend on parameters, "" for others."""
     constants = {one.name: one.value for one in scene.constants}
     for formula in (c.start, c.rate):
         free = {name.id for name in formula.names()}.isdisjoint(p.name for p in scene.parameters)
@@ -275,12 +275,12 @@ def _follows(scene: Scene, c: Written) -> Iterator[str]:
 
 
 def _at_the_start(scene: Scene) -> list[Problem]:
-    """Warnings of springs and dampers that have no direction there."""
+    """Return warnings on springs and dampers of zero length at the start."""
     assembly = scene.assembly
     if not assembly or not any(
         [*(s.points for s in assembly.springs), *(d.points for d in assembly.dampers)]
     ):
         return []
-    from eomc.model import mobility  # and with it NumPy, which few scenes need here
+    from eomc.model import mobility  # imports NumPy, which few scenes need here
 
     return mobility.meeting(scene)

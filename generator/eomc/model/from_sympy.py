@@ -116,8 +116,8 @@ class Maker:
         api_arguments.check_functions(expr, role)
         return expr
 
-    def _parameter(self, one: Any, given_value: Any, units: Mapping[str, str]) -> Parameter:
-        value = api_arguments.number(given_value, f"parameter {one}", _OF_NUMBERS)
+    def _parameter(self, one: Any, value_: Any, units: Mapping[str, str]) -> Parameter:
+        value = api_arguments.number(value_, f"parameter {one}", _OF_NUMBERS)
         never_negative = getattr(one, "is_nonnegative", None) is True
         if never_negative and value < 0:
             raise api_arguments.fault(
@@ -136,8 +136,8 @@ class Maker:
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
     ) -> Made:  # fmt: skip
-        """The system, of the class `of`."""
-        as_given = (coordinates, parameters, inputs, definitions)
+        """Return the system, of the class `of`."""
+        declarations = (coordinates, parameters, inputs, definitions)
         starts = api_arguments.symbols(coordinates, "coordinates", None)
         parameters = api_arguments.mapping(parameters, "parameters", "{m: 2.0}")
         forces = api_arguments.by_name(forces, "forces", "{x: F}")
@@ -148,18 +148,22 @@ class Maker:
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
-        made = [self._coordinate(one, units) for one in starts]
+        declared_coordinates = [self._coordinate(one, units) for one in starts]
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
-        made = [*self._started(made, starts.values(), declared)]
-        made = self._held(made, [*starts], guess, bool(rows))
+        declared_coordinates = [
+            *self._with_initial_values(declared_coordinates, starts.values(), declared)
+        ]
+        declared_coordinates = self._mark_fixed(declared_coordinates, [*starts], guess, bool(rows))
         pending = api_arguments.symbols(inputs, "inputs", 0)
         named = map(api_arguments.name_of, (*starts, *parameters, *pending, *definitions))
         api_arguments.check_units(
             units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)]
         )
-        given_inputs = {i: self._declare(i, "input") for i in pending}
+        input_names = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
-        self.known = {c.q for c in made} | {c.qd for c in made} | {t}
+        self.known = (
+            {c.q for c in declared_coordinates} | {c.qd for c in declared_coordinates} | {t}
+        )
         self.known |= {symbol(n) for n in self.taken}
         ordered = []
         for one, body in definitions.items():
@@ -176,37 +180,41 @@ class Maker:
         ]
         drawn, drawn_text = None, ""
         if picture is not None:
-            names = given_inputs.values()
-            drawn, drawn_text = picture_scene(picture, expression, made, declared, names, ordered)
+            names = input_names.values()
+            drawn, drawn_text = picture_scene(
+                picture, expression, declared_coordinates, declared, names, ordered
+            )
         energies = self._energies(
             {"kinetic": kinetic, "potential": potential, "dissipation": dissipation},
-            ordered, [c.qd for c in made], given_inputs.values(),
+            ordered, [c.qd for c in declared_coordinates], input_names.values(),
         )  # fmt: skip
-        made_of: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "name": self.name,
-            "coordinates": tuple(made),
+            "coordinates": tuple(declared_coordinates),
             **energies,
             "forces": tuple(
                 expression(forces.get(api_arguments.name_of(c), 0), f"force on {c}") for c in starts
             ),
             "parameters": tuple(declared),
-            "inputs": tuple(self._inputs(pending, given_inputs, units, ends, ordered)),
+            "inputs": tuple(self._inputs(pending, input_names, units, ends, ordered)),
             "definitions": tuple(ordered),
-            **self._constraints(rows, made, ordered, given_inputs.values(), units),
+            **self._constraints(rows, declared_coordinates, ordered, input_names.values(), units),
             "events": tuple(self._events(events, starts, declared)),
             "outputs": tuple(
-                self._outputs(outputs, starts, made, units, [*map(str, rows), *sticks])
+                self._outputs(
+                    outputs, starts, declared_coordinates, units, [*map(str, rows), *sticks]
+                )
             ),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
         self.frictions = list(self._frictions(friction, starts, declared))
-        as_text = {one for group in as_given for one in group if isinstance(one, str)}
+        as_text = {one for group in declarations for one in group if isinstance(one, str)}
         own = _own_symbols(self.taken, starts, as_text, self.used)
-        whole = sympy.srepr(sorted(made_of.items())) + drawn_text + str(self.frictions or "")
+        whole = sympy.srepr(sorted(fields.items())) + drawn_text + str(self.frictions or "")
         digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(
-            **made_of,
+            **fields,
             digest=digest,
             renamed=tuple(self.renamed),
             picture_scene=drawn,
@@ -217,22 +225,24 @@ class Maker:
         self, energies: Mapping[str, Any], definitions: Sequence[tuple[Symbol, Expr]],
         velocities: Sequence[Symbol], inputs: Iterable[str],
     ) -> dict[str, Expr]:  # fmt: skip
-        """The energies by their fields of the system; the potential in its parts."""
-        made = {role: self._expression(energy, role) for role, energy in energies.items()}
-        for role, energy in made.items():
-            if held := _input_in(energy, definitions, inputs):
-                why = f"{held} is an input, and an energy can't depend on inputs"
+        """Return the energies by field name, the potential split into its parts."""
+        expressions = {role: self._expression(energy, role) for role, energy in energies.items()}
+        for role, energy in expressions.items():
+            if used_input := _input_in(energy, definitions, inputs):
+                why = f"{used_input} is an input, and an energy can't depend on inputs"
                 raise api_arguments.fault(role, f"{why}: let it act through forces")
             what = f"the {role} energy"
             api_arguments.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
         try:
-            made["potential"], linear = split(made["potential"], definitions, velocities)
+            expressions["potential"], linear = split(
+                expressions["potential"], definitions, velocities
+            )
         except NotLinearError as why:
             raise api_arguments.fault("potential", str(why)) from None
-        return made if linear == 0 else {**made, "linear_potential": linear}
+        return expressions if linear == 0 else {**expressions, "linear_potential": linear}
 
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
-        """A coordinate, whose symbols are known from here on."""
+        """Return a coordinate and declare its symbols."""
         name = self._name_of(one, "coordinate")
         c = Coordinate(name, units.get(api_arguments.name_of(one), ""))
         self.map[one] = c.q
@@ -246,14 +256,17 @@ class Maker:
                 self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
         return c
 
-    def _started(
-        self, made: Iterable[Coordinate], starts: Iterable[Any], parameters: Iterable[Parameter]
+    def _with_initial_values(
+        self,
+        coordinates: Iterable[Coordinate],
+        starts: Iterable[Any],
+        parameters: Iterable[Parameter],
     ) -> Iterator[Coordinate]:
-        """The coordinates with their starts, over parameters; what is given of one is held."""
+        """Yield the coordinates with initial values, over parameters; given values are fixed."""
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
         rule = "a start is made of numbers and parameters"
-        for c, whole in zip(made, starts, strict=True):
+        for c, whole in zip(coordinates, starts, strict=True):
             role, ends = f"start of {c.name}", []
             for x in api_arguments.start(whole, role):
                 follows = ""
@@ -272,43 +285,43 @@ class Maker:
                 rate_fixed=rate is not None, follows=follows, rate_follows=rate_follows,
             )  # fmt: skip
 
-    def _held(
-        self, made: Sequence[Coordinate], given_as: Sequence[Any], guess: Any, rows: bool
+    def _mark_fixed(
+        self, coordinates: Sequence[Coordinate], keys: Sequence[Any], guess: Any, rows: bool
     ) -> list[Coordinate]:
-        """The coordinates, all held where there are no rows, else those that are no guess."""
+        """Return the coordinates with initial values marked as fixed or as guesses."""
         if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
             raise api_arguments.fault(
                 "guess", f"give a list of coordinates, such as [x], here {guess!r}"
             )
         guessed = {api_arguments.name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
-        if unknown := sorted(guessed - {api_arguments.name_of(one) for one in given_as}):
+        if unknown := sorted(guessed - {api_arguments.name_of(one) for one in keys}):
             raise api_arguments.fault("guess", f"{', '.join(unknown)} not among the coordinates")
         if guessed and not rows:
             raise api_arguments.fault(
                 "guess", "constraints move a guess, and there are none: leave it out"
             )
-        free = [api_arguments.name_of(one) in guessed for one in given_as]
+        free = [api_arguments.name_of(one) in guessed for one in keys]
         return [
             replace(
                 c,
                 start_fixed=not rows or (c.start_fixed and not moves),
                 rate_fixed=not rows or (c.rate_fixed and not moves),
             )
-            for c, moves in zip(made, free, strict=True)
+            for c, moves in zip(coordinates, free, strict=True)
         ]
 
     def _constraints(
-        self, rows: Any, made: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
+        self, rows: Any, coordinates: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
         inputs: Iterable[str], units: Mapping[Any, str],
     ) -> dict[str, Any]:  # fmt: skip
-        """The rows of constraints, under their key of the system where there are any."""
+        """Return the constraints and their warnings by field name; empty without constraints."""
         if not isinstance(rows, Mapping):
             example = '{"rod": x**2 + y**2 - l**2}'
             raise api_arguments.fault(
                 "constraints", f"give a dict, such as {example}, here {rows!r}"
             )
-        found = []
-        moving = (s.name for c in made for s in (c.qd, c.qdd))
+        declared = []
+        moving = (s.name for c in coordinates for s in (c.qd, c.qdd))
         taken = {*self.taken, *moving, "energy"}
         for one, formula in rows.items():
             name, role = api_arguments.called(one, "constraints"), f"constraint {one}"
@@ -316,10 +329,12 @@ class Maker:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
             api_arguments.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
-            if held := _input_in(expr, ordered, inputs):
-                why = f"{held} is an input, whose rate is not known: let it act through forces"
+            if used_input := _input_in(expr, ordered, inputs):
+                why = (
+                    f"{used_input} is an input, whose rate is not known: let it act through forces"
+                )
                 raise api_arguments.fault(role, why)
-            found.append(Constraint(name, expr, unit=units.get(name, "")))
+            declared.append(Constraint(name, expr, unit=units.get(name, "")))
 
         def fault(row: Constraint, message: str) -> None:
             raise api_arguments.fault(f"constraint {row.name}", f"{row.formula} {message}")
@@ -334,20 +349,20 @@ class Maker:
                 )
             )
 
-        checked = constraints.Rows(made, ordered, {}, fault, doubt).sorted(found)
-        return {"constraints": checked, "warnings": tuple(doubts)} if found else {}
+        checked = constraints.Rows(coordinates, ordered, {}, fault, doubt).sorted(declared)
+        return {"constraints": checked, "warnings": tuple(doubts)} if declared else {}
 
     def _inputs(
         self, signals: Mapping[Any, Any], used: Mapping[Any, str], units: Mapping[Any, str],
         limits: Mapping[str, Ends], definitions: Sequence[tuple[Symbol, Expr]],
     ) -> Iterator[Input]:  # fmt: skip
-        """The inputs by the names that are used."""
+        """Yield the inputs, with their names in the system."""
         for one, signal in signals.items():
             name, role = api_arguments.name_of(one), f"signal of {one}"
             value = self._expression(signal, role)
-            if held := _input_in(value, definitions, used.values()):
+            if used_input := _input_in(value, definitions, used.values()):
                 raise api_arguments.fault(
-                    role, f"{held} is an input, and a signal can't depend on inputs"
+                    role, f"{used_input} is an input, and a signal can't depend on inputs"
                 )
             ends = limits.get(name, (None, None))
             yield Input(used[one], units.get(name, ""), value, limits=ends)
@@ -355,10 +370,10 @@ class Maker:
     def _limits(
         self, limits: Any, inputs: Iterable[Any], parameters: Iterable[Parameter]
     ) -> dict[str, Ends]:
-        """The limits of inputs by their names, over parameters."""
+        """Return the limits of inputs by name, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
-        known, found = {api_arguments.name_of(i) for i in inputs}, dict[str, Ends]()
+        known, checked = {api_arguments.name_of(i) for i in inputs}, dict[str, Ends]()
         rule = "limits are made of numbers and parameters"
         for name, pair in api_arguments.by_name(limits, "limits", "{F: (-1, 1)}").items():
             role = f"limits of {name}"
@@ -375,18 +390,18 @@ class Maker:
             )
             if least is not None and most is not None and (most - least).xreplace(values) <= 0:
                 raise api_arguments.fault(role, f"{least}, the least value, is not below {most}")
-            found[name] = (least, most)
-        return found
+            checked[name] = (least, most)
+        return checked
 
     def _events(
         self, events: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
     ) -> Iterator[Event]:
-        """The events, each a formula or a dict as [[event]] has it."""
+        """Yield the events; each is given as a formula or a dict as in [[event]]."""
         if not isinstance(events, Mapping):
             raise api_arguments.fault(
                 "events", f'give a dict, such as {{"impact": y}}, here {events!r}'
             )
-        state: dict[str, str] = {}  # names, by what a user may call them
+        state: dict[str, str] = {}  # names in the system, by names that the user may write
         for one in starts:
             name = self.map[one].name
             rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
@@ -421,26 +436,26 @@ class Maker:
     def _frictions(
         self, friction: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
     ) -> Iterator[Friction]:
-        """Friction that sticks, along coordinates, over parameters."""
+        """Yield stick-slip friction along coordinates, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         known = {api_arguments.name_of(one): self.map[one].name for one in starts}
         for name, size in api_arguments.by_name(friction, "friction", "{x: mu*m*g}").items():
             role = f"friction of {name}"
             if name not in known:
                 raise api_arguments.fault(role, f"coordinates are {', '.join(known)}")
-            found = self._expression(size, role)
-            if moving := sorted(s.name for s in found.free_symbols - self.fixed.keys()):
+            force = self._expression(size, role)
+            if moving := sorted(s.name for s in force.free_symbols - self.fixed.keys()):
                 raise api_arguments.fault(role, f"{moving[0]} is no parameter, of which it is made")
-            if (value := float(found.xreplace(values))) < 0:
+            if (value := float(force.xreplace(values))) < 0:
                 raise api_arguments.fault(role, f"is {value:g}, and can't be negative")
-            yield Friction(known[name], found, "friction")
+            yield Friction(known[name], force, "friction")
 
     def _outputs(
-        self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],
+        self, outputs: Any, starts: Iterable[Any], coordinates: Sequence[Coordinate],
         units: Mapping[Any, str], rows: Sequence[str],
     ) -> Iterator[Output]:  # fmt: skip
-        """The outputs, which may use accelerations, and multipliers by names as lambda_rod."""
-        for one, c in zip(starts, made, strict=True):
+        """Yield the outputs, which may use accelerations and multipliers (lambda_rod)."""
+        for one, c in zip(starts, coordinates, strict=True):
             if isinstance(one, AppliedUndef):
                 self.map[sympy.Derivative(one, (one.args[0], 2))] = c.qdd
             else:
@@ -455,7 +470,7 @@ class Maker:
             raise api_arguments.fault(
                 "outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}'
             )
-        moving = {x for c in made for x in (c.q, c.qd)}
+        moving = {x for c in coordinates for x in (c.q, c.qd)}
         for name, formula in outputs.items():
             called = api_arguments.called(name, "outputs")
             expr = self._expression(formula, f"output {name}")

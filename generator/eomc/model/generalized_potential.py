@@ -41,7 +41,7 @@ def split(
         return bool(e.free_symbols & moving or e.has(dot))
 
     terms = sympy.Add.make_args(potential)
-    still = sympy.Add(*(e for e in terms if not moves(e)))
+    conservative = sympy.Add(*(e for e in terms if not moves(e)))
     rest = sympy.Add(*filter(moves, terms))
     if rest == 0:
         return potential, S.Zero
@@ -60,7 +60,7 @@ def split(
     slopes = [_without(sympy.diff(rest, x), variables) for x in variables]
     linear = sympy.Add(*(a * x for a, x in zip(slopes, variables, strict=True)))
     back = {dummy: e for e, dummy in stand_ins.items()}
-    return still + rest.xreplace(at_rest), linear.xreplace(back)
+    return conservative + rest.xreplace(at_rest), linear.xreplace(back)
 
 
 def _without(slope: Expr, variables: Sequence[Expr]) -> Expr:

@@ -39,9 +39,9 @@ def compiled(
         return sympy.sympify(e).xreplace(stand_ins)
 
     several = isinstance(expressions, (list, tuple))
-    made = [*map(renamed, expressions)] if several else renamed(expressions)
+    replaced = [*map(renamed, expressions)] if several else renamed(expressions)
     known = [(stand_ins[name], renamed(e)) for name, e in definitions]
     shared = (lambda e: (known, e)) if definitions else True
     function: Callable[..., Any]
-    function = sympy.lambdify([stand_ins[x] for x in arguments], made, modules, cse=shared)
+    function = sympy.lambdify([stand_ins[x] for x in arguments], replaced, modules, cse=shared)
     return function
