@@ -15,6 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError, Problem
 from eomc.model import api_arguments, constraints
 from eomc.model.algebra import UNDEFINED
+from eomc.model.api_arguments import name_of
 from eomc.model.coulomb_friction import Friction
 from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.mechanics import Made
@@ -69,7 +70,7 @@ class Maker:
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
             raise api_arguments.fault(role, f"{one!r} is not a symbol")
-        text = api_arguments.name_of(one)
+        text = name_of(one)
         used = names.plain(text) if names.fault(text) else text
         if used in self.taken:
             raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
@@ -123,7 +124,7 @@ class Maker:
             raise api_arguments.fault(
                 f"parameter {one}", f"its symbol can't be negative, here {value:g}"
             )
-        unit = units.get(api_arguments.name_of(one), "")
+        unit = units.get(name_of(one), "")
         declared = Parameter(self._declare(one, "parameter"), value, unit)
         self.fixed[declared.symbol] = never_negative
         return declared
@@ -148,22 +149,18 @@ class Maker:
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
-        declared_coordinates = [self._coordinate(one, units) for one in starts]
+        coordinates = [self._coordinate(one, units) for one in starts]
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
-        declared_coordinates = [
-            *self._with_initial_values(declared_coordinates, starts.values(), declared)
-        ]
-        declared_coordinates = self._mark_fixed(declared_coordinates, [*starts], guess, bool(rows))
+        coordinates = [*self._with_initial_values(coordinates, starts.values(), declared)]
+        coordinates = self._mark_fixed(coordinates, [*starts], guess, bool(rows))
         pending = api_arguments.symbols(inputs, "inputs", 0)
-        named = map(api_arguments.name_of, (*starts, *parameters, *pending, *definitions))
+        named = map(name_of, (*starts, *parameters, *pending, *definitions))
         api_arguments.check_units(
             units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)]
         )
         input_names = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
-        self.known = (
-            {c.q for c in declared_coordinates} | {c.qd for c in declared_coordinates} | {t}
-        )
+        self.known = {c.q for c in coordinates} | {c.qd for c in coordinates} | {t}
         self.known |= {symbol(n) for n in self.taken}
         ordered = []
         for one, body in definitions.items():
@@ -171,39 +168,33 @@ class Maker:
             defined = symbol(self._declare(one, "definition"))
             self.known.add(defined)
             ordered.append((defined, expr))
-        if unknown := [f for f in forces if f not in map(api_arguments.name_of, starts)]:
+        if unknown := [f for f in forces if f not in map(name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
         rubbed = api_arguments.by_name(friction, "friction", "{x: mu*m*g}")
-        sticks = [
-            f"{self.map[x].name}_sticks" for x in starts if api_arguments.name_of(x) in rubbed
-        ]
+        sticks = [f"{self.map[x].name}_sticks" for x in starts if name_of(x) in rubbed]
         drawn, drawn_text = None, ""
         if picture is not None:
             names = input_names.values()
             drawn, drawn_text = picture_scene(
-                picture, expression, declared_coordinates, declared, names, ordered
+                picture, expression, coordinates, declared, names, ordered
             )
         energies = self._energies(
             {"kinetic": kinetic, "potential": potential, "dissipation": dissipation},
-            ordered, [c.qd for c in declared_coordinates], input_names.values(),
+            ordered, [c.qd for c in coordinates], input_names.values(),
         )  # fmt: skip
         fields: dict[str, Any] = {
             "name": self.name,
-            "coordinates": tuple(declared_coordinates),
+            "coordinates": tuple(coordinates),
             **energies,
-            "forces": tuple(
-                expression(forces.get(api_arguments.name_of(c), 0), f"force on {c}") for c in starts
-            ),
+            "forces": tuple(expression(forces.get(name_of(c), 0), f"force on {c}") for c in starts),
             "parameters": tuple(declared),
             "inputs": tuple(self._inputs(pending, input_names, units, ends, ordered)),
             "definitions": tuple(ordered),
-            **self._constraints(rows, declared_coordinates, ordered, input_names.values(), units),
+            **self._constraints(rows, coordinates, ordered, input_names.values(), units),
             "events": tuple(self._events(events, starts, declared)),
             "outputs": tuple(
-                self._outputs(
-                    outputs, starts, declared_coordinates, units, [*map(str, rows), *sticks]
-                )
+                self._outputs(outputs, starts, coordinates, units, [*map(str, rows), *sticks])
             ),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
@@ -244,7 +235,7 @@ class Maker:
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
         """Return a coordinate and declare its symbols."""
         name = self._name_of(one, "coordinate")
-        c = Coordinate(name, units.get(api_arguments.name_of(one), ""))
+        c = Coordinate(name, units.get(name_of(one), ""))
         self.map[one] = c.q
         if isinstance(one, AppliedUndef):
             time = one.args[0]
@@ -293,14 +284,14 @@ class Maker:
             raise api_arguments.fault(
                 "guess", f"give a list of coordinates, such as [x], here {guess!r}"
             )
-        guessed = {api_arguments.name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
-        if unknown := sorted(guessed - {api_arguments.name_of(one) for one in keys}):
+        guessed = {name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
+        if unknown := sorted(guessed - {name_of(one) for one in keys}):
             raise api_arguments.fault("guess", f"{', '.join(unknown)} not among the coordinates")
         if guessed and not rows:
             raise api_arguments.fault(
                 "guess", "constraints move a guess, and there are none: leave it out"
             )
-        free = [api_arguments.name_of(one) in guessed for one in keys]
+        free = [name_of(one) in guessed for one in keys]
         return [
             replace(
                 c,
@@ -358,7 +349,7 @@ class Maker:
     ) -> Iterator[Input]:  # fmt: skip
         """Yield the inputs, with their names in the system."""
         for one, signal in signals.items():
-            name, role = api_arguments.name_of(one), f"signal of {one}"
+            name, role = name_of(one), f"signal of {one}"
             value = self._expression(signal, role)
             if used_input := _input_in(value, definitions, used.values()):
                 raise api_arguments.fault(
@@ -373,7 +364,7 @@ class Maker:
         """Return the limits of inputs by name, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
-        known, checked = {api_arguments.name_of(i) for i in inputs}, dict[str, Ends]()
+        known, checked = {name_of(i) for i in inputs}, dict[str, Ends]()
         rule = "limits are made of numbers and parameters"
         for name, pair in api_arguments.by_name(limits, "limits", "{F: (-1, 1)}").items():
             role = f"limits of {name}"
@@ -405,9 +396,9 @@ class Maker:
         for one in starts:
             name = self.map[one].name
             rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
-            state |= {str(one): name, api_arguments.name_of(one): name}
-            state |= {str(rate): f"{name}_dot", f"{api_arguments.name_of(one)}_dot": f"{name}_dot"}
-        state |= {api_arguments.name_of(self.taken[p.name]): p.name for p in parameters}
+            state |= {str(one): name, name_of(one): name}
+            state |= {str(rate): f"{name}_dot", f"{name_of(one)}_dot": f"{name}_dot"}
+        state |= {name_of(self.taken[p.name]): p.name for p in parameters}
         for name, entry in events.items():
             called, role = api_arguments.called(name, "events"), f"event {name}"
             table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
@@ -438,7 +429,7 @@ class Maker:
     ) -> Iterator[Friction]:
         """Yield stick-slip friction along coordinates, over parameters."""
         values = {p.symbol: p.value for p in parameters}
-        known = {api_arguments.name_of(one): self.map[one].name for one in starts}
+        known = {name_of(one): self.map[one].name for one in starts}
         for name, size in api_arguments.by_name(friction, "friction", "{x: mu*m*g}").items():
             role = f"friction of {name}"
             if name not in known:
@@ -488,7 +479,7 @@ class Maker:
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)
         self.map[one] = symbol(used)
-        if one == symbol(api_arguments.name_of(one)):  # also without the assumption of real values
+        if one == symbol(name_of(one)):  # also without the assumption of real values
             self.map[Symbol(one.name)] = symbol(used)
         return used
 
@@ -505,7 +496,7 @@ def _own_symbols(
     """
     moving, found = {*coordinates}, dict[str, Expr]()
     for name, one in declared.items():
-        if api_arguments.name_of(one) in as_text:
+        if name_of(one) in as_text:
             continue
         found[name] = one
         if one in moving and isinstance(one, AppliedUndef):
