@@ -1,4 +1,4 @@
-"""What acts in the scene of a robot: inputs, laws of drives, tendons, weights that are borne."""
+"""Actuation in the scene of a robot: inputs, drive laws, tendons, and gravity compensation."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from eomc.robots.formulas import less, number, total
 from eomc.robots.robot import UNLIMITED, Drive, Law, Robot, RobotBody, Tendon, joined
 
 _FORCES = {"rad": "N m", "m": "N"}  # by a coordinate's unit
-_MAX_TERMS = 50  # terms of a sum at most: each nests the formula deeper, which bears 150
+_MAX_TERMS = 50  # of one sum: each term nests the formula deeper, and the limit on depth is 150
 
 
 def law_names(drive: Drive) -> tuple[str, ...]:
-    """What a drive's names end in, besides the empty end of its own."""
+    """Return the suffixes of the names that a drive's law adds to its own name."""
     return ("_force", "_kp", "_kv") if drive.law else ()
 
 
 def inputs(robot: Robot) -> dict[str, str]:
-    """The entries of [inputs]."""
+    """Return the entries of [inputs]."""
     return {d.name: _input(d, robot) for d in robot.drives}
 
 
 def gains(robot: Robot) -> dict[str, str]:
-    """The gains of servos, entries of [parameters]."""
+    """Return the gains of servos, as entries of [parameters]."""
     units, entries = _units(robot), {}
     for d in robot.drives:
         if d.law:
@@ -38,7 +38,7 @@ def gains(robot: Robot) -> dict[str, str]:
 
 
 def definitions(robot: Robot) -> dict[str, str]:
-    """The lengths of tendons and the forces of servos, entries of [definitions]."""
+    """Return the lengths of tendons and the forces of servos, as entries of [definitions]."""
     driven = {d.coordinate for d in robot.drives}
     acting = [t for t in robot.tendons if t.acts or t.name in driven]
     entries = {t.name: toml(less(total(t.terms), -t.offset)) for t in acting}
@@ -49,7 +49,7 @@ def definitions(robot: Robot) -> dict[str, str]:
 
 
 def energies(robot: Robot) -> dict[str, str]:
-    """The entries of [energy]."""
+    """Return the entries of [energy]: tendons, and the weight that is compensated (gravcomp)."""
     rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
     lifted = [b for b in robot.bodies if b.lifted and b.mass]
     weights = [
@@ -66,14 +66,14 @@ def energies(robot: Robot) -> dict[str, str]:
 
 
 def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
-    """The part of a body's mass that is borne, as a factor, times a place."""
+    """Return the compensated share of a body's mass, and its centre's coordinate on `axis`."""
     if body.parameter:
         return body.lifted, f"{body.parameter}*{body.name}_{axis}"
     return body.lifted * body.mass, f"{body.name}_{axis}"
 
 
 def force(coordinate: str, robot: Robot) -> str:
-    """What drives a coordinate, its `actuator`."""
+    """Return the formula of the force along a coordinate, its `actuator`."""
     terms = [
         (by * d.gear, f"{d.name}_force" if d.law else d.name)
         for d in robot.drives
@@ -106,7 +106,7 @@ def _input(drive: Drive, robot: Robot) -> str:
 
 
 def _law(d: Drive, law: Law, robot: Robot) -> str:
-    """The force of a servo, before the gear."""
+    """Return the formula of a servo's force, before the gear."""
     coordinate = d.coordinate in _units(robot)
     q, rate = d.coordinate, f"{d.coordinate}_dot" if coordinate else f"dot({d.coordinate})"
     gain, by_length, by_rate = law.gain
@@ -131,7 +131,7 @@ def _law(d: Drive, law: Law, robot: Robot) -> str:
 
 
 def _spring(t: Tendon) -> str:
-    """The energy of a spring of stiffness 1, which has none between the ends of its rest."""
+    """Return the energy of a spring of stiffness 1, which is zero within its range of rest."""
     low, high = t.rest
     if low == high:
         return f"({less(t.name, low)})**2/2"
@@ -140,7 +140,7 @@ def _spring(t: Tendon) -> str:
 
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
-    """A sum in parentheses, of sums where it is long."""
+    """Return a sum in parentheses; a long one is split into partial sums."""
     if len(terms) <= _MAX_TERMS:
         return f"({total(terms)})"
     return (
@@ -151,6 +151,6 @@ def _sum(terms: Sequence[tuple[float, str]]) -> str:
 
 
 def _long(formula: str) -> str:
-    """A formula of names and numbers alone as TOML has it, over lines where it is long."""
+    """Return a formula of plain names and numbers as TOML, wrapped if it is long."""
     lines = textwrap.wrap(formula, 98, break_long_words=False, break_on_hyphens=False)
     return toml(formula) if len(lines) < 2 else '"""\n' + "\n".join(lines) + '"""'

@@ -1,4 +1,4 @@
-"""What a user asks for of a robot: joints locked, parts cut, another base, inertias mended."""
+"""Options of `eomc import`: lock joints, cut out a part, change the base, correct inertias."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _LIMITS = re.compile(r"limits of (\d+ )?joints?\b")  # in what readers leave out
 
 
 def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """The robot with joints frozen: coordinate -> value (rad or m).
+    """Return the robot with joints fixed at `values`: coordinate -> value (rad or m).
 
-    Raises EomcError for what is not a coordinate, and for one of a joint that has several.
+    Raises EomcError for unknown coordinates, and for those of a joint that has several.
     """
     owners = {m.name: body for body in robot.bodies for m in body.motions}
     for name in values:
@@ -86,7 +86,7 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def with_joint_stops(robot: Robot) -> Robot:
-    """The robot with stops where its joints have limits. Raises EomcError where none has."""
+    """Return the robot with stops at its joint limits. Raises EomcError if no joint has limits."""
     stops = joint_stops(robot)
     if not stops:
         raise EomcError("--stops: no joint of this robot has limits")
@@ -103,12 +103,11 @@ def with_joint_stops(robot: Robot) -> Robot:
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
-    """The bodies from `root` on, or those on the way from there to `tip`.
+    """Return the subtree of bodies from `root`, or the chain of bodies from `root` to `tip`.
 
-    The root is fixed to the world where it stands while all coordinates have their start values,
-    so that gravity pulls as it did. What is fixed to a body on the way to the tip stays with it;
-    what the tip carries does not. Raises EomcError for unknown bodies and a tip not behind the
-    root.
+    The root is fixed to the world in its pose at the start values, so that the direction of gravity
+    relative to it is unchanged. Bodies fixed to a body of the chain are retained, except those
+    carried by the tip. Raises EomcError for unknown bodies, and if `tip` is not in the subtree.
     """
     by_name = {body.name: body for body in robot.bodies}
     for option, name in (("--root", root), ("--tip", tip)):
@@ -139,7 +138,7 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
             bodies[k] = replace(fix_body(body, *_pose_in_world(by_name, body)), parent=WORLD)
     removed = tuple(name for name in by_name if name not in selected)
     left_out = ((f"cut off: {texts.listed(removed)}",) if removed else ()) + robot.left_out
-    frozen: dict[str, float] = {}  # the joints that hold the root, at their start
+    frozen: dict[str, float] = {}  # the joints between the world and the root, at their start
     above = by_name[root] if root and by_name[root].parent != WORLD else None
     while above:
         frozen |= {m.name: m.start for m in above.motions if not m.mimics}
@@ -148,7 +147,10 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
 
 
 def with_nearest_inertias(robot: Robot) -> Robot:
-    """The robot with the nearest tensor in place of each that no body can have, noted."""
+    """Return the robot with each inertia that no body can have replaced by the nearest valid one.
+
+    The replacements are reported.
+    """
     bodies, words = [], []
     for body in robot.bodies:
         inertia = without_dust(body)
@@ -164,9 +166,10 @@ def with_nearest_inertias(robot: Robot) -> Robot:
 
 
 def with_base(robot: Robot, free: bool) -> Robot:
-    """The robot with its first body free, or fixed to the world where it starts.
+    """Return the robot with its root body free, or fixed to the world in its pose at the start.
 
-    A free one starts where it was fixed. Raises EomcError where several bodies stand on the world.
+    A free root starts in the pose in which it was fixed. Raises EomcError if several bodies are
+    attached to the world.
     """
     roots = [body for body in robot.bodies if body.parent == WORLD]
     if len(roots) != 1:
@@ -199,7 +202,7 @@ def _at_start(body: RobotBody) -> tuple[Vector, Matrix]:
 
 
 def _pose_in_world(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, Matrix]:
-    """Where the body's frame stands in the world at the start."""
+    """Return the pose of the body's frame in the world at the start."""
     offset, rotation = _at_start(body)
     while body.parent != WORLD:
         body = by_name[body.parent]

@@ -1,4 +1,4 @@
-"""Constraints of a robot that hold nothing: what they join does not move against each other."""
+"""Ineffective constraints of a robot: loops and couplings whose Jacobian is identically zero."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from eomc.base.spatial import plus, scaled
 from eomc.robots.robot import Robot, RobotLoop
 from eomc.robots.stiffness import coupling_gradient, loop_jacobian, rigid_bodies
 
-STATE_COUNT = 3  # random ones at which the Jacobian is zero
-ZERO_TOLERANCE = 1e-10  # of an entry of a Jacobian, relative to the distances of bodies: rounding
+STATE_COUNT = 3  # random states at which the Jacobian is evaluated
+ZERO_TOLERANCE = 1e-10  # of an entry of the Jacobian, relative to the bodies' distances
 GAP_TOLERANCE = 1e-6  # m: a larger gap is reported
 
 
 def without_ineffective_constraints(robot: Robot) -> Robot:
-    """Return the robot without loops and couplings that no motion changes, which are reported.
+    """Return the robot without loops and couplings whose Jacobian is zero; they are reported.
 
     MuJoCo gives such an equality no rows.
     """
@@ -58,7 +58,7 @@ def without_ineffective_constraints(robot: Robot) -> Robot:
 
 
 def _described(loop: RobotLoop, robot: Robot, rows: list[str]) -> str:
-    """Return a loop's name, with the distance of its points where it is not closed."""
+    """Return a loop's name, with the distance between its points if it is open."""
     rigid = rigid_bodies(robot.bodies, rows)
     one, other = (rigid[b].point(p) for b, p in zip(loop.bodies, loop.points, strict=True))
     gap = float(np.linalg.norm(plus(one, scaled(other, -1.0))))

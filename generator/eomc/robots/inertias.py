@@ -1,4 +1,4 @@
-"""Inertias as robot files have them: rotated, what no body can have, and what would do."""
+"""Inertia tensors of robot files: rotation, physical validity, and the nearest valid tensor."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ TRIANGLE = 1e-6  # relative excess of a principal moment over the other two that
 
 
 def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
-    """A I A^T; what rounding left of a zero is zero."""
+    """Return A I A^T, with entries that are only rounding error set to zero."""
     size = 1e-15 * max(map(abs, inertia))
     return six(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
 
 
 def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
-    """The principal moments, the smallest first, and their axes."""
+    """Return the principal moments in ascending order, and their axes."""
     import numpy as np
 
     moments, axes = np.linalg.eigh(spatial.tensor(inertia))
@@ -28,7 +28,7 @@ def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
 
 
 def indefinite(inertia: Inertia) -> str:
-    """In words, with one that would do, that a principal moment is negative, or ""."""
+    """Return a message if a principal moment is negative, with the nearest valid tensor; or ""."""
     moments, _ = principal(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
         return ""
@@ -45,10 +45,10 @@ def indefinite(inertia: Inertia) -> str:
 
 
 def has_nearest(inertia: Inertia) -> bool:
-    """Return whether the nearest tensor of a body has anything of this one.
+    """Return whether the nearest valid tensor differs from zero.
 
-    With a negative principal moment and fewer than two positive ones it is zero, that of a point:
-    signs were lost.
+    It is zero if one principal moment is negative and fewer than two are positive; the tensor in
+    the file then has wrong signs.
     """
     (small, middle, _), _ = principal(inertia)
     tiny = TRIANGLE * max(map(abs, inertia))
@@ -56,7 +56,7 @@ def has_nearest(inertia: Inertia) -> bool:
 
 
 def unbalanced(inertia: Inertia) -> str:
-    """In words, with one that would do, that a moment exceeds the other two together, or ""."""
+    """Return a message if a principal moment exceeds the sum of the other two; or ""."""
     (small, middle, large), _ = principal(inertia)
     if large <= (small + middle) * (1 + TRIANGLE):
         return ""
@@ -68,10 +68,11 @@ def unbalanced(inertia: Inertia) -> str:
 
 
 def nearest(inertia: Inertia) -> Inertia:
-    """The tensor that a body can have with the least sum of squares of what changes (Frobenius).
+    """Return the tensor of a physical body that is nearest in the Frobenius norm.
 
-    It has the same axes. Its principal moments are I = (b + c, a + c, a + b) with the second
-    moments a, b, c >= 0 of the mass along them: least squares, of which some are zero.
+    It has the same principal axes. Its principal moments are I = (b + c, a + c, a + b), where
+    a, b, c >= 0 are the second moments of mass along the axes: nonnegative least squares, solved
+    by trying every set of positive ones.
     """
     import numpy as np
 
@@ -92,5 +93,5 @@ def nearest(inertia: Inertia) -> Inertia:
 
 
 def shown(inertia: Inertia) -> str:
-    """The six numbers, for a message."""
+    """Return the six entries as text, for a message."""
     return f"[{', '.join(f'{x:.8g}' for x in inertia)}]"

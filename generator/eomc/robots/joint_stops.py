@@ -1,10 +1,10 @@
-"""Limits of joints as stops: springs that push back beyond them, and give less than they took.
+"""Joint stops: position limits as stiff, dissipative springs.
 
-The force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v), which never pulls: x is
-how far the joint is beyond it, v how fast it goes on. k is the joint's effort over `depth`, so that
-a joint driven as hard as it may be rests that far in its stop: what the joint takes, or its drives
-together give, the lesser of these. Where the file tells neither, what holds all that the joint
-carries, stretched out against gravity, stands for it.
+The contact force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v), cut off at zero
+so that it never pulls; x is the penetration and v = dx/dt. k = effort/depth, so that the full
+effort of the joint penetrates by `depth`. The effort is the smaller of the joint's own limit and
+the largest total force of its drives. If the file gives neither, it is the force that holds all
+bodies carried by the joint, stretched out, against gravity.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ DAMPING = {"rad": 1.0, "m": 10.0}  # s/rad, s/m
 
 @dataclass(frozen=True)
 class Stop:
-    """The stop of a coordinate: its limits, and the force `effort` that pushes it in by depth.
+    """The stop of a coordinate: its limits, and the force `effort` that penetrates by `depth`.
 
-    known: whether the file tells that force.
+    known: whether the file gives that force, or it is estimated from weights.
     """
 
     coordinate: str
@@ -33,9 +33,11 @@ class Stop:
 
 
 def joint_stops(robot: Robot) -> list[Stop]:
-    """Of all coordinates that have limits."""
-    carried_loads: dict[str, tuple[float, float]] = {}  # by a body: mass, and moment at most
-    holding_effort: dict[str, float] = {}  # by a coordinate: what holds that against gravity
+    """Return the stops of all coordinates that have finite limits."""
+    carried_loads: dict[
+        str, tuple[float, float]
+    ] = {}  # by body: mass, and largest mass times distance
+    holding_effort: dict[str, float] = {}  # by coordinate: against gravity, N or N m
     g = math.hypot(*robot.gravity)
     for body in reversed(robot.bodies):  # children come before parents
         mass, moment = carried_loads.get(body.name, (0.0, 0.0))
@@ -44,7 +46,7 @@ def joint_stops(robot: Robot) -> list[Stop]:
         more = mass, moment + mass * math.hypot(*body.offset)
         one, other = carried_loads.get(body.parent, (0.0, 0.0)), more
         carried_loads[body.parent] = one[0] + other[0], one[1] + other[1]
-    drive_force: dict[str, float] = {}  # by a coordinate: what its drives give together
+    drive_force: dict[str, float] = {}  # by coordinate: the sum over its drives
     for d in robot.drives:
         for factor, q in robot.coordinate_terms(d.coordinate):
             drive_force[q] = drive_force.get(q, 0.0) + (

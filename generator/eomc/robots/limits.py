@@ -1,4 +1,4 @@
-"""Limits of drives in robot files as limits of inputs, each in the unit of its input."""
+"""Limits of drives in robot files as limits of the scene's inputs, each in its input's unit."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.robots.robot import UNLIMITED, Range, Robot
 
-# what readers say of limits that act now, and of those of position and speed beside them
+# notes of the readers: on limits that take effect here, and on those of position and speed
 _ACTING = re.compile(r"limits of (actuators|the actuators' force on joints), kept as notes")
 _JOINTS = re.compile(r"^(limits of \d+ joints?)(?=: )")
-_STOPS = "those of speed and effort are notes"  # of edit.stopped
+_STOPS = "those of speed and effort are notes"  # a note of edit.with_joint_stops
 
 
 def input_range(force: Range, factor: float) -> Range:
-    """The limits of an input whose force is factor times its value."""
+    """Return the limits of an input whose force is `factor` times its value."""
     if not factor:
         return UNLIMITED
     low, high = sorted(f / factor for f in force)
@@ -24,17 +24,17 @@ def input_range(force: Range, factor: float) -> Range:
 
 
 def intersection(one: Range, other: Range) -> Range | None:
-    """The limits of what obeys both; None where no more than a value does."""
+    """Return the intersection of two ranges; None if it is empty or a point."""
     low, high = max(one[0], other[0]), min(one[1], other[1])
     return (low, high) if low < high else None
 
 
 def with_input_limits(robot: Robot) -> Robot:
-    """The robot with limits of drives as those of their inputs; with those of its joint's force.
+    """Return the robot with inputs limited by their drive and by the force limits of its joint.
 
-    Servos have limits of their forces besides. A joint that several drives share, or tendons pull,
-    has the sum of their forces within its own limits: these are told and left out. Raises
-    EomcError where none has limits.
+    Servos limit their force instead of their input. The force limits of a joint that several
+    drives or tendons act on apply to the sum of their forces; they are reported and left out.
+    Raises EomcError if no input has limits.
     """
     on = [q for d in robot.drives for _, q in robot.coordinate_terms(d.coordinate)]
     driven = {m.name: m.driven for m in robot.motions if m.driven != UNLIMITED}

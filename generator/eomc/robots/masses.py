@@ -68,7 +68,7 @@ def parameters(robot: Robot) -> dict[str, str]:
 
 
 def inertia_text(body: RobotBody) -> str:
-    """Return the tensor about the centre of mass, which is proportional to a mass that varies."""
+    """Return the tensor about the centre of mass; it scales with a mass that is a parameter."""
     tensor_entries = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
     if not body.parameter:
         return f"[{', '.join(map(number, tensor_entries))}]"

@@ -1,4 +1,4 @@
-"""What a robot file leaves without mass or inertia, so that D would be singular."""
+"""Joints of a robot file that move no mass or inertia, so that D would be singular."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from eomc.scene.joints import JOINTS
 
 
 def without_inertia(robot: Robot) -> list[str]:
-    """In words, each joint that moves nothing with mass or inertia."""
+    """Return a message for each joint that moves no mass or inertia, and then a remedy."""
     faults: dict[str, str] = {}  # by coordinate
     locks: dict[str, str] = {}
     resisted: set[str] = set()
@@ -40,7 +40,10 @@ def without_inertia(robot: Robot) -> list[str]:
 
 
 def light_root(robot: Robot) -> str:
-    """A free body without inertia, nor with what is fixed to it, that carries one joint, or ""."""
+    """Return the name of a massless free body that carries exactly one joint, or "".
+
+    Bodies fixed to it count as part of it.
+    """
     for root in (b for b in robot.bodies if b.joint == "free" and b.parent == WORLD):
         mine, joints = {root.name}, list[RobotBody]()
         for body in robot.bodies:

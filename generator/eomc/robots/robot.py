@@ -1,7 +1,7 @@
-"""Robots as robot files have them: bodies, joints and drives in plain numbers.
+"""Data model of a robot file: bodies, joints and drives in plain numbers.
 
-The readers (urdf.py, mjcf/) make a Robot with the names of the file, edit.py changes it as the user
-asks, scene_text.py makes it fit for a scene and writes that.
+The readers (urdf.py, mjcf/) return a Robot with the names of the file, edit.py applies the user's
+options, and scene_text.py converts it to a scene.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_an
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
-BARE = "no <inertial>"  # the note of a link that has none, and no shape
+BARE = "no <inertial>"  # note of a link without inertia and shapes
 Range = tuple[float, float]  # minimum and maximum
 Terms = tuple[tuple[float, str], ...]  # a sum of coordinates, each with its factor
 # rad or m: locked values may violate a coupling by this much: typed decimals are rounded
@@ -35,18 +35,18 @@ class Mimic:
     shift: float = 0.0
 
     def joint_position(self, value: float) -> float:
-        """Where the joint is while the coordinate has this value."""
+        """Return the position of the joint at this value of the coordinate."""
         return self.gear * value + self.shift
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A coordinate of a joint, in `unit` "rad" or "m"; where it `mimics` another, it is none.
+    """One degree of freedom of a joint, in `unit` "rad" or "m".
 
-    damping: N m s/rad or N s/m; friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or
-    N/m) and rest: of the joint's own spring. friction_width: rad/s or m/s, 0 for the default.
-    note: its limits, in words. limits: where it ends.
-    driven: the least and largest force that drives it, N m or N, infinite where nobody says.
+    It is a coordinate of the scene unless it `mimics` another one. damping: N m s/rad or N s/m;
+    friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or N/m) and rest: of the joint's
+    own spring. friction_width: rad/s or m/s, 0 for the default. note: its limits, in words.
+    limits: range of positions. driven: range of driving forces, N m or N, infinite if not given.
     """
 
     name: str
@@ -66,15 +66,15 @@ class Motion:
 
 @dataclass(frozen=True)
 class RobotBody:
-    """A body and the joint that holds it; `assembly.Body` in numbers.
+    """A body and the joint that connects it to its parent; `assembly.Body` in numbers.
 
     parent: a body above, or "world". joint: a key of joints.JOINTS, with a motion for each of
     its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
     frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
     body's frame. inertia: kg m^2, of the centre of mass, along the body's axes. point: whether it
-    only marks a place on its parent. lifted: the share of its weight that a force takes. rotor:
-    what of the diagonal of the inertia is a joint's armature, kg m^2. parameter: what its mass is
-    called in the scene, "" where that is a number.
+    only marks a point of its parent. lifted: the share of its weight that is compensated
+    (gravcomp). rotor: the armature that is included in the diagonal of the inertia, kg m^2.
+    parameter: the name of its mass in the scene, or "" if that is a number.
     """
 
     name: str
@@ -96,9 +96,10 @@ class RobotBody:
 
 @dataclass(frozen=True)
 class Law:
-    """A force that follows what it acts on: gain times an input, plus bias.
+    """The affine law of an actuator: force = gain(l, v) * input + bias(l, v).
 
-    gain, bias: each of 1, of the length and of the velocity. force: within which it stays.
+    gain, bias: coefficients of 1, of the length l and of the velocity v. force: range to which the
+    force is clamped.
     """
 
     gain: Vector
@@ -107,17 +108,17 @@ class Law:
 
     @property
     def kp(self) -> float:
-        """How stiff it is along the length."""
+        """Stiffness: position gain."""
         return -self.bias[1]
 
     @property
     def kv(self) -> float:
-        """How it damps the velocity."""
+        """Damping: velocity gain."""
         return -self.bias[2]
 
     @property
     def set_point(self) -> str:
-        """What pulls toward the input, "kp" or, where that is a velocity, "kv"; "" for none."""
+        """Gain whose set point is the input: "kp" for a position, "kv" for a velocity, or ""."""
         gain, *more = self.gain
         if not gain or any(more):
             return ""
@@ -125,16 +126,17 @@ class Law:
 
     @property
     def plain(self) -> bool:
-        """Whether it is a number times the input."""
+        """Whether the force is a constant times the input."""
         return not any((*self.gain[1:], *self.bias))
 
 
 @dataclass(frozen=True)
 class Drive:
-    """An input that acts along a coordinate, or a tendon, with the force gear times its value.
+    """An input that exerts the force gear * input along a coordinate or a tendon.
 
-    law: of which that is the input; its length is gear times the coordinate, and gear times its
-    force acts. limits: of the input, in its own unit, before the gear. start: the input at first.
+    law: the actuator's law, if it has one. Its length is then gear times the coordinate, and the
+    force along the coordinate is gear times that of the law. limits: of the input, in its own
+    unit, before the gear. start: initial value of the input.
     """
 
     name: str
@@ -147,21 +149,21 @@ class Drive:
 
     @property
     def ends(self) -> Range:
-        """Within which its force stays, before the gear."""
+        """Range of its force, before the gear."""
         return self.law.force if self.law else self.limits
 
     @property
     def max_force(self) -> float:
-        """The largest force that acts, infinite where nobody says."""
+        """Largest magnitude of the force along the coordinate, infinite if it is not limited."""
         return abs(self.gear) * max(map(abs, self.ends)) if self.gear else 0.0
 
 
 @dataclass(frozen=True)
 class Tendon:
-    """A sum of coordinates, each with its factor, that acts as its length does.
+    """A fixed tendon, whose length is a linear combination of coordinates plus `offset`.
 
-    stiffness, damping, armature: along it. rest: the length, or the ends of those, where the
-    spring pulls nothing. offset: what locked joints add to the length.
+    stiffness, damping, armature: along it. rest: the range of lengths in which its spring is slack.
+    offset: contribution of locked joints to the length.
     """
 
     name: str
@@ -174,7 +176,7 @@ class Tendon:
 
     @property
     def acts(self) -> bool:
-        """Whether it has an effect of its own, and not by a drive alone."""
+        """Whether it has stiffness, damping or armature, with or without a drive."""
         return bool(self.stiffness or self.damping or self.armature)
 
 
@@ -182,7 +184,7 @@ class Tendon:
 class RobotLoop:
     """A joint, "spherical" or "weld", that closes a loop between two bodies or with the world.
 
-    points: where it is in the frame of each, m. rotation: of the second frame in the first.
+    points: its position in each body's frame, m. rotation: of the second frame in the first.
     """
 
     name: str
@@ -194,9 +196,9 @@ class RobotLoop:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Sums of coordinates, each with its factor: first - zero = sum a_k (second - at)^k.
+    """A holonomic constraint between coordinates: first - zero = sum a_k (second - at)^k.
 
-    polynomial: a_0 to a_4. unit: of the row.
+    first, second: linear combinations of coordinates. polynomial: a_0 to a_4. unit: of both sides.
     """
 
     name: str
@@ -209,11 +211,11 @@ class Coupling:
 
     @property
     def coordinates(self) -> set[str]:
-        """The coordinates in it."""
+        """Names of the coordinates that occur in it."""
         return {q for _, q in (*self.first, *self.second)}
 
     def excess(self, values: Mapping[str, float]) -> float:
-        """Return the left side less the right side."""
+        """Return the residual: the left side less the right side."""
         first, second = (sum(by * values[q] for by, q in s) for s in (self.first, self.second))
         right = sum(a * (second - self.at) ** k for k, a in enumerate(self.polynomial))
         return first - self.zero - right
@@ -231,10 +233,11 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words.
+    """A tree of bodies, parents first, with drives, tendons and constraints; gravity in m/s^2.
 
-    stopped: whether limits of joints are stops. limited: whether those of drives act on inputs.
-    method: of runs, "" for the default.
+    stopped: whether joint limits become stops. limited: whether limits of drives become limits of
+    inputs. method: of integration, "" for the default. left_out: notes on parts of the file that
+    are not modelled.
     """
 
     name: str
@@ -256,12 +259,12 @@ class Robot:
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
     def coordinate_terms(self, name: str) -> Terms:
-        """A coordinate or a tendon as a sum of coordinates."""
+        """Return a coordinate or a tendon as a linear combination of coordinates."""
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
 def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
-    """Return the fault with a note of what is not read of the file, which may be its cause."""
+    """Return the error with a note on parts of the file that are not read and may be its cause."""
     if left_out:
         listed = "".join(f"\n  - {texts.line(words)}" for words in left_out)
         fault.add_note(f"not read of this file, which may be the cause:{listed}")
@@ -269,7 +272,7 @@ def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
 
 
 def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
-    """Where the body's frame stands in its parent's: offset (m) and rotation, at `values`."""
+    """Return the pose of a body in its parent, offset (m) and rotation, at joint `values`."""
     offset, rotation = body.offset, body.rotation
     joint = JOINTS[body.joint]
     for kind, axis, value in zip(joint.motions, joint.motion_axes(body.axes), values, strict=True):
@@ -281,17 +284,16 @@ def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]
 
 
 def fix_body(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
-    """The body on a fixed joint there."""
+    """Return the body with a fixed joint in this pose."""
     return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
 
 
 def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
-    """Return the robot with its joints fixed at coordinates that are frozen (rad or m).
+    """Return the robot with joints fixed at the values of the `frozen` coordinates (rad or m).
 
-    A joint that mimics a coordinate without motion is fixed too, and so is one whose coordinate is
-    the only one that a coupling still has. In tendons and couplings frozen coordinates are
-    constants. What needs a coordinate or a body that is neither there nor frozen is left out, and
-    reported.
+    Joints that mimic a fixed coordinate are fixed as well, and so is a coordinate that a coupling
+    determines from fixed ones. In tendons and couplings fixed coordinates become constants. Drives,
+    tendons and constraints that refer to a removed coordinate or body are left out and reported.
     """
     values, coupled = _propagate_couplings(robot, frozen or {})
     free = {m.name for m in robot.motions} - values.keys()
@@ -334,7 +336,7 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
 
 
 def _fixed_position(motion: Motion, values: Mapping[str, float], free: Set[str]) -> float | None:
-    """Return where a joint without motion stands; None for one that moves."""
+    """Return the position of a joint that is fixed; None if it moves."""
     mimics = motion.mimics
     if not mimics:
         return values.get(motion.name)
@@ -346,7 +348,10 @@ def _fixed_position(motion: Motion, values: Mapping[str, float], free: Set[str])
 def _propagate_couplings(
     robot: Robot, frozen: Mapping[str, float]
 ) -> tuple[dict[str, float], list[str]]:
-    """Return the frozen coordinates, with those that couplings to them fix, and these in words."""
+    """Return the values of all coordinates that are frozen, directly or by couplings.
+
+    The second value describes those that couplings fix, one text each.
+    """
     values, words = dict(frozen), []
     motions = {m.name: m for m in robot.motions}
     waiting = [c for c in robot.couplings if c.coordinates & values.keys()]
@@ -369,7 +374,7 @@ def _propagate_couplings(
 
 
 def _split(terms: Terms, values: Mapping[str, float]) -> tuple[Terms, float]:
-    """Return the terms of coordinates without a value, and the sum of the others."""
+    """Return the terms of free coordinates, and the constant sum of the others."""
     remaining = tuple((by, q) for by, q in terms if q not in values)
     return remaining, sum((by * values[q] for by, q in terms if q in values), 0.0)
 
@@ -387,7 +392,7 @@ def _reduced(c: Coupling, values: Mapping[str, float]) -> Coupling:
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:
-    """The six coordinates of a free body; `of` marks them where there are several such bodies."""
+    """Return the six coordinates of a free body; a non-empty `of` is appended to their names."""
     end = f"_{of}" if of else ""
     slides = (Motion(f"{name}{end}", "m") for name in "xyz")
     turns = (
@@ -399,11 +404,11 @@ def free_motions(of: str = "") -> tuple[Motion, ...]:
 
 
 def without_dust(body: RobotBody) -> Inertia:
-    """Zeros for moments that are rounding: gyrations of 0.1 micrometres, as of 1e-20 kg m^2."""
+    """Return the inertia, or zero if it is rounding error: radii of gyration below 0.1 um."""
     dust = max(map(abs, body.inertia)) <= 1e-14 * body.mass
     return NO_INERTIA if dust else body.inertia
 
 
 def joined(*notes: str) -> str:
-    """Notes in a line."""
+    """Join non-empty notes by semicolons."""
     return "; ".join(note for note in notes if note)

@@ -1,4 +1,4 @@
-"""A robot fit for a scene, and the scene's text: such as a person can read and edit."""
+"""Conversion of a robot to a scene: names and checks, and the scene as readable TOML text."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
 
 MENDED = ", as --mend-inertias writes"
-_NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot") fits too
+_NAME = 32  # characters of a name, to leave room for suffixes such as "_torque" and "_dot"
 
 
 def prepared_for_scene(robot: Robot) -> Robot:
-    """The robot fit for a scene: its names such as C can bear, bare frames marked as points.
+    """Return the robot with names that are valid in a scene and with massless frames as points.
 
-    Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
-    tensor that is not positive semi-definite; one that breaks the triangle inequality is noted.
+    Raises EomcError if no joint moves, if a joint moves no mass or inertia, or if a tensor is not
+    positive semi-definite. Tensors that violate the triangle inequality are reported.
     """
     robot = without_ineffective_constraints(robot)
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
@@ -58,7 +58,7 @@ def prepared_for_scene(robot: Robot) -> Robot:
     ]
     if faults := [*faults, *without_inertia(robot)]:
         raise EomcError("\n".join(faults))
-    robot = _with_scene_names(robot)  # after the faults, which have the names that --lock takes
+    robot = _with_scene_names(robot)  # after the errors, which use the names that --lock expects
     notes = tuple(
         f"body {body.name}: {why}{MENDED}; until then the scene is refused"
         for body in robot.bodies
@@ -81,12 +81,12 @@ def prepared_for_scene(robot: Robot) -> Robot:
 
 
 def _rough(angle: float) -> bool:
-    """Whether an angle is nearly, but not quite, a multiple of pi/2."""
+    """Return whether an angle is close, but not equal, to a multiple of pi/2."""
     return SNAP < abs(angle - round(angle * 2 / math.pi) * math.pi / 2) < 1e-4
 
 
 def _with_points(robot: Robot) -> Robot:
-    """Fixed bodies that have no mass and carry no other, which only mark places, as points."""
+    """Return the robot with fixed, massless bodies that carry no other body as points."""
     bodies: list[RobotBody] = []
     parents: set[str] = set()
     for body in reversed(robot.bodies):  # children come before parents
@@ -100,9 +100,9 @@ def _with_points(robot: Robot) -> Robot:
 
 
 def _with_scene_names(robot: Robot) -> Robot:
-    """With the name of everything such as a scene can bear, and different from all others.
+    """Return the robot with names that are valid in a scene and unique.
 
-    A coordinate takes its velocity's name too, a body those of its centre of mass.
+    A coordinate also reserves its velocity's name, and a body those of its centre of mass.
     """
     taken = {name for unit in DEPTHS for name in _stop_names(unit)} if robot.stopped else set()
 
@@ -174,7 +174,7 @@ def _with_scene_names(robot: Robot) -> Robot:
 
 
 def _mimic_in_scene(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
-    """What a joint mimics, by its name in the scene."""
+    """Return the mimic of a joint with the coordinate's name in the scene."""
     mimic = motion.mimics
     return mimic and replace(mimic, coordinate=coordinates[mimic.coordinate])
 
@@ -187,10 +187,10 @@ def _renamed(old: str, new: str, note: str) -> str:
 
 
 def scene_text(robot: Robot) -> str:
-    """The scene of a robot as TOML, only what differs from the defaults written out.
+    """Return the scene of a robot as TOML, without keys that have their default values.
 
-    Numbers read back as they were, save angles within 1e-10 of a multiple of pi/12, which are
-    written as such, so that their sines are exact.
+    Numbers are written exactly, except angles within 1e-10 of a multiple of pi/12: these are
+    written as multiples of pi, so that their sines are exact.
     """
     robot = prepared_for_scene(robot)
     head = [f"# {line(robot.title)}"]
@@ -236,7 +236,7 @@ def scene_text(robot: Robot) -> str:
 
 
 def _stop_names(unit: str) -> tuple[str, str]:
-    """Parameters of stops of this unit: depth and damping."""
+    """Return the names of the parameters of stops of this unit: depth and damping."""
     kind = "slide" if unit == "m" else "turn"
     return f"stop_depth_{kind}", f"stop_damping_{kind}"
 
@@ -247,7 +247,7 @@ def _depth(unit: str) -> str:
 
 
 def _stop(s: Stop) -> str:
-    """The force of a stop, as `stops` has it."""
+    """Return the formula of a stop's force, described in `joint_stops`."""
     deep, soft = _stop_names(s.unit)
     q, (low, high) = s.coordinate, (length(x, s.unit).strip('"') for x in s.limits)
     before = f"max(0, {low} - {q})*max(0, 1 - {soft}*{q}_dot)"
@@ -256,7 +256,7 @@ def _stop(s: Stop) -> str:
 
 
 def _loop(loop: RobotLoop) -> dict[str, str]:
-    """The keys of a [[loop]] between bodies."""
+    """Return the keys of a [[loop]] between bodies."""
     entry = {
         "name": toml(loop.name),
         "joint": toml(loop.joint),
@@ -269,13 +269,13 @@ def _loop(loop: RobotLoop) -> dict[str, str]:
 
 
 def _is_gear(c: Coupling) -> bool:
-    """Whether one coordinate is a multiple of another, and a number."""
+    """Return whether one coordinate is a multiple of another plus a constant."""
     single = [by for by, _ in (*c.first, *c.second)] == [1.0, 1.0] and len(c.first) == 1
     return single and c.polynomial[1] != 0 and not any(c.polynomial[2:])
 
 
 def _gear(c: Coupling) -> dict[str, str]:
-    """The keys of a gear."""
+    """Return the keys of a gear."""
     (_, driven), (_, driving) = c.first[0], c.second[0]
     ratio = c.polynomial[1]
     offset = c.zero + c.polynomial[0] - ratio * c.at
@@ -289,7 +289,7 @@ def _gear(c: Coupling) -> dict[str, str]:
 
 
 def _row(c: Coupling) -> str:
-    """A coupling as a row of constraints."""
+    """Return a coupling as an entry of [constraints]."""
     second = less(total(c.second), c.at)
     second = second if second.isidentifier() else f"({second})"
     powers = [f"{number(a)}*{second}**{k}" for k, a in enumerate(c.polynomial) if a and k]
@@ -308,7 +308,7 @@ def _coordinate(m: Motion, robot: Robot) -> str:
 
 
 def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
-    """The keys of a [[body]] or [[point]] that differ from their defaults."""
+    """Return the keys of a [[body]] or [[point]] that differ from their defaults."""
     entry = {"name": toml(body.name)}
     if body.point:
         entry["body"] = toml(body.parent)
@@ -350,7 +350,7 @@ def _turns(turns: Sequence[tuple[str, float]]) -> str:
 
 
 def _moved_by(m: Motion) -> str:
-    """The coordinate of a joint, or the formula of the one that it mimics."""
+    """Return the coordinate of a joint, or the formula of its position if it mimics another."""
     if not m.mimics:
         return m.name
     gear, shift = number(m.mimics.gear), length(m.mimics.shift, m.unit).strip('"')

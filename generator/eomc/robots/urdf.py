@@ -1,7 +1,7 @@
-"""URDF read into a Robot. The file is data: no mesh or other file that it names is opened.
+"""Reader of URDF files. Meshes and other files that a URDF refers to are not opened.
 
-Source: the URDF specification of ROS (wiki.ros.org/urdf/XML). A link's frame is its joint's
-frame; axes stand in it; ixy and its like are entries of the tensor.
+Source: the URDF specification of ROS (wiki.ros.org/urdf/XML). A link's frame coincides with its
+joint's frame, in which axes are given; ixy, ixz and iyz are entries of the inertia tensor.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from eomc.scene.scope import cycle_text, find_cycles
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-# the parts of a link and of a joint, each at most once; * are not read, and are counted
+# elements and their attributes; those with * are not read, only counted
 _SCHEMA = schema.parse(
     """
 robot: name version
@@ -75,9 +75,9 @@ _SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")
 
 
 def read(file: str | os.PathLike[str]) -> Robot:
-    """The robot of a URDF file, its root link fixed to the world.
+    """Read the robot of a URDF file, with its root link fixed to the world.
 
-    Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
+    Raises SceneError with all faults of the robot, EomcError if the file is not a URDF.
     """
     root, shown = xml.root(file), texts.line(str(file))
     if any(tag.kind.startswith("xacro:") for tag in root.all()):
@@ -89,7 +89,7 @@ def read(file: str | os.PathLike[str]) -> Robot:
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint between two links; `motions` are for the scene, in the file's names."""
+    """A joint between two links, with its motions and drive."""
 
     name: str
     kind: str
@@ -103,7 +103,7 @@ class _Joint:
 
 
 class _Reader:
-    """One file; faults collected on the way."""
+    """Reader of one file, which collects faults."""
 
     def __init__(self, root: Tag, path: Path, shown: str) -> None:
         self.root = root
@@ -113,7 +113,7 @@ class _Reader:
         self.lines: dict[str, int] = {}  # of links and joints, by key
 
     def robot(self) -> Robot:
-        """The robot. Raises SceneError with every fault."""
+        """Return the robot. Raises SceneError with all faults."""
         links = self._named("link")
         if not links and not self.faults:
             self.say("", "the robot has no <link>: a URDF has one for each body")
@@ -136,11 +136,11 @@ class _Reader:
         return with_joints_fixed(robot)
 
     def say(self, key: str, message: str) -> None:
-        """Note a fault of a link or joint."""
+        """Record a fault of a link or joint."""
         self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
     def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:
-        """Report parts that are there more than once."""
+        """Report child elements that occur more than once."""
         for tag in tags:
             parts = [*element.each(tag)]
             if len(parts) > 1:
@@ -149,7 +149,7 @@ class _Reader:
     # --- links
 
     def _named(self, tag: str) -> dict[str, Tag]:
-        """The elements of the robot with this tag, by name."""
+        """Return the elements of the robot with this tag, by name."""
         out: dict[str, Tag] = {}
         for k, element in enumerate(self.root.each(tag)):
             name = element.get("name").strip()
@@ -218,7 +218,7 @@ class _Reader:
         return _Joint(name, kind, ends[0], ends[1], offset, rotation, axis, motions, drive)
 
     def _end(self, joint: Tag, end: str, key: str, bodies: dict[str, RobotBody]) -> str:
-        """The link at one end of a joint, or "" where it is at fault."""
+        """Return the link at one end of a joint, or "" after a fault."""
         tag = joint.first(end)
         link = "" if tag is None else tag.get("link").strip()
         if not link:
@@ -260,7 +260,7 @@ class _Reader:
         return (Motion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
     def _with_mimics(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
-        """The joints, those with <mimic> moved by the coordinate that it leads to."""
+        """Return the joints, with each <mimic> resolved to a coordinate of the scene."""
         mimics: dict[str, Mimic] = {}
         for joint in joints:
             mimic_tag = elements[joint.name].first("mimic")
@@ -296,7 +296,7 @@ class _Reader:
         return Mimic(leader, *numbers.values())
 
     def _as_mimic(self, joint: _Joint, mimic: Mimic, leader: _Joint | None) -> _Joint:
-        """The joint as it moves by what it mimics, without a drive of its own."""
+        """Return the joint with its motion as a mimic of the leader's, and without a drive."""
         for each in (joint, leader):
             if each and len(each.motions) > 1:
                 count = f"a {each.kind} joint, which has {len(each.motions)} coordinates"
@@ -311,7 +311,7 @@ class _Reader:
     # --- the tree
 
     def _tree(self, bodies: dict[str, RobotBody], joints: list[_Joint]) -> list[RobotBody]:
-        """The bodies, each chain in a row, parents first."""
+        """Return the bodies in depth-first order, parents first."""
         parent_joints: dict[str, _Joint] = {}
         child_joints: dict[str, list[_Joint]] = {name: [] for name in bodies}
         for joint in joints:
@@ -355,7 +355,10 @@ class _Reader:
         return out[1:] if out and out[0].name == WORLD else out  # many files call the ground so
 
     def _on_joint(self, body: RobotBody, joint: _Joint | None) -> list[RobotBody]:
-        """The link on its joint; a planar joint needs a frame whose z is the plane's normal."""
+        """Return the link with its joint.
+
+        A planar joint may need a frame in between, whose z axis is the plane's normal.
+        """
         if joint is None:
             return [body]
         kinds = {"continuous": "revolute", "floating": "free"}
@@ -384,7 +387,7 @@ class _Reader:
     # --- what is not modelled
 
     def _unread_parts(self) -> list[str]:
-        """What the file has besides bodies and joints, in words."""
+        """Return notes on the parts of the file that are not modelled."""
         out = [*schema.unknown_parts(self.root, _SCHEMA, "URDF")]
         links, joints = [*self.root.each("link")], [*self.root.each("joint")]
         for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
@@ -444,7 +447,7 @@ class _Reader:
         return self._value(written, f"{attribute} of <{element.kind}>", key)
 
     def _value(self, word: str, what: str, key: str) -> float:
-        """The number; 0 where it is none, so that the rest is read too."""
+        """Return the number; record a fault and return 0 if it is none, so that reading goes on."""
         try:
             return xml.number(word)
         except ValueError as why:
@@ -453,12 +456,12 @@ class _Reader:
 
 
 def _macro(written: str) -> str:
-    """The remedy where a number is one of xacro's, or ""."""
+    """Return the remedy if a number contains a xacro macro, or ""."""
     return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
 
 
 def _mimic_description(motion: Motion) -> str:
-    """A joint that mimics another in words, with its limits."""
+    """Return a description of a joint that mimics another, with its limits."""
     assert motion.mimics
     return joined(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)
 

@@ -1,4 +1,4 @@
-"""XML of strangers, read as data: no entity is expanded, nothing that it names is opened."""
+"""Reader of untrusted XML: entities are not expanded, and no other file is opened."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they 
 
 @dataclass(frozen=True, eq=False)
 class Tag:
-    """An element of the file: what it is, where it stands, what it has and holds.
+    """An element of the file, with its line, attributes and children.
 
-    text: what stands between its tags, blanks apart.
+    text: the non-blank text between its tags.
     """
 
     kind: str
@@ -35,19 +35,19 @@ class Tag:
     text: list[str] = field(default_factory=list)
 
     def get(self, key: str, default: str = "") -> str:
-        """An attribute as it is written."""
+        """Return the text of an attribute."""
         return self.attributes.get(key, default)
 
     def each(self, kind: str) -> Iterator[Tag]:
-        """The children of a kind."""
+        """Return the children of a kind."""
         return (child for child in self.children if child.kind == kind)
 
     def first(self, kind: str) -> Tag | None:
-        """The first child of a kind."""
+        """Return the first child of a kind, or None."""
         return next(self.each(kind), None)
 
     def all(self) -> Iterator[Tag]:
-        """This and every tag in it, in the file's order."""
+        """Yield this tag and all of its descendants, in the file's order."""
         waiting = [self]
         while waiting:
             yield (tag := waiting.pop())
@@ -55,7 +55,7 @@ class Tag:
 
 
 class _Builder:
-    """Puts tags together as the parser comes to them."""
+    """Target of the XML parser that builds the tree of tags."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -94,7 +94,7 @@ class _Builder:
 
 
 def root(file: str | os.PathLike[str]) -> Tag:
-    """The root element of an XML file. Raises EomcError with what is wrong and what to do."""
+    """Return the root element of an XML file. Raises EomcError with the fault and a remedy."""
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import DefusedXMLParser
 
@@ -126,7 +126,7 @@ def root(file: str | os.PathLike[str]) -> Tag:
 
 
 def number(word: str) -> float:
-    """The number that a word is; ValueError, in words, for what only Python takes for one: 1_0."""
+    """Convert a word to a number. Raises ValueError, also for Python's own syntax such as 1_0."""
     try:
         value = float("x" if "_" in word or not word.isascii() else word)
     except ValueError:

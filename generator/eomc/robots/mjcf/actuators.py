@@ -19,7 +19,7 @@ from eomc.robots.robot import UNLIMITED, Drive, Law, Motion, Range, RobotBody, T
 from eomc.robots.rotations import ORIGIN, from_quaternion, yaw_pitch_roll
 from eomc.robots.xml import Tag
 
-# how an activation, which is the input here, follows from the control
+# dyntype: dynamics from the control to the activation, which is the input here
 DYNAMICS = {"none", "integrator", "filter", "filterexact"}
 ACTIVATIONS = "activations of actuators, which are their inputs here, not what they follow"
 BESIDES = "what the key frame home has besides positions and controls"
@@ -29,9 +29,9 @@ Loaded = TypeVar("Loaded", Motion, Tendon)
 
 
 class Actuator(NamedTuple):
-    """An actuator as it is read. drive: None where it is left out. dynamics: its dyntype.
+    """An actuator of the file. drive: None if it is left out. dynamics: its dyntype.
 
-    lawful: whether its control, or activation, is the drive's input.
+    lawful: whether its control, or activation, is the drive's input, and not its force.
     """
 
     drive: Drive | None
@@ -43,9 +43,9 @@ def read_actuators(
     root: Tag, bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Tendons,
     reader: Reader,
 ) -> tuple[list[MjcfJoint], list[Actuator]]:  # fmt: skip
-    """The joints with their actuators' armature and damping, and the actuators in their order.
+    """Return the joints with their actuators' armature and damping, and the actuators.
 
-    Tendons get theirs in place. bodies: with all their masses, as the file places them.
+    Tendons are changed in place. bodies: with masses, in the pose of the file.
     """
     by_name = {joint.name: joint for joint in joints}
     tags = [tag for section in root.each("actuator") for tag in section.children]
@@ -72,7 +72,7 @@ def read_actuators(
 def _drive(
     name: str, a: AttributeReader, joints: dict[str, MjcfJoint], tendons: Tendons, reader: Reader
 ) -> Drive | None:
-    """The drive of an actuator; what it acts on gets its armature and damping."""
+    """Return the drive of an actuator; add its armature and damping to its joint or tendon."""
     report = reader.report
     damps, *more = a.numbers("damping", 3, 1) or (0.0,)
     if any(more):
@@ -119,10 +119,10 @@ def _loaded(of: Loaded, armature: float, damping: float) -> Loaded:
 def _lawful(
     drive: Drive, law: Law | None, a: AttributeReader, ends: Range, reader: Reader
 ) -> Drive:
-    """The drive with the law of an actuator, its limits and its note.
+    """Return the drive with the law of an actuator, its limits and its note.
 
-    Where its force is no affine law of its input the input is the force, before the gear. Of one
-    with an activation that is the input. ends: of what it acts on.
+    Without an affine law the input is the force, before the gear. With an activation the input is
+    the activation. ends: limits of the joint.
     """
     name, report = drive.name, reader.report
     dynamics = a.get("dyntype", "none")
@@ -160,7 +160,7 @@ def _lawful(
 
 
 def _law(a: AttributeReader) -> Law | None:
-    """The force of an actuator by its input; None where that is not affine, and for a fault."""
+    """Return the affine law of an actuator's force; None if it is not affine, or after a fault."""
     gain_type, bias_type = a.get("gaintype", "fixed"), a.get("biastype", "none")
     affine = gain_type in {"fixed", "affine"} and bias_type in {"none", "affine"}
     if not affine or a.get("dyntype", "none") not in DYNAMICS:
@@ -179,16 +179,16 @@ def _law(a: AttributeReader) -> Law | None:
 
 
 def _damped(
-    made: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint],
+    actuators: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint],
     tendons: Tendons,
 ) -> list[Actuator]:  # fmt: skip
-    """The actuators, ratios of damping as damping."""
-    if not any(each.drive and has_ratio(each.drive.law) for each in made):
-        return list(made)
+    """Return the actuators with damping ratios converted to damping."""
+    if not any(each.drive and has_ratio(each.drive.law) for each in actuators):
+        return list(actuators)
     masses, rows = masses_at_start(bodies, joints, tendons.fixed.values())
     terms = {t.name: t.terms for t in tendons.fixed.values()}
     out = []
-    for each in made:
+    for each in actuators:
         d = each.drive
         if d and d.law and has_ratio(d.law):
             along = [(d.gear * by, q) for by, q in terms.get(d.coordinate, ((1.0, d.coordinate),))]
@@ -201,7 +201,7 @@ def _damped(
 
 
 def _range(a: AttributeReader, key: str, reader: Reader) -> Range:
-    """A range of an actuator that holds, or an unlimited one."""
+    """Return an active range of an actuator, or an unlimited one."""
     values = a.numbers(f"{key}range", 2)
     if not values or not is_limited(a, f"{key}limited", reader.settings):
         return UNLIMITED
@@ -209,7 +209,7 @@ def _range(a: AttributeReader, key: str, reader: Reader) -> Range:
 
 
 def _range_note(report: Report, name: str, own: Range, control: Range, force: Range) -> str:
-    """Ranges of an actuator's input, control and force for its note; reported as left out."""
+    """Return the ranges of input, control and force as text; report them as left out."""
     words = []
     for what, ends in (("input", own), ("control", control), ("force", force)):
         if ends != UNLIMITED:
@@ -222,7 +222,7 @@ def _range_note(report: Report, name: str, own: Range, control: Range, force: Ra
 def with_key_frame_start(
     root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: Report
 ) -> tuple[list[MjcfJoint], tuple[Drive, ...]]:
-    """The joints and drives with the start of the key frame "home"; singular ones are reported."""
+    """Return joints and drives that start at the key frame "home"; report singular angles."""
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
         a = AttributeReader(tag.attributes, tag, report)
@@ -245,7 +245,7 @@ def with_key_frame_start(
 
 
 def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
-    """The joints with the positions of a key frame."""
+    """Return the joints with the positions of a key frame."""
     sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
     size = sum(sizes[joint.type] for joint in joints)
     values = a.numbers("qpos", 1_000_000, 0)
@@ -270,7 +270,7 @@ def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
 
 
 def _controlled(a: AttributeReader, actuators: Sequence[Actuator]) -> list[Drive | None]:
-    """The drives with the controls of a key frame, or the activations that integrate these."""
+    """Return the drives with the controls of a key frame, or the activations of integrators."""
     drives = [each.drive for each in actuators]
     active = [k for k, each in enumerate(actuators) if each.dynamics != "none"]
     for key, those in (("ctrl", range(len(drives))), ("act", active)):

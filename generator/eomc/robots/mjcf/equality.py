@@ -1,7 +1,7 @@
-"""Equality constraints of an MJCF file: bodies that are connected or welded, coupled joints.
+"""Equality constraints of an MJCF file: connected or welded bodies, coupled joints and tendons.
 
-MuJoCo holds them softly, as springs whose stiffness solref and solimp say; here they hold exactly.
-Where the second body is met follows from the pose in which the file is written, as in MuJoCo.
+MuJoCo's constraints are soft, with the stiffness given by solref and solimp; here they are exact.
+The point on the second body follows from the pose of the file, as in MuJoCo.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ Sides = tuple[tuple[float, Motion], ...]  # a sum of coordinates, each with its 
 
 @dataclass(frozen=True)
 class _Ends:
-    """The bodies in the pose of the file, and where the file has their frames in ours.
+    """Frames of the bodies in the pose of the file, in the scene's and in the file's convention.
 
-    poses: of our frames in the world. anchors: of our frames in the file's.
+    poses: of the scene's frames in the world. anchors: origins of the scene's frames in the file's.
     """
 
     poses: Mapping[str, Pose]
     anchors: Mapping[str, Vector]
 
     def of_file(self, body: str) -> Pose:
-        """The file's frame of a body, in the world."""
+        """Return the pose of the file's frame of a body in the world."""
         back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
         return self.poses[body].compose(back)
 
     def point(self, body: str, place: Vector) -> Vector:
-        """A place in the world, in our frame of a body."""
+        """Return a point of the world in the scene's frame of a body."""
         at, turn = self.poses[body]
         x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
         return _plain(x), _plain(y), _plain(z)
 
     def shifted(self, body: str, point: Vector) -> Vector:
-        """Return a point of the file's frame of a body in our frame of that body."""
+        """Convert a point from the file's frame of a body to the scene's."""
         return plus(point, scaled(self.anchors.get(body, ORIGIN), -1.0))
 
 
 def _plain(x: float) -> float:
-    """A length that was computed, in m: without what rounding left in its last digit."""
+    """Return a computed length, m, rounded to 15 digits."""
     return rounded(float(f"{x:.15g}"), 1.0)
 
 
@@ -67,7 +67,7 @@ def read_equalities(
     anchors: Mapping[str, Vector],
     reader: Reader,
 ) -> tuple[tuple[RobotLoop, ...], tuple[Coupling, ...]]:
-    """The loops and couplings of a file; bodies and joints as they stand in it."""
+    """Return the loops and couplings of a file; bodies and joints are in the pose of the file."""
     poses = {WORLD: IDENTITY_POSE}
     for body in bodies:
         offset, turn = body_pose(body, [m.start for m in body.motions])
@@ -80,7 +80,7 @@ def read_equalities(
 
 
 class _Reading:
-    """The constraints read so far."""
+    """Reader of equality constraints, with those read so far."""
 
     def __init__(
         self, tendons: Tendons, ends: _Ends, joints: Sequence[MjcfJoint], reader: Reader
@@ -94,7 +94,7 @@ class _Reading:
         self.couplings: list[Coupling] = []
 
     def read(self, tag: Tag) -> None:
-        """One constraint; what is not read is reported."""
+        """Read one constraint, or report it as left out."""
         report = self.reader.report
         a = self.reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "equality")
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]
@@ -132,7 +132,7 @@ class _Reading:
         self.reader.report.leave(SOFT, name)
 
     def _site(self, name: str, a: AttributeReader) -> tuple[str, Vector, Matrix] | None:
-        """A site: its body, its place in our frame of that, and the body's axes along its own."""
+        """Return a site's body, its position there, and the body's axes in the site's frame."""
         placed = self.reader.sites.get(name)
         if placed is None:
             what = missing("site", name, self.reader.sites)
@@ -146,7 +146,7 @@ class _Reading:
         return placed.body, self.ends.point(placed.body, world.place), transposed(site.turn)
 
     def _anchored(self, kind: str, a: AttributeReader) -> list[tuple[str, Vector, Matrix] | None]:
-        """Both bodies, where they meet, and the rotation of each in a frame that both share."""
+        """Return both bodies, each with the common point and its rotation in a common frame."""
         names = [a.get("body1"), a.get("body2", WORLD)]
         for name in names:
             if name not in self.ends.poses:
@@ -200,7 +200,7 @@ class _Reading:
         self.reader.report.leave(SOFT, name)
 
     def _joint(self, joint: str, name: str, a: AttributeReader) -> Sides | None:
-        """The coordinate of a joint, as a sum of one; None where there is none."""
+        """Return the coordinate of a joint, as a sum with one term; None if it has none."""
         if joint not in self.joints:
             a.fault(missing("joint", joint, self.joints) if joint else "it needs joint1")
             return None
@@ -211,7 +211,7 @@ class _Reading:
         return ((1.0, mjcf_joint.motions[0]),)
 
     def _tendon(self, tendon: str, name: str, a: AttributeReader) -> Sides | None:
-        """A tendon's length in coordinates; None where it is not a sum of these."""
+        """Return a tendon's length as a sum of coordinates; None if it is not fixed."""
         if not tendon:
             a.fault("it needs tendon1")
             return None

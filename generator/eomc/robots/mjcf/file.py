@@ -1,8 +1,8 @@
-"""The text of an MJCF file: elements with their lines, attributes, default classes, settings.
+"""Syntax of MJCF files: elements with their lines, attributes, default classes, settings.
 
-What the elements mean is taken from the XML reference of MuJoCo's documentation and, where that
-leaves it open, from what MuJoCo 3 and 4 do. Nothing that a file names is opened, unless `load` is
-asked for included files; entities and document types are refused.
+Sources are the XML reference of MuJoCo's documentation and, where it is ambiguous, the behaviour of
+MuJoCo 3 and 4. No other file is opened, except included ones if `load` is called with `include`;
+entities and document types are refused.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
 from eomc.scene.formulas import suggest
 
-SHOWN = 12  # names in one line of what is left out
+SHOWN = 12  # names in one note on parts that are left out
 
-# arrays of which an element may give the first numbers and leave the rest to its class
+# arrays of which an element may set the first entries and inherit the others from its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
 
-# attributes of what is read that change the motion in MuJoCo, unless they have a neutral value
+# attributes that are not read but change the motion in MuJoCo, unless their value is neutral
 _FRICTION_SOFTNESS = (
     "the softness of friction (solreffriction, solimpfriction), which is exact here"
 )
@@ -54,9 +54,9 @@ Classes = dict[str, dict[str, Attributes]]
 
 @dataclass
 class Report:
-    """What reading has found: faults, and what is left out, by kind, in the order found.
+    """Results of reading: faults, and names of the parts that are left out, by kind.
 
-    strangers: what MJCF does not have, in words.
+    strangers: notes on elements and attributes that MJCF does not define.
     """
 
     faults: list[Problem] = field(default_factory=list)
@@ -64,11 +64,11 @@ class Report:
     left: dict[str, list[str]] = field(default_factory=dict)
 
     def leave(self, kind: str, name: str = "") -> None:
-        """Keep that the thing `name`, of a kind, is left out."""
+        """Record that the part `name` of this kind is left out."""
         self.left.setdefault(kind, []).append(name)
 
     def read(self, kind: str, name: str) -> None:
-        """Something that was left out is read after all."""
+        """Remove the record that a part is left out."""
         those = self.left.get(kind, [])
         if name in those:
             those.remove(name)
@@ -76,7 +76,7 @@ class Report:
                 del self.left[kind]
 
     def lines(self) -> tuple[str, ...]:
-        """What is left out, one line a kind; what has a name counts once."""
+        """Return one note for each kind that is left out; a name counts once."""
         lines = [*self.strangers]
         for kind, those in self.left.items():
             names = [*dict.fromkeys(name for name in those if name)]
@@ -91,7 +91,7 @@ class Report:
 
 @dataclass(frozen=True)
 class AttributeReader:
-    """The attributes that a tag has, by itself or from its class; faults in them are reported."""
+    """Typed access to the attributes of a tag, its own or inherited; faults are reported."""
 
     attributes: Attributes
     tag: Tag
@@ -101,18 +101,18 @@ class AttributeReader:
         return key in self.attributes
 
     def get(self, key: str, default: str = "") -> str:
-        """An attribute as it is written."""
+        """Return the text of an attribute."""
         return self.attributes.get(key, default)
 
     def fault(self, message: str) -> None:
-        """Report a fault, with the line it stands in; reading goes on to find the others."""
+        """Report a fault with its line; reading continues, to report all faults."""
         tag = self.tag
         self.report.faults.append(Problem(message, element_label(tag), str(tag.file), tag.line))
 
     def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
-        """The numbers of an attribute, `least` (by default `most`) to `most` of them.
+        """Return the numbers of an attribute, between `least` (default: `most`) and `most` of them.
 
-        None where there is no such attribute, or a fault.
+        Returns None if the attribute is missing or faulty.
         """
         text = self.attributes.get(key)
         if text is None:
@@ -130,17 +130,17 @@ class AttributeReader:
         return values
 
     def vector(self, key: str) -> Vector | None:
-        """Three numbers; None as for numbers."""
+        """Return three numbers, or None as in `numbers`."""
         values = self.numbers(key, 3)
         return (values[0], values[1], values[2]) if values else None
 
     def number(self, key: str, default: float = 0.0) -> float:
-        """One number."""
+        """Return one number, or the default."""
         values = self.numbers(key, 1)
         return values[0] if values else default
 
     def choice(self, key: str, choices: Sequence[str], default: str = "") -> str:
-        """A word out of `choices`, of which the first is the default if no other is given."""
+        """Return a word out of `choices`; the default is the first of them."""
         default = default or choices[0]
         word = self.get(key, default)
         if word in choices:
@@ -149,11 +149,11 @@ class AttributeReader:
         return default
 
     def is_true(self, key: str, default: bool = False) -> bool:
-        """Whether it is "true"."""
+        """Return whether the attribute is "true"."""
         return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
 
 
-# the flags that change the motion of what is read, and what they disable
+# flags that change the motion, and the effects that they disable
 EFFECTS = {
     "gravity": ("gravity",),
     "spring": ("spring",),
@@ -170,7 +170,7 @@ EFFECTS = {
 
 @dataclass(frozen=True)
 class Settings:
-    """<compiler> and <option>, as far as they bear on masses and motion."""
+    """Settings of <compiler> and <option> that affect masses and motion."""
 
     degrees: bool = True
     eulerseq: str = "xyz"
@@ -187,7 +187,7 @@ class Settings:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def angle(self, value: float) -> float:
-        """An angle of the file in rad."""
+        """Return an angle of the file in rad."""
         return math.radians(value) if self.degrees else value
 
 
@@ -195,9 +195,10 @@ class Settings:
 
 
 def load(path: Path, include: bool, report: Report) -> Tag:
-    """The file as tags, with what it includes in the place of <include>.
+    """Read the file as a tree of tags, with each <include> replaced by the included elements.
 
-    Raises SceneError where something can't be included: what needs it would seem at fault too.
+    Raises SceneError at once if a file can't be included, since elements that refer to its contents
+    would be reported as faults too.
     """
     root = xml.root(path)
     folder = path.resolve().parent
@@ -223,7 +224,7 @@ def load(path: Path, include: bool, report: Report) -> Tag:
 def _included(
     tag: Tag, folder: Path, include: bool, opened: set[Path], report: Report
 ) -> list[Tag]:
-    """What stands in the file that <include> names; it must lie in `folder`."""
+    """Return the elements of the file that <include> refers to; it must lie in `folder`."""
     a = AttributeReader(tag.attributes, tag, report)
     name = a.get("file")
     if not include:
@@ -248,18 +249,18 @@ def _included(
 
 
 def element_label(tag: Tag) -> str:
-    """A tag as errors call it."""
+    """Return the label of a tag in error messages."""
     name = tag.get("name")
     return f'{tag.kind} "{name}"' if name else tag.kind
 
 
 def missing(kind: str, name: str, known: Iterable[str]) -> str:
-    """In words, that nothing of a kind has a name, and the near one that is meant."""
+    """Return a message that nothing of this kind has the name, with a similar known name."""
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
 def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
-    """Report the attributes that change the motion in MuJoCo and are not read, as `UNREAD` has."""
+    """Report attributes in `UNREAD` that change the motion in MuJoCo and are not read."""
     for key, what in UNREAD[kind].items():
         if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):
             a.report.leave(what, name)
@@ -269,9 +270,9 @@ def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
 
 
 def settings_of(root: Tag, report: Report) -> Settings:
-    """Return <compiler> and <option>; of what is given twice, the last value counts."""
+    """Return the settings of <compiler> and <option>; the last value of a repeated one counts."""
     s = Settings()
-    disabled = dict.fromkeys(EFFECTS, False)  # by flag; one option keeps those of another
+    disabled = dict.fromkeys(EFFECTS, False)  # by flag; flags accumulate over all <option> elements
     groups: set[float] = set()
     for tag in root.each("compiler"):
         s = _compiler(s, AttributeReader(tag.attributes, tag, report))
@@ -327,10 +328,10 @@ def _compiler(s: Settings, a: AttributeReader) -> Settings:
 
 
 def classes_of(root: Tag, report: Report) -> Classes:
-    """The default classes, each with the attributes of its kinds of elements, inherited too.
+    """Return the default classes: the attributes of each kind of element, with inherited ones.
 
-    All actuators of a class share one entry, "actuator". Elements of a class hold for the classes
-    inside it wherever they stand there.
+    All actuators of a class share one entry, "actuator". Elements of a class apply to its nested
+    classes, wherever they occur in it.
     """
     classes: Classes = {"main": {}}
     for top in root.each("default"):
@@ -359,10 +360,10 @@ def classes_of(root: Tag, report: Report) -> Classes:
 
 
 def merged(base: Attributes, tag: Tag) -> Attributes:
-    """The attributes of a tag over those of its class.
+    """Return the attributes of a tag, completed by those of its class.
 
-    An orientation replaces an inherited one of whatever kind, and fromto a whole inherited pose.
-    A shortcut of <general> is written as its law of force; its name stays under the key " law".
+    An orientation replaces an inherited one of any kind, and `fromto` an inherited pose. A shortcut
+    such as <position> is converted to the attributes of <general>; the key " law" has its name.
     """
     own = {k: v for k, v in tag.attributes.items() if k not in {"class", "childclass"}}
     over = dict(base)

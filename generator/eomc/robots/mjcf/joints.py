@@ -1,4 +1,4 @@
-"""Joints of an MJCF file: their motions, axes, limits, and the names of coordinates."""
+"""Joints of an MJCF file: motions, axes, limits, and names of coordinates."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, uni
 
 
 class MjcfJoint(NamedTuple):
-    """A joint as it is read. kind: as in joints.JOINTS. type: as in MJCF.
+    """A joint of the file. kind: as in joints.JOINTS. type: as in MJCF.
 
-    anchor: where it stands in the body's frame. zero: from the body's frame there to the frame in
-    which the joint's coordinates are zero. armature: of all turns of a free or ball joint.
-    spring: its springdamper, a time constant (s) and a damping ratio; zeros where it has none.
+    anchor: its position in the body's frame. zero: pose of the frame in which the joint's
+    coordinates are zero, relative to the body's frame moved to the anchor. armature: of the
+    rotations of a free or ball joint. spring: its springdamper, a time constant (s) and a damping
+    ratio; zeros if it has none.
     """
 
     name: str
@@ -32,16 +33,16 @@ class MjcfJoint(NamedTuple):
     spring: tuple[float, float] = (0.0, 0.0)
 
 
-# what a flag of the file disables of a joint
+# properties of a joint, and the flag of the file that disables each
 DISABLES = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
 LIMITS = "limits of joints, kept as notes"
 TYPES = ("hinge", "slide", "ball", "free")
 
 
 def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint | None:
-    """A joint; `pose` is where its body stands in the parent. None for a fault.
+    """Read a joint; `pose` is that of its body in the parent. Returns None after a fault.
 
-    The motions of free and ball joints get their names in _named.
+    The motions of free and ball joints are named by `with_coordinate_names`.
     """
     report, settings, tag = reader.report, reader.settings, placed.tag
     free = tag.kind == "freejoint"
@@ -54,7 +55,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint
         return settings.angle(number) if kind == "hinge" else number
 
     def first(key: str) -> float:
-        """The linear coefficient; those of the square and the cube are reported."""
+        """Return the linear coefficient; report quadratic and cubic ones."""
         numbers = a.numbers(key, 3, 1) or (0.0,)
         if any(numbers[1:]):
             report.leave(f"{key} in the square and cube of joints", name)
@@ -123,10 +124,10 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint
 
 
 def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: Report) -> MjcfJoint:
-    """A free or ball joint with what acts along its coordinates.
+    """Return a free or ball joint with damping, friction and springs on each coordinate.
 
-    MuJoCo lets damping, friction and springs of turns act on the angular velocity and on the
-    angle of the whole turn; per angle they are the same only near zero angles, which is reported.
+    In MuJoCo these act on the angular velocity and on the total angle of rotation. Applied to each
+    of the three angles they are equivalent only near zero angles, which is reported.
     """
     springs = ("damping", "stiffness") if any(joint.spring) else ()
     keys = [key for key in ("damping", "friction", "stiffness") if own[key] or key in springs]
@@ -153,7 +154,10 @@ def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: Report) -
 def _limits(
     a: AttributeReader, kind: str, settings: Settings, name: str
 ) -> tuple[str, tuple[float, float], tuple[float, float]]:
-    """The limits of a joint in words, for its note, of position and force; reported as left out."""
+    """Return the limits of a joint as text for its note, and those of position and of force.
+
+    All are reported as left out.
+    """
     notes, ends, driven = [], Motion.limits, Motion.driven
     limits = a.numbers("range", 2)
     if limits and kind != "free" and is_limited(a, "limited", settings):
@@ -184,13 +188,13 @@ def without_limits(joint: MjcfJoint) -> MjcfJoint:
 
 
 def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
-    """Whether a range that is given holds."""
+    """Return whether a range in the file is active."""
     word = a.get(key, "auto")
     return word == "true" or (word == "auto" and settings.autolimits)
 
 
 def unique_name(name: str, taken: Collection[str]) -> str:
-    """`name`, with a number behind it where another has it."""
+    """Return `name`, with a number appended if it is taken."""
     free, number = name, 2
     while free in taken:
         free, number = f"{name}_{number}", number + 1
@@ -198,7 +202,11 @@ def unique_name(name: str, taken: Collection[str]) -> str:
 
 
 def with_coordinate_names(joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
-    """With a name of its own for each coordinate: its joint's, or x to roll of a lone free one."""
+    """Return the joints with unique names of coordinates.
+
+    The name is the joint's; of a free or ball joint it has a suffix, and the coordinates of the
+    only free joint are x, y, z, yaw, pitch and roll.
+    """
     taken = {joint.name for joint in joints if joint.type in {"hinge", "slide"}}
     several = sum(joint.type == "free" for joint in joints) > 1
     out = []

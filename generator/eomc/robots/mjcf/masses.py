@@ -1,4 +1,4 @@
-"""Poses and masses of an MJCF file: orientations, solids, <inertial>, and their sums in a body."""
+"""Poses and masses of an MJCF file: orientations, geoms, <inertial>, and the mass of a body."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, towar
 from eomc.robots.xml import Tag
 
 LEAST_MASS = 1e-15  # kg, mjMINVAL of MuJoCo's compiler
-ROUNDING = 1e-15  # what is smaller, relative to its neighbours, becomes zero
+ROUNDING = 1e-15  # relative to neighbouring entries: smaller ones become zero
 
 
 class Pose(NamedTuple):
-    """A frame in another: its origin, m, and its axes, the columns of `turn`."""
+    """Pose of a frame in another: its origin, m, and its axes, the columns of `turn`."""
 
     place: Vector
     turn: Matrix
 
     def compose(self, other: Pose) -> Pose:
-        """The frame `other`, given in this one, where this one is given."""
+        """Return the pose of `other`, relative to this frame, in the frame of this pose."""
         return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
 
 
@@ -56,7 +56,7 @@ class Mass(NamedTuple):
     inertia: Inertia = NO_INERTIA
 
     def in_frame(self, pose: Pose) -> Mass:
-        """The same in the frame in which `pose` is given."""
+        """Return the mass in the parent frame; `pose` is that of its own frame there."""
         return Mass(
             self.mass,
             plus(pose.place, apply(pose.turn, self.center)),
@@ -65,7 +65,7 @@ class Mass(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A tag in a body, with the pose of the frames around it there, and its default class."""
+    """A tag in a body, with the pose of the enclosing frames in the body, and its childclass."""
 
     tag: Tag
     body: str
@@ -75,9 +75,9 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Reader:
-    """What every step of reading needs: settings, default classes, and where faults go.
+    """Context of reading: settings, default classes, and the report of faults.
 
-    sites: those with names, found on the way.
+    sites: named sites read so far.
     """
 
     settings: Settings
@@ -86,20 +86,20 @@ class Reader:
     sites: dict[str, Placed] = field(default_factory=dict)
 
     def attributes_with_defaults(self, placed: Placed, kind: str) -> AttributeReader:
-        """What a tag has, with what its class gives: its own, or the childclass around it."""
+        """Return the attributes of a tag, completed by its class or the enclosing childclass."""
         tag = placed.tag
         default = self.class_of(tag.get("class", placed.childclass), tag)
         return AttributeReader(merged(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
-        """The default class that a tag names; the outermost one for "", or for a fault."""
+        """Return the default class with this name; the outermost one for "" or after a fault."""
         if name and name not in self.classes:
             self.own_attributes(tag).fault(missing("default class", name, self.classes))
             name = ""
         return self.classes[name or "main"]
 
     def own_attributes(self, tag: Tag) -> AttributeReader:
-        """What a tag has by itself."""
+        """Return the attributes of a tag without those of its class."""
         return AttributeReader(tag.attributes, tag, self.report)
 
 
@@ -107,7 +107,7 @@ class Reader:
 
 
 def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
-    """`vector` of length one; None, and a fault, where it has none."""
+    """Return the unit vector along `vector`; None, after a fault, if its length is zero."""
     x, y, z = vector
     if math.hypot(x, y, z) < 1e-14:
         a.fault(f"{what} has the length zero; give it a direction")
@@ -116,7 +116,7 @@ def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector 
 
 
 def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
-    """The rotation that one of quat, axisangle, euler, xyaxes, zaxis gives."""
+    """Return the rotation given by one of quat, axisangle, euler, xyaxes, zaxis."""
     keys = [key for key in ORIENTATION if key in a]
     if len(keys) > 1:
         a.fault(f"the orientation is given twice, by {' and '.join(keys)}; leave one")
@@ -147,7 +147,7 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
 
 
 def pose_of(a: AttributeReader, settings: Settings) -> Pose:
-    """Where an element's frame stands in the frame around it."""
+    """Return the pose of an element's frame in the enclosing frame."""
     return Pose(a.vector("pos") or ORIGIN, _orientation(a, settings))
 
 
@@ -160,7 +160,7 @@ def _ball(size: Sequence[float], shell: bool) -> tuple[float, Vector]:
 
 
 def _capsule(size: Sequence[float], shell: bool) -> tuple[float, Vector]:
-    """Volume (area of a shell), and the mean squares of x, y and z over it.
+    """Return the volume (area of a shell), and the mean squares of x, y and z over it.
 
     size: radius, half the length of the cylinder between the two half balls.
     """
@@ -218,13 +218,13 @@ SHAPES: dict[str, tuple[int, Callable[[Sequence[float], bool], tuple[float, Vect
     "ellipsoid": (3, _ellipsoid),
 }
 MASSLESS = ("plane", "hfield")
-FORMLESS = ("mesh", "sdf")  # their volume stands in a file of their own
+FORMLESS = ("mesh", "sdf")  # their shape is in a separate file
 
 
 def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
-    """The mass of a geom in its body's frame; None where it has none, or a fault.
+    """Return the mass of a geom in its body's frame; None if it has none, or after a fault.
 
-    still: the body doesn't move, so that a mass that isn't known doesn't matter.
+    still: the body doesn't move, so that its mass has no effect.
     """
     a = reader.attributes_with_defaults(placed, "geom")
     kind = a.choice("type", (*SHAPES, *MASSLESS, *FORMLESS))
@@ -272,7 +272,7 @@ def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
 
 
 def _form(kind: str, a: AttributeReader, settings: Settings) -> tuple[Sequence[float], Pose] | None:
-    """The sizes of a geom, m, and where it stands in the frame around it; None for a fault."""
+    """Return the sizes of a geom, m, and its pose in the enclosing frame; None after a fault."""
     count = SHAPES[kind][0]
     size, ends = a.numbers("size", 3, 1), a.numbers("fromto", 6)
     if size is None:
@@ -300,7 +300,7 @@ def _form(kind: str, a: AttributeReader, settings: Settings) -> tuple[Sequence[f
 
 
 def _sum(masses: Sequence[Mass]) -> Mass:
-    """Several masses as one: their centre, and Steiner's theorem about it."""
+    """Combine masses into one, by Steiner's theorem about the common centre of mass."""
     total = sum(m.mass for m in masses)
     if len(masses) < 2 or not total:
         return masses[0] if masses else Mass()
@@ -317,12 +317,12 @@ def _sum(masses: Sequence[Mass]) -> Mass:
 
 
 def rounded(x: float, size: float) -> float:
-    """`x`, or 0 where it is what rounding left of a zero among numbers of the size `size`."""
+    """Return x, or 0 if it is rounding error relative to numbers of magnitude `size`."""
     return x if abs(x) > ROUNDING * size else 0.0
 
 
 def _inertial(placed: Placed, reader: Reader) -> Mass | None:
-    """The mass that <inertial> gives, in its body's frame; None for a fault."""
+    """Return the mass given by <inertial>, in its body's frame; None after a fault."""
     a = reader.own_attributes(placed.tag)
     if "mass" not in a or "pos" not in a:
         a.fault(f"the <inertial> of {placed.body} needs pos and mass")
@@ -341,9 +341,9 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
 
 
 def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) -> Mass:
-    """The mass of a body, in its frame, from <inertial> or from its geoms.
+    """Return the mass of a body in its frame, from <inertial> or from its geoms.
 
-    still: the body stands still.
+    still: the body doesn't move.
     """
     how = reader.settings.inertia
     inertials = [p for p in inner if p.tag.kind == "inertial"]
@@ -359,7 +359,7 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) ->
 
 
 def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
-    """`mass` under boundmass, boundinertia and balanceinertia; its inertia checked."""
+    """Apply boundmass, boundinertia and balanceinertia to a mass, and check its inertia."""
     inertia = mass.inertia
     if not all(math.isfinite(x) for x in (mass.mass, *mass.center, *inertia)):
         a.fault("its mass or inertia overflows: check sizes, densities and places")
@@ -381,7 +381,7 @@ def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
 
 
 def scaled_to(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
-    """The bodies with masses and inertias scaled to settotalmass."""
+    """Return the bodies with masses and inertias scaled to settotalmass."""
     now = sum(body.mass for body in bodies)
     k = total / now if now else 1.0
     return [

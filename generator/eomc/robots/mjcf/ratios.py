@@ -126,5 +126,8 @@ def masses_at_start(
 
 
 def _velocity(turn: Vector, of: Vector, at: Vector) -> Vector:
-    """Of the point `at`, by a turn about a line through `of`; by a slide, `of` itself."""
+    """Return the velocity of the point `at` for one joint motion.
+
+    turn: its angular velocity about a line through `of`; zero for a slide, whose velocity is `of`.
+    """
     return cross(turn, plus(at, scaled(of, -1.0))) if any(turn) else of

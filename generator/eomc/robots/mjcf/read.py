@@ -1,4 +1,4 @@
-"""A robot from MuJoCo's MJCF: its joints, the tree of its bodies, actuators and key frames."""
+"""Reader of MuJoCo's MJCF: the tree of bodies, joints, actuators and key frames."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from eomc.robots.schema import unknown_parts
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 
-# tags in a body that say nothing about its motion, and those that would
+# tags in a body that don't affect its motion, and unsupported ones that do
 ORNAMENTS = {"camera", "light", "site"}
 GENERATORS = {"replicate", "composite", "flexcomp", "attach", "plugin", "skin"}
 
@@ -58,7 +58,7 @@ KINDS = {
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
-    """The robot in an MJCF file.
+    """Read the robot of an MJCF file.
 
     Coordinates are MuJoCo's qpos: a hinge or slide has its `ref` in the pose in which the file
     is written. Free and ball joints have yaw, pitch and roll in place of the quaternion; those of
@@ -124,10 +124,10 @@ def _geom_left_out(placed: Placed, reader: Reader) -> None:
 def _bodies(
     root: Tag, reader: Reader
 ) -> tuple[list[RobotBody], list[MjcfJoint], dict[str, Vector]]:
-    """The bodies, parents first and in the file's order, and the joints in the order of qpos.
+    """Return the bodies (parents first, in the file's order), the joints, and the anchors.
 
-    Each joint is that of one body, in the order of the bodies that move. The third is where the
-    frames of bodies stand in those of the file.
+    Joints are in the order of qpos, one for each body that moves. Anchors are the origins of the
+    bodies' frames in the frames of the file.
     """
     report, settings = reader.report, reader.settings
     worlds = list(root.each("worldbody"))
@@ -207,7 +207,7 @@ def _bodies(
 
 
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
-    """What a body holds, frames resolved, in the file's order; what is not read is reported."""
+    """Return the elements of a body in the file's order, with <frame> resolved; report others."""
     report = reader.report
     contents: list[Placed] = []
     reader.class_of(childclass, tag)
@@ -244,10 +244,10 @@ def _chain(
     taken: Collection[str],
     report: Report,
 ) -> tuple[list[RobotBody], list[MjcfJoint], Vector]:
-    """The bodies for one <body>: one a joint, in their order, the mass in the last.
+    """Return the chain of bodies for one <body>, one for each joint; the last has the mass.
 
-    still: the parent stands still. pose: of the body in the parent. The third is the place of the
-    last body's frame in that of <body>: it stands in the last joint's anchor.
+    still: the parent doesn't move. pose: of the body in the parent. The third value is the origin
+    of the last body's frame, the anchor of the last joint, in the frame of <body>.
     """
     if not joints:
         only = RobotBody(name, parent, offset=pose.place, rotation=pose.turn)
@@ -289,7 +289,7 @@ def _chain(
 
 
 def _heavy(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
-    """The body with a mass, which is given where the body's frame stands at `anchor`."""
+    """Return the body with a mass; `anchor` is its frame's origin in the frame of the mass."""
     note = ""
     if anchor != ORIGIN:
         x, y, z = anchor
@@ -299,7 +299,7 @@ def _heavy(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
 
 
 def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[RobotBody, ...]:
-    """The bodies, those that move with the motions of their joints and the armature of turns."""
+    """Return the bodies with the motions of their joints and the armature of rotations."""
     waiting = iter(joints)
     out = []
     for body in bodies:
@@ -333,7 +333,7 @@ def _sections(root: Tag, report: Report) -> None:
 
 
 def _label(tag: Tag) -> str:
-    """An entry of a section: its name, or what it is and on which things it acts."""
+    """Return the label of an entry of a section: its kind, and its name or those it refers to."""
     a = tag.attributes
     ends = [
         a[k] for k in a if k.rstrip("12") in {"body", "joint", "site", "geom", "tendon", "file"}

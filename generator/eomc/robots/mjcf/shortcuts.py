@@ -1,4 +1,4 @@
-"""The shortcuts of MJCF's <general> actuator: <motor>, <position>, ... in its own attributes."""
+"""MJCF's actuator shortcuts <motor>, <position>, ... as attributes of <general>."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from collections.abc import Mapping
 
 from eomc.robots import xml
 
-MEASURES = ("kp", "kv", "dampratio", "timeconst", "area", "diameter")  # numbers that they have
+MEASURES = (
+    "kp",
+    "kv",
+    "dampratio",
+    "timeconst",
+    "area",
+    "diameter",
+)  # numeric attributes of shortcuts
 
 
 def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """What a shortcut sets, over what its class gives; numbers that it has not come from there.
+    """Return the attributes of <general> that a shortcut sets; missing numbers are inherited.
 
-    A class that has another shortcut gives none, nor does one whose gain is no number. Of a kind
-    whose force is no affine law of its input the types of gain and bias are the kind.
+    Nothing is inherited from a class with another shortcut or without a constant gain. A kind whose
+    force is not affine in its input has the kind itself as gaintype and biastype.
     """
     same = inherited.get(" law") == kind
     if not same and (" law" in inherited or inherited.get("gaintype", "fixed") != "fixed"):
@@ -51,7 +58,7 @@ def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) ->
 
 
 def _value(text: str) -> float:
-    """A number; 0 for a fault, which whoever reads the attribute reports."""
+    """Return a number; 0 for a fault, which is reported where the attribute is read."""
     try:
         return xml.number(text)
     except ValueError:

@@ -11,11 +11,11 @@ from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Reader
 from eomc.robots.robot import Range, Tendon
 from eomc.robots.xml import Tag
 
-LEFT = "tendons"  # the kind under which those are listed that do nothing here
+LEFT = "tendons"  # kind in the report of tendons that have no effect
 
 
 class Tendons:
-    """The tendons of a file by their names in it. fixed: those that are sums of joints."""
+    """The tendons of a file, by name. fixed: those that are linear combinations of joints."""
 
     def __init__(self, root: Tag, joints: Sequence[MjcfJoint], reader: Reader) -> None:
         self.fixed: dict[str, Tendon] = {}
@@ -38,28 +38,28 @@ class Tendons:
 
     @property
     def acting(self) -> tuple[Tendon, ...]:
-        """Those that have an effect."""
+        """Fixed tendons with stiffness, damping, armature or an actuator."""
         return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
 
     def known(self, name: str, a: AttributeReader) -> bool:
-        """Whether there is such a tendon, a fault if there is none."""
+        """Return whether there is a tendon with this name; report a fault if not."""
         names = {tag.get("name") for tag in self._tags}
         if name not in names:
             a.fault(missing("tendon", name, names))
         return name in names
 
     def reads(self, name: str) -> None:
-        """A fixed tendon that is not left out."""
+        """Record that a fixed tendon is not left out."""
         self._reader.report.read(LEFT, f"fixed {name}".rstrip())
 
     def driven(self, name: str) -> str:
-        """What the coordinate of a drive along a fixed tendon is called."""
+        """Mark a fixed tendon as driven; return its name as the coordinate of the drive."""
         self._driven.add(name)
         self.reads(name)
         return self.fixed[name].name
 
     def _terms(self, tag: Tag) -> tuple[tuple[float, str], ...]:
-        """The joints of a fixed tendon, each with its factor; none where it is no sum of these."""
+        """Return the terms of a fixed tendon; none if it refers to free, ball or unknown joints."""
         terms = []
         for each in tag.each("joint"):
             a = self._reader.own_attributes(each)
@@ -102,7 +102,7 @@ class Tendons:
         )
 
     def _rest_range(self, tendon: Tendon, a: AttributeReader) -> Range:
-        """Where its spring is slack: as the file says, or as it is where those of joints are."""
+        """Return the range in which its spring is slack: springlength, or the joints' springref."""
         slack = a.numbers("springlength", 2, 1) or (-1.0,)
         if {*slack} != {-1.0}:
             return slack[0], slack[-1]
