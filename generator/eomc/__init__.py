@@ -16,12 +16,12 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    """The names that the package offers, those that are imported on first use included."""
+    """Return the public names, including those that are imported on first use."""
     return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
 
 
 def __getattr__(name: str) -> object:
-    """What needs SymPy, imported when it is asked for: that takes half a second."""
+    """Import names that need SymPy on first use, since the import takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 

@@ -1,8 +1,8 @@
-"""The whole way from a scene to a module, an arrow a function.
+"""The stages from a scene to a module; each arrow is a function.
 
     scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
 
-`load` goes the whole way; `sources` stops at the text. Each arrow is a function of one module:
+`load` runs all stages; `sources` stops at the text. Each arrow is a function of one module:
 scene.read, system.from_scene, lagrange.derive, program.build, render.render, cache.build.
 """
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 ScenePath = str | os.PathLike[str]
-LOADS = 5  # where other builds replace the module each time
+LOADS = 5  # attempts while other builds replace the module
 
 
 @contextmanager
-def _garbage_kept() -> Iterator[None]:
-    """No search for cycles: a derivation makes hundreds of thousands of values and hardly a cycle.
+def _without_garbage_collection() -> Iterator[None]:
+    """Disable the garbage collector: a derivation allocates many objects and hardly any cycles.
 
-    The search takes an eighth of the time, and a humanoid's build is no larger without it.
+    The collector takes an eighth of the time; without it a humanoid's build needs no more memory.
     """
     on = gc.isenabled()
     gc.disable()
@@ -48,7 +48,7 @@ def _garbage_kept() -> Iterator[None]:
             gc.enable()
 
 
-@_garbage_kept()
+@_without_garbage_collection()
 def read(scene: ScenePath) -> System:
     """The checked scene as a SymPy system, its start assembled where there are constraints.
 
@@ -64,7 +64,7 @@ def read(scene: ScenePath) -> System:
 
 
 def _assembled(system: System) -> System:
-    """With its start assembled, where it has constraints."""
+    """Return the system, with consistent initial values if it has constraints."""
     if not system.constraints:
         return system
     from eomc.program import assembly
@@ -72,7 +72,7 @@ def _assembled(system: System) -> System:
     return assembly.assembled(system)
 
 
-@_garbage_kept()
+@_without_garbage_collection()
 def sources(
     system: System,
     extension: str = "_extension",
@@ -103,7 +103,7 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
     return derived
 
 
-@_garbage_kept()
+@_without_garbage_collection()
 def unit(system: System, fmi: int = 2, *, warn: Callable[[Problem], None] | None = None) -> Unit:
     """The files of a unit of FMI 2 or 3, as text. warn is called with each warning."""
     from eomc.emit import render
@@ -130,8 +130,10 @@ def export_fmu(
     from eomc.toolchain import fmu
 
     _refuse_other(scene, "" if out is None else out)
-    made = unit(read(scene) if isinstance(scene, (str, os.PathLike)) else scene, fmi, warn=warn)
-    return fmu.export(made, Path(f"{made.name}.fmu" if out is None else out), binary)
+    fmu_files = unit(
+        read(scene) if isinstance(scene, (str, os.PathLike)) else scene, fmi, warn=warn
+    )
+    return fmu.export(fmu_files, Path(f"{fmu_files.name}.fmu" if out is None else out), binary)
 
 
 def build(
@@ -155,29 +157,29 @@ def build(
         from eomc.model.mechanics import Mechanics
 
         # dataclasses.replace does not change the digest of a System, so all fields are digested
-        made, name = scene, scene.name
+        system, name = scene, scene.name
         digest = hashlib.sha256(f"{scene.digest} {Mechanics.__repr__(scene)}".encode()).hexdigest()
     else:
-        made = None
+        system = None
         name, digest = name_and_digest(Path(scene))
     folder = cache.place(name, Path(root), form)
     try:
-        wanted = cache.key(digest, form)
+        key = cache.key(digest, form)
     except NoCompilerError:
         if name and (there := cache.key_there(folder, digest, form)):
             return cache.Built(name, folder, False, there)
         raise
-    if name and cache.is_built(folder, wanted):
-        return cache.Built(name, folder, False, wanted)
-    if made is None:
+    if name and cache.is_built(folder, key):
+        return cache.Built(name, folder, False, key)
+    if system is None:
         assert isinstance(scene, (str, os.PathLike))
-        made = read(scene)
+        system = read(scene)
 
     def texts(extension: str) -> Sources:
         _tell_preparing(warn)
-        return sources(made, extension, warn=warn)
+        return sources(system, extension, warn=warn)
 
-    return cache.build(made.name, wanted, texts, Path(root), form, digest)
+    return cache.build(system.name, key, texts, Path(root), form, digest)
 
 
 def write_c(
@@ -199,9 +201,9 @@ def write_c(
 
     if prefix is not None and (why := names.module_fault(prefix)):
         raise EomcError(f"--prefix: {why}")
-    made = read(scene)
-    made = made if prefix is None else replace(made, name=prefix)
-    files = sources(made, warn=warn).embeddable
+    system = read(scene)
+    system = system if prefix is None else replace(system, name=prefix)
+    files = sources(system, warn=warn).embeddable
     c_folder.write(files, Path(folder))
     return files
 
@@ -215,16 +217,16 @@ def write_wheel(
     """
     from eomc.toolchain import wheel
 
-    made = read(scene)
+    system = read(scene)
     text = Path(scene).read_bytes()
     _tell_preparing(warn)
     return wheel.build(
-        sources(made, wheel.COMPILED, warn=warn), text, made.digest, made.title, Path(folder)
+        sources(system, wheel.COMPILED, warn=warn), text, system.digest, system.title, Path(folder)
     )
 
 
 def _tell_preparing(warn: Callable[[Problem], None] | None) -> None:
-    """A note where the compiler's first call takes long."""
+    """Issue a note if the compiler's first call takes long."""
     from eomc.base.errors import Problem
     from eomc.toolchain.compiler import first_call_note
 
@@ -287,8 +289,8 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     if not isinstance(source, Path) and source.scene and read(source.file) == source:
         source = Path(source.file)
     if not isinstance(source, Path):
-        made = _eventful(source, events, what)
-        return load(made, folder / ".events" / made.digest[:16])
+        system = _eventful(source, events, what)
+        return load(system, folder / ".events" / system.digest[:16])
     try:
         data = source.read_bytes()
     except OSError as fault:
@@ -311,7 +313,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
 
 
 def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
-    """What System.make makes with events besides those that it was given."""
+    """Return the system that System.make returns with additional events."""
     from dataclasses import replace
 
     from eomc.base.errors import SceneError
@@ -325,17 +327,17 @@ def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
     if double := sorted({*map(str, own)} & {*map(str, events)}):
         raise EomcError(f"{what}: event {double[0]}: '{double[0]}' is an event already: rename it")
     try:
-        made: System = system.again(events={**own, **events})
-        return made
+        extended: System = system.again(events={**own, **events})
+        return extended
     except SceneError as wrong:
-        told = [replace(p, file=what) for p in _by_name(wrong, len(own), events).problems]
-        raise SceneError(told) from None
+        problems = [replace(p, file=what) for p in _by_name(wrong, len(own), events).problems]
+        raise SceneError(problems) from None
     except EomcError as wrong:
         raise EomcError(str(wrong).replace("System.make:", f"{what}:")) from None
 
 
 def _by_name(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneError:
-    """Faults of events by their names, which stand behind so many of the scene's own."""
+    """Replace the numbers of events in problems by names; `own` events of the scene come first."""
     from dataclasses import replace
 
     names = {f"event.{own + k}": str(called) for k, called in enumerate(events, start=1)}
@@ -348,13 +350,13 @@ def _by_name(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneErr
 
 
 def _renamed(key: str, names: Mapping[str, str]) -> str:
-    """The key of an event, by its name in place of its number."""
+    """Return the key of an event with its name in place of its number."""
     start = ".".join(key.split(".")[:2])
     return names.get(start, start) + key[len(start) :]
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:
-    """What a scene is called and the digest of its text, without checking it; no SymPy."""
+    """Return the name of a scene and the digest of its text, without checks and without SymPy."""
     from eomc.scene.toml_text import tree_and_digest
 
     try:

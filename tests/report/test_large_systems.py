@@ -207,7 +207,7 @@ def as_set_out(
     n, gamma = len(system.q), numbers(tree.gravity)
     qd = np.array([at[s] for s in system.qd])
     X, v, a, f, body, S, slopes, places = [], [], [], [], [], [], [], []
-    K, P = 0.0, number(tree.beside_potential)
+    K, P = 0.0, number(tree.other_potential)
     for link in tree.links:
         ds = np.array([number(sympy.diff(link.q, x)) for x in system.q])
         rate = sum(sympy.diff(link.q, x) * v for x, v in zip(system.q, system.qd, strict=True))
@@ -241,7 +241,7 @@ def as_set_out(
         total += ds * (S[k] @ f[k] + rotor)
         if (p := tree.links[k].parent) >= 0:
             f[p] = f[p] + X[k].T @ f[k]
-    total += [number(sympy.diff(tree.beside_potential, x)) for x in system.q]
+    total += [number(sympy.diff(tree.other_potential, x)) for x in system.q]
     return total, K, P
 
 

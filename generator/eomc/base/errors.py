@@ -14,13 +14,13 @@ MOST = 50  # problems shown, at most
 
 
 class EomcError(Exception):
-    """An error that is the user's to mend; its text is meant to be read as it stands."""
+    """An error that the user can correct; its text is complete without a traceback."""
 
     def __str__(self) -> str:
         return texts.lines(super().__str__())
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the message alone, without the calls inside the package."""
+        """Show the message in IPython without the traceback inside the package."""
         return [f"{type(self).__name__}: {self}"]
 
 

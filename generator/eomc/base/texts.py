@@ -29,20 +29,20 @@ _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\
 
 def checked_line(text: str) -> str:
     """The text, of a title or unit. Raises ValueError with the remedy for a hidden character."""
-    if found := _HIDDEN.search(text):
-        raise ValueError(_fault(text, found))
+    if match := _HIDDEN.search(text):
+        raise ValueError(_fault(text, match))
     return text
 
 
 def checked_lines(text: str) -> str:
     """The text of a note, which may have several lines, and tabs. Raises ValueError likewise."""
-    if found := _HIDDEN_IN_LINES.search(text):
-        raise ValueError(_fault(text, found))
+    if match := _HIDDEN_IN_LINES.search(text):
+        raise ValueError(_fault(text, match))
     return text
 
 
-def _fault(text: str, found: re.Match[str]) -> str:
-    c = found[0]
+def _fault(text: str, match: re.Match[str]) -> str:
+    c = match[0]
     if c == "\n":
         return "holds a line break: write it in one line"
     kind = "a control character"
@@ -52,9 +52,9 @@ def _fault(text: str, found: re.Match[str]) -> str:
         kind = "a separator of lines"
     elif re.match(f"[{_HALVES}]", c):
         kind = "no character"
-    before = f" after '{line(text[: found.start()][-20:])}'" if found.start() else " at its start"
+    before = f" after '{line(text[: match.start()][-20:])}'" if match.start() else " at its start"
     remedy = "write a space" if c == "\t" else "remove it"
-    if c in "\t\x08\x0c\r" and text[found.end() : found.end() + 1].isalpha():  # "\theta"
+    if c in "\t\x08\x0c\r" and text[match.end() : match.end() + 1].isalpha():  # "\theta"
         remedy = 'a backslash in "..." begins an escape, write the text in single quotes'
     return f"holds U+{ord(c):04X}, {kind},{before}: {remedy}"
 
@@ -73,8 +73,8 @@ def lines(text: str) -> str:
     return _HIDDEN_IN_LINES.sub(_escaped, text)
 
 
-def _escaped(found: re.Match[str]) -> str:
-    return found[0].encode("unicode_escape").decode("ascii")
+def _escaped(match: re.Match[str]) -> str:
+    return match[0].encode("unicode_escape").decode("ascii")
 
 
 def flat(text: str) -> str:
@@ -143,11 +143,11 @@ def figure(text: str) -> str:
     return line(text).replace("$", r"\$")
 
 
-def name(given: str) -> str:
-    """What stands in code as it is: a plain name, or ValueError. Readers let no other pass."""
-    if not re.fullmatch(r"[A-Za-z_][0-9A-Za-z_]*", given):
-        raise ValueError(f"{given!r} is not a plain name and can't stand in code")
-    return given
+def name(text: str) -> str:
+    """Return an identifier for generated code. Raises ValueError for any other text."""
+    if not re.fullmatch(r"[A-Za-z_][0-9A-Za-z_]*", text):
+        raise ValueError(f"{text!r} is not a plain name and can't stand in code")
+    return text
 
 
 def command(file: str) -> str:

@@ -22,7 +22,7 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     tau.
     """
     tree = system.tree
-    energies = (tree.beside_kinetic, tree.beside_potential) if tree else None
+    energies = (tree.other_kinetic, tree.other_potential) if tree else None
     energies_ = energies_on_tape(
         system, *(energies or (system.kinetic, system.potential)), accelerations=True
     )

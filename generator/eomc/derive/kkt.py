@@ -139,8 +139,8 @@ def factors(
             inverses[k] = tape.define(pivot_inverse(pivot, limit))
             inverse = tape.define(-inverses[k])
             if k - n in switched:
-                is_kept = tape.define(pivot * inverses[k])  # 1, or 0 where the pivot is dropped
-                replacement = tape.times(tape.define(DROPPED_PIVOT * (is_kept - 1)), initial)
+                retained = tape.define(pivot * inverses[k])  # 1, or 0 where the pivot is dropped
+                replacement = tape.times(tape.define(DROPPED_PIVOT * (retained - 1)), initial)
                 switched_pivots[k - n] = tape.total([pivot, replacement]), below
                 (coordinate,) = (j for j, entry in enumerate(A[k - n]) if entry != 0)
                 slides[coordinate] = tape.define(1 - sympy.sign(inverses[k]))

@@ -144,7 +144,7 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, SolveResult
     Bodies on joints by the recursive Newton-Euler algorithm, all other energies by Lagrange's
     method.
     """
-    e = energies_on_tape(system, tree.beside_kinetic, tree.beside_potential)
+    e = energies_on_tape(system, tree.other_kinetic, tree.other_potential)
     tape, q = e.tape, system.q
     rest = _lagrange(system, e)
     recursion = Recursion(tape, tree)

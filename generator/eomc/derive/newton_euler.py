@@ -68,7 +68,9 @@ class Recursion(Links):
     def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape, tree)
         self.gravity = self.vector(tree.gravity)
-        self.fixed_moment = self.vector(tree.still)  # first moment of mass fixed in the world
+        self.fixed_moment = self.vector(
+            tree.fixed_moment
+        )  # first moment of mass fixed in the world
         self.armature = [self.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
 

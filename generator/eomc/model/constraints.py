@@ -134,13 +134,13 @@ class Rows:
                 others.append(replace(row, holonomic=False))
         return (*holonomic, *others)
 
-    def settled(self, closed: Closed) -> Closed:
+    def without_constant_rows(self, closed: Closed) -> Closed:
         """Return a loop without its constant equations, each of which is reported."""
         fixed = [self._fixed(row.formula) for row in closed.rows]
         if closed.points and None in fixed:
             hardly = self._hardly_moved(closed)
             fixed = [b if a is None else a for a, b in zip(fixed, hardly, strict=True)]
-        reduced, constant = loops.settled(closed, fixed)
+        reduced, constant = loops.without_constant_rows(closed, fixed)
         far = [(row, value) for row, value in constant if not abs(value) <= NEAR]
         for row, value in far:
             why = f"can't close: its row {row.name} is {value:.6g} wherever its bodies move"

@@ -70,7 +70,7 @@ def add_stick_slip(system: Made, frictions: Sequence[Friction]) -> Made:
         rows.append(row)
         events += _events(c, s, force, row)
         sliding[c.qd.name] = s.name
-    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic + energy)
+    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic + energy)
     return replace(
         system,
         coordinates=(*system.coordinates, *states),
@@ -130,7 +130,7 @@ def without_modes(system: Made) -> Made:
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
     sticking = dict.fromkeys((c.q for c in system.coordinates[n:]), S.Zero)
-    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic - energy)
+    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic - energy)
     return replace(
         system,
         coordinates=system.coordinates[:n],

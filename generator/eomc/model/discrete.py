@@ -32,7 +32,7 @@ def add_discrete_coordinates(system: Made) -> Made:
         raise SceneError(problems)
     variables = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in jumped_parameters)
     energy = sum(c.qd**2 for c in variables) / 2
-    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic + energy)
+    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic + energy)
     return replace(
         system,
         coordinates=(*system.coordinates, *variables),
@@ -97,7 +97,7 @@ def with_constant_parameters(system: Made) -> Made:
     own = [c for c in system.coordinates if c.name not in system.discrete]
     variables = [c for c in system.coordinates if c.name in system.discrete]
     energy = sum(c.qd**2 for c in variables) / 2
-    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic - energy)
+    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic - energy)
     forces = zip(system.coordinates, system.forces or (), strict=False)
     return replace(
         system,

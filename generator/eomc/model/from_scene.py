@@ -165,7 +165,7 @@ class _Formulas:
             lambda row, message: self.problems.append(problem(row, message, "error")),
             lambda row, message: self.doubts.append(problem(row, message, "warning")),
         )
-        loops = [checks.settled(loop) for loop in closed]
+        loops = [checks.without_constant_rows(loop) for loop in closed]
         rows += [row for loop in loops for row in loop.rows]
         return checks.sorted(rows), tuple(r for loop in loops for r in loop.reactions)
 

@@ -17,25 +17,23 @@ from eomc.scene.joints import JOINTS
 from eomc.scene.scene import Scene
 
 Array = NDArray[np.float64]
-Pose = tuple[Array, Array]  # where a body's frame is in the world: offset (3,), rotation (3, 3)
-# how fast over each coordinate, "t" or "r", axis and a point on it, in the world
+Pose = tuple[Array, Array]  # of a frame in the world: offset (3,), rotation (3, 3)
+# derivative by coordinate index, "t" or "r", axis and a point on it, in the world
 Motion = tuple[dict[int, float], str, Array, Array]
 
-STEP = 1e-5  # of central differences: their error is about 1e-10
-NOTHING = 1e-7  # a column shorter than this, relative to the longest, is one of zeros
-RANK = 1e-6  # a singular value of columns of length one, relative to the largest: a zero
-PIVOT = (
-    1e-10  # of an inertia, relative to those that it is made of: above it, it is none of rounding
-)
-STATES = 3  # random ones; a rank that holds almost everywhere is the largest of them
+STEP = 1e-5  # of central differences, whose error is about 1e-10
+ZERO_COLUMN_TOLERANCE = 1e-7  # relative to the longest column
+RANK_TOLERANCE = 1e-6  # of singular values of normalised columns, relative to the largest
+PIVOT_TOLERANCE = 1e-10  # of an inertia, relative to its terms: below it, it may be rounding
+SAMPLES = 3  # random states; the largest rank holds almost everywhere
 
 
 @dataclass(frozen=True)
 class Jacobian:
-    """Over the coordinates, a column each.
+    """Jacobians with one column for each coordinate.
 
-    moves: velocities and angular velocities of all bodies, m/s and rad/s a unit of rate. weighs:
-    these times the roots of their inertias, so that D = weighs^T weighs.
+    moves: of the velocities (m/s) and angular velocities (rad/s) of all bodies. weighs: the same
+    times the square roots of the inertias, so that D = weighs^T weighs.
     """
 
     moves: Array
@@ -44,14 +42,14 @@ class Jacobian:
 
 @dataclass(frozen=True)
 class Null:
-    """Motions that move no body, and those that move nothing with inertia, a row each."""
+    """Null spaces: motions that move no body, and motions without kinetic energy, as rows."""
 
     moves: Array
     weighs: Array
 
 
 class Kinematics:
-    """A scene's bodies at a state, in plain numbers."""
+    """Numerical kinematics of the bodies of a scene."""
 
     def __init__(self, scene: Scene, assembly: Assembly) -> None:
         self.coordinates = [c.name for c in scene.coordinates]
@@ -67,9 +65,9 @@ class Kinematics:
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
 
     def states(self) -> Iterator[Null]:
-        """At random states: coordinates not too far from the start, where formulas have values."""
+        """Yield null spaces at random states near the start where all formulas have values."""
         random = np.random.default_rng(0)
-        for _ in range(STATES):
+        for _ in range(SAMPLES):
             q = self.start + random.uniform(-0.7, 0.7, len(self.start))
             if null := self.null(q, random.uniform(0, 1)):
                 yield null
@@ -77,25 +75,25 @@ class Kinematics:
                     return
 
     def null(self, q: Array, t: float) -> Null | None:
-        """What moves nothing at a state; None where a formula has no value there."""
+        """Return the null spaces at a state; None where a formula has no value."""
         if self.is_regular(q):
             return Null(*np.zeros((2, 0, len(q))))
-        found = self.jacobian(q, t)
-        return Null(_null(found.moves), _null(found.weighs)) if found else None
+        jacobian = self.jacobian(q, t)
+        return Null(_null(jacobian.moves), _null(jacobian.weighs)) if jacobian else None
 
     def is_regular(self, q: Array) -> bool:
-        """Whether every joint of a tree, armature left out, is seen to have inertia of its own.
+        """Return True if every joint of a tree has articulated inertia, without its armature.
 
         The joints are eliminated from the last one inwards (articulated bodies; Featherstone,
-        *Rigid Body Dynamics Algorithms*, ch. 7), which takes as long as the tree is. A pivot that
-        may be rounding is not judged: then the answer is False.
+        *Rigid Body Dynamics Algorithms*, ch. 7), in linear time. False also if a pivot may be
+        rounding.
         """
         by = [formula.text for body in self.tree for formula in body.coordinates]
         if self.placed or sorted(by) != sorted(self.coordinates):
             return False
         frames = self._frames(q)
-        inertia: dict[str, Array] = {}  # of what is beyond a joint, in the world's directions
-        size: dict[str, float] = {}  # of what went into it
+        inertia: dict[str, Array] = {}  # of the subtree of each joint, in world axes
+        size: dict[str, float] = {}  # scale of its terms
         for body in reversed(self.tree):
             (at, R), motions = frames[body.name]
             mass, root = self.roots[body.name]
@@ -106,7 +104,7 @@ class Kinematics:
                 turn = [axis, np.cross(axis, at - point)]  # angular velocity, and velocity at `at`
                 s = np.concatenate(turn if kind == "r" else [np.zeros(3), axis])
                 u = beyond @ s
-                if s @ u <= PIVOT * scale:
+                if s @ u <= PIVOT_TOLERANCE * scale:
                     return False
                 beyond = beyond - np.outer(u, u) / (s @ u)
             if body.parent != WORLD:
@@ -117,15 +115,18 @@ class Kinematics:
         return True
 
     def poses(self, q: Array) -> dict[str, Pose] | None:
-        """Of each body's frame, of a placed one its centre's; None where a formula has no value."""
+        """Return the pose of each body's frame, or centre if placed by formulas.
+
+        None where a formula has no value.
+        """
         try:
-            held = {name: pose for name, (pose, _) in self._frames(q).items()}
-            return held | (self._placed_at(q, 0.0) if self.placed else {})
+            by_name = {name: pose for name, (pose, _) in self._frames(q).items()}
+            return by_name | (self._placed_at(q, 0.0) if self.placed else {})
         except (ArithmeticError, ValueError, TypeError):
             return None
 
     def _frames(self, q: Array) -> dict[str, tuple[Pose, list[Motion]]]:
-        """Of each body its frame, and its joint's motions, in the world."""
+        """Return each body's frame and the motions of its joint, in the world."""
         known = self._known(q)
         out: dict[str, tuple[Pose, list[Motion]]] = {WORLD: ((np.zeros(3), np.eye(3)), [])}
         for body in self.tree:
@@ -145,11 +146,14 @@ class Kinematics:
         return out
 
     def _known(self, q: Array) -> dict[str, float]:
-        """Values of parameters, constants and coordinates."""
+        """Return the values of parameters, constants and coordinates."""
         return {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True))}
 
     def _slopes(self, by: Formula, known: dict[str, float]) -> dict[int, float]:
-        """What a joint moves by, over the coordinates; of a formula by central differences."""
+        """Return the derivatives of a joint position with respect to the coordinates.
+
+        Those of a formula are computed by central differences.
+        """
         if by.text in self.index:
             return {self.index[by.text]: 1.0}
         slopes = {}
@@ -161,23 +165,23 @@ class Kinematics:
         return slopes
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
-        """At a state; None where a formula has no value there."""
+        """Return the Jacobians at a state; None where a formula has no value."""
         try:
-            found = [*self._tree_rates(q), *self._placed_rates(q, t)]
+            velocities = [*self._tree_rates(q), *self._placed_rates(q, t)]
             rotors = [*self._armatures(q)]
         except (ArithmeticError, ValueError, TypeError):
             return None
         moves, weighs = [], []
-        for body, R, v, omega in found:
+        for body, R, v, omega in velocities:
             mass, inertia = self.roots[body.name]
             moves += [v, omega]
             weighs += [mass * v, inertia @ R.T @ omega]
         return Jacobian(np.vstack(moves), np.vstack([*weighs, *rotors]))
 
     def _tree_rates(self, q: Array) -> Iterator[tuple[Body, Array, Array, Array]]:
-        """Each body's rotation, and velocities of its centre and of turning over q: (3, nq)."""
+        """Yield each body's rotation and its translational and rotational Jacobians (3, nq)."""
         frames = self._frames(q)
-        above: dict[str, list[Motion]] = {WORLD: []}  # all between a body and the world
+        above: dict[str, list[Motion]] = {WORLD: []}  # all motions between a body and the world
         for body in self.tree:
             (at, R), own = frames[body.name]
             above[body.name] = [*above[body.parent], *own]
@@ -193,7 +197,7 @@ class Kinematics:
             yield body, R, v, omega
 
     def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
-        """The same of bodies placed by formulas, by central differences."""
+        """Yield the same for bodies placed by formulas, by central differences."""
         if not self.placed:
             return
         here = self._placed_at(q, t)
@@ -213,7 +217,7 @@ class Kinematics:
             yield body, here[body.name][1], v[body.name], omega[body.name]
 
     def _placed_at(self, q: Array, t: float) -> dict[str, Pose]:
-        """Centre of mass and rotation of each body that is placed by formulas."""
+        """Return centre of mass and rotation of each body that is placed by formulas."""
         known = {**self._known(q), "t": t}
         for name, ((at, R), _) in self._frames(q).items():
             if name != WORLD:
@@ -228,24 +232,24 @@ class Kinematics:
         }
 
     def joint_frame(self, body: Body) -> Pose:
-        """Where the joint's frame stands in the parent's."""
+        """Return the pose of the joint's frame in the parent's."""
         offset = self.vector(body.offset, self.values) if body.offset else np.zeros(3)
         return offset, self._rotation(body.rotation, self.values)
 
     def axes(self, body: Body) -> list[Array]:
-        """The axis of each coordinate of a joint, in the frame that those before it moved."""
+        """Return the axis of each coordinate of a joint, in the frame moved by those before it."""
         axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
 
     def _roots(self, body: Body) -> tuple[float, Array]:
-        """The root of the mass, and of the inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""
+        """Return the roots of mass and inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""
         inertia = [self._number(entry, self.values) for entry in body.inertia]
         moments, axes = np.linalg.eigh(spatial.tensor(inertia))
         root = np.sqrt(np.maximum(moments, 0))[:, None] * axes.T
         return math.sqrt(max(self._number(body.mass, self.values), 0)), root
 
     def _armatures(self, q: Array) -> Iterator[Array]:
-        """A row (nq,) for each armature: its root times how fast its joint moves."""
+        """Yield a row (nq,) for each armature: its square root times the gradient of its joint."""
         frames = self._frames(q)
         for body in self.tree:
             for armature, (slopes, *_) in zip(body.armature, frames[body.name][1], strict=False):
@@ -254,7 +258,7 @@ class Kinematics:
                 yield math.sqrt(max(self._number(armature, self.values), 0)) * row
 
     def vector(self, formulas_: Iterable[Formula], known: dict[str, float]) -> Array:
-        """The values of formulas, where the names have those in `known`."""
+        """Return the values of formulas, with values of names from `known`."""
         return np.array([self._number(formula, known) for formula in formulas_])
 
     def _rotation(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:
@@ -265,7 +269,7 @@ class Kinematics:
         return rotation
 
     def _number(self, formula: Formula, known: dict[str, float]) -> float:
-        """The value of a formula; definitions are followed, and kept in `known`."""
+        """Return the value of a formula; values of definitions are added to `known`."""
 
         def lookup(name: str) -> float:
             if name not in known:
@@ -279,33 +283,33 @@ class Kinematics:
 
 
 def _cross(v: Array) -> Array:
-    """[v] with [v] w = v x w."""
+    """Return the matrix [v] with [v] w = v x w."""
     x, y, z = v
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def _spatial(mass: float, center: Array, root: Array) -> Array:
-    """The inertia (6, 6) of turning rate and velocity at a point: mass, its centre, root^T root."""
+    """Return the spatial inertia (6, 6) at a point, of angular velocity and velocity."""
     c = _cross(center)
     coupled = mass * c
     return np.block([[root.T @ root - coupled @ c, coupled], [-coupled, mass * np.eye(3)]])
 
 
 def _about(axis: Array, angle: float) -> Array:
-    """The rotation by an angle about a unit axis."""
+    """Return the rotation by an angle about a unit axis."""
     return np.array(spatial.about(axis.tolist(), math.cos(angle), math.sin(angle)))
 
 
 def _null(columns: Array) -> Array:
-    """The null space, a row each, with as many zeros as elimination finds: (n - rank, n)."""
+    """Return a basis of the null space (n - rank, n), made sparse by elimination."""
     n = columns.shape[1]
     sizes = np.linalg.norm(columns, axis=0)
-    there = np.flatnonzero(sizes > NOTHING * sizes.max(initial=0.0))
+    there = np.flatnonzero(sizes > ZERO_COLUMN_TOLERANCE * sizes.max(initial=0.0))
     rows = [np.eye(n)[k] for k in range(n) if k not in there]
     if len(there):
-        upper = np.linalg.qr(columns[:, there] / sizes[there], mode="r")  # as long as wide
+        upper = np.linalg.qr(columns[:, there] / sizes[there], mode="r")
         _, values, vectors = np.linalg.svd(upper)
-        rank = int((values > RANK * values[0]).sum())
+        rank = int((values > RANK_TOLERANCE * values[0]).sum())
         for row in _eliminated(vectors[rank:]):
             full = np.zeros(n)
             full[there] = row / sizes[there]
@@ -315,7 +319,7 @@ def _null(columns: Array) -> Array:
 
 
 def _eliminated(rows: Array) -> Array:
-    """Gauss and Jordan's form of linearly independent rows."""
+    """Return the reduced row echelon form of linearly independent rows."""
     rows = rows.copy()
     for k in range(len(rows)):
         pivot = np.unravel_index(np.abs(rows[k:]).argmax(), rows[k:].shape)

@@ -181,35 +181,35 @@ def find_wrong_rotations(
     cosines = [(r.name, branch) for r in system.reactions for branch in r.branches]
     if not cosines:
         return lambda q, t, parameters: []
-    wanted = [branch for _, branch in cosines]
-    known = needed(system.definitions, wanted)
+    branches = [branch for _, branch in cosines]
+    known = needed(system.definitions, branches)
     names = [*(c.q for c in system.coordinates), t, *(p.symbol for p in system.parameters)]
     defaults = {p.name: p.value for p in system.parameters}
-    of = sympy.lambdify(names, wanted, "math", cse=lambda e: (known, e))
+    of = sympy.lambdify(names, branches, "math", cse=lambda e: (known, e))
 
     def wrong(q: Sequence[float], time: float, parameters: Mapping[str, float]) -> list[str]:
-        found = of(*q, time, *(defaults | dict(parameters)).values())
-        each = zip(cosines, found, strict=True)
+        values = of(*q, time, *(defaults | dict(parameters)).values())
+        each = zip(cosines, values, strict=True)
         return list(dict.fromkeys(name for (name, _), x in each if x < 0.5))
 
     return wrong
 
 
-def settled(
-    made: Closed, values: Sequence[float | None]
+def without_constant_rows(
+    closed: Closed, values: Sequence[float | None]
 ) -> tuple[Closed, list[tuple[Constraint, float]]]:
-    """Without the rows that no motion changes, whose multipliers are zero; and these.
+    """Return a loop without its constant equations, whose multipliers are zero, and these.
 
-    values: of each row, None of one that moves.
+    values: of each constant equation, None for others.
     """
-    rows, still = [], []
-    for row, fixed in zip(made.rows, values, strict=True):
+    rows, constant = [], []
+    for row, fixed in zip(closed.rows, values, strict=True):
         if fixed is None:
             rows.append(row)
         else:
-            still.append((row, fixed))
-    zero = {row.multiplier: S.Zero for row, _ in still}
+            constant.append((row, fixed))
+    zero = {row.multiplier: S.Zero for row, _ in constant}
     reactions = [
-        replace(r, values=tuple(S(e).xreplace(zero) for e in r.values)) for r in made.reactions
+        replace(r, values=tuple(S(e).xreplace(zero) for e in r.values)) for r in closed.reactions
     ]
-    return replace(made, rows=rows, reactions=reactions), still
+    return replace(closed, rows=rows, reactions=reactions), constant

@@ -30,16 +30,16 @@ from eomc.scene.joints import CLOSINGS, JOINTS
 if TYPE_CHECKING:
     from eomc.scene.scene import Scene
 
-TOGETHER = 1e-12  # apart, relative to how far both are from the origin: that is rounding
+COINCIDENCE_TOLERANCE = 1e-12  # relative distance below which two points coincide
 
 
 @dataclass(frozen=True)
 class Mobility:
-    """What was counted and found. joints, loops: how many of each kind; M: the count.
+    """Mobility of a mechanism. joints, loops: number of each kind; M: by the mobility formula.
 
-    coordinates: of the scene; rank: how many move the bodies independently, almost everywhere.
-    constraints: the rows that are written by hand. remarks: in words, what is redundant, missing or
-    singular.
+    coordinates: number in the scene; rank: number that move the bodies independently, almost
+    everywhere. constraints: number written as formulas. remarks: messages on redundant or missing
+    coordinates and on singular positions.
     """
 
     scene: str
@@ -54,7 +54,7 @@ class Mobility:
     constraints: int = 0
 
     def table(self) -> str:
-        """For people."""
+        """Return the result as text."""
         d, freedoms = self.d, partial(_freedoms, d=self.d)
         kinds = [f"{n} {kind} (f = {freedoms(kind)})" for kind, n in self.joints.items()]
         closing = [f"{n} {kind} (f = {_left(kind, d)})" for kind, n in self.loops.items()]
@@ -105,10 +105,10 @@ def count(scene: Scene) -> Mobility:
     closed = sum(n * (d - _left(kind, d)) for kind, n in loops.items())
     kinematics = Kinematics(scene, assembly)
     names = kinematics.coordinates
-    found = list(kinematics.states())
-    if not found:
+    samples = list(kinematics.states())
+    if not samples:
         raise EomcError(f"{scene.file}: the bodies' positions have no value at the states tried")
-    generic = min(found, key=lambda null: (len(null.moves), len(null.weighs)))
+    generic = min(samples, key=lambda null: (len(null.moves), len(null.weighs)))
     rank = len(names) - len(generic.moves)
     remarks = [
         *_fixed(assembly),
@@ -126,9 +126,9 @@ def count(scene: Scene) -> Mobility:
 
 
 def meeting(scene: Scene) -> list[Problem]:
-    """A warning for each spring and damper whose ends meet at the start.
+    """Return a warning for each spring and damper whose ends coincide at the start.
 
-    Its force has no direction there. A spring without rest length needs none.
+    Its force has no direction there. A spring without rest length does not need one.
     """
     assembly = scene.assembly
     if not assembly:
@@ -146,7 +146,7 @@ def meeting(scene: Scene) -> list[Problem]:
     poses = kinematics.poses(kinematics.start)
     if poses is None:
         return []
-    found = []
+    problems = []
     for key, line in lines:
         assert line.bodies and line.points
         one, other = (
@@ -154,13 +154,13 @@ def meeting(scene: Scene) -> list[Problem]:
             for name, point in zip(line.bodies, line.points, strict=True)
         )
         size = max(float(np.abs(one).max()), float(np.abs(other).max()))
-        if float(np.linalg.norm(one - other)) <= TOGETHER * size:
+        if float(np.linalg.norm(one - other)) <= COINCIDENCE_TOLERANCE * size:
             what = "its ends meet at the start, where its force has no direction: "
             remedy = "start elsewhere, or choose other points"
             if isinstance(line, Spring):
                 remedy += ", or a rest length of zero, which needs no direction"
-            found.append(scene.problem(key, what + remedy, severity="warning"))
-    return found
+            problems.append(scene.problem(key, what + remedy, severity="warning"))
+    return problems
 
 
 def _is_zero(formula: Formula, scene: Scene) -> bool:
@@ -193,13 +193,13 @@ def _fixed(assembly: Assembly) -> Iterator[str]:
 
 
 def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
-    seen: set[str] = set()
+    names_before: set[str] = set()
     motions, together = 0, []
     for body in assembly.bodies:
         by = {formula.text for formula in body.coordinates}
-        if seen & by or not by <= names:
+        if names_before & by or not by <= names:
             together.append(body.name)
-        seen |= by
+        names_before |= by
         motions += len(body.coordinates)
     if motions > len(names):
         fewer = motions - len(names)
@@ -274,10 +274,10 @@ def _singular_start(kinematics: Kinematics, generic: Null) -> Iterator[str]:
         (at_start.weighs, generic.weighs, "have inertia"),
     ):
         if len(null) > len(usual):
-            lost = listed([_combination(row, names) for row in null])
+            missing = listed([_combination(row, names) for row in null])
             yield (
                 f"singular start: {len(names) - len(null)} coordinates {what} there, elsewhere "
-                f"{len(names) - len(usual)}: there {lost} does not. Start with another value of "
+                f"{len(names) - len(usual)}: there {missing} does not. Start with another value of "
                 "the coordinate between, such as the pitch between yaw and roll"
             )
             return

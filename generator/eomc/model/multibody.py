@@ -31,37 +31,39 @@ Value = Callable[[str, Formula], Expr]  # the expression of a formula that stand
 
 @dataclass
 class Terms:
-    """What bodies, springs and dampers add to a system.
+    """Terms that bodies, springs and dampers add to a system.
 
-    definitions: those that the user's formulas may use. later: those that use the user's.
+    definitions: may be used by the user's formulas. later: may use the user's definitions.
     """
 
     definitions: list[tuple[Symbol, Expr]] = field(default_factory=list)
     later: list[tuple[Symbol, Expr]] = field(default_factory=list)
-    tree_kinetic: list[Expr] = field(default_factory=list)  # to be added up
+    tree_kinetic: list[Expr] = field(default_factory=list)  # terms of a sum
     tree_potential: list[Expr] = field(default_factory=list)
     kinetic: Expr = S.Zero  # of bodies placed by formulas
-    potential: Expr = S.Zero  # theirs and the springs'
+    potential: Expr = S.Zero  # of these bodies and of springs
     dissipation: Expr = S.Zero
     forces: dict[str, Expr] = field(default_factory=dict)
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
-    closed: list[Closed] = field(default_factory=list)  # by each loop
-    frictions: list[tuple[Expr, Friction]] = field(default_factory=list)  # along what, that stick
+    closed: list[Closed] = field(default_factory=list)  # one for each loop
+    frictions: list[tuple[Expr, Friction]] = field(
+        default_factory=list
+    )  # positions and stick-slip friction
     rates: dict[Symbol, Symbol] = field(default_factory=dict)  # of the coordinates of joints
-    still: Vector = ZERO
+    fixed_moment: Vector = ZERO
     gravity: Vector = ZERO
 
     def tree(self, kinetic: Expr, potential: Expr) -> Tree | None:
-        """The tree, besides energies that were written by hand; None where it is empty."""
+        """Return the tree, with energies written as formulas kept apart; None if it is empty."""
         if not self.links:
             return None
         return Tree(
             tuple(self.links),
             tuple(self.rates.items()),
             self.gravity,
-            self.still,
+            self.fixed_moment,
             kinetic + self.kinetic,
             potential + self.potential,
         )
@@ -144,7 +146,7 @@ class Builder:
         self._load(body, place)
 
     def _coordinate(self, key: str, formula: Formula) -> Expr:
-        """What a joint moves by, in coordinates, whose velocities are noted."""
+        """Return a joint position over coordinates, and record their velocities."""
         moved = self.value(f"{key}.coordinates", formula)
         by = sorted(self.coordinates.keys() & moved.free_symbols, key=str)
         self.terms.rates |= {q: self.coordinates[q] for q in by}
@@ -191,7 +193,7 @@ class Builder:
         m, c = numeric((mass, S.Zero, S.Zero))[0], numeric(center)
         moment = scaled(plus(place.offset, apply(place.rotation, c)), m)
         if place.link < 0:
-            terms.still = plus(terms.still, moment)
+            terms.fixed_moment = plus(terms.fixed_moment, moment)
         else:
             about = spatial.rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
             arm = plus(place.offset, apply(place.rotation, c))
@@ -234,7 +236,7 @@ class Builder:
     # --- bodies placed by formulas, springs and dampers ------------------------------------------
 
     def build_rest(self) -> None:
-        """What may use the user's definitions."""
+        """Build all elements that may use the user's definitions."""
         for body in self.assembly.bodies:
             if not body.joint:
                 self._put(body)
@@ -319,7 +321,7 @@ class Builder:
         self.terms.dissipation += damping * dot(self._length(key, damper, False)) ** 2 / 2
 
     def _length(self, key: str, end: Spring | Damper, square: bool) -> Expr:
-        """What a spring is stretched to. square: only its square is needed."""
+        """Return the length of a spring or damper. square: only the squared length is needed."""
         if end.coordinate:
             return symbol(end.coordinate)
         assert end.bodies is not None
@@ -370,16 +372,16 @@ class Builder:
         return R
 
     def _position(self, name: str, at: Vector, later: bool = False) -> Vector:
-        """The centre of mass, under the names that formulas may use."""
-        made = [S.Zero] * 3
+        """Return the centre of mass as the symbols that formulas may use."""
+        symbols = [S.Zero] * 3
         for k, x in enumerate(at[:2] if self.assembly.plane else at):
             wish = f"{name}_{'xyz'[k]}"
             if later:
-                made[k] = self._named(wish, x, later)
-            else:  # a name may be used even where it stands for a number
-                made[k] = symbol(wish) if x.free_symbols else x
+                symbols[k] = self._named(wish, x, later)
+            else:  # the symbol is defined even if it is a number
+                symbols[k] = symbol(wish) if x.free_symbols else x
                 self.terms.definitions.append((symbol(wish), x))
-        x, y, z = made
+        x, y, z = symbols
         return (x, y, z)
 
     def _world(self, name: str, at: Vector, later: bool = False) -> Vector:
@@ -388,7 +390,7 @@ class Builder:
         return (x, y, z)
 
     def _later(self, begin: str) -> Named:
-        """What gives names to a body's place, behind the user's definitions."""
+        """Return the function that names a body's pose, after the user's definitions."""
 
         def named(body: str, at: Vector, R: Matrix) -> tuple[Vector, Matrix]:
             R = R if self.assembly.plane else self._entries(begin + body, R, later=True)

@@ -1,6 +1,6 @@
-"""The picture of a system that is made in Python: what [picture] is to a scene, checked as there.
+"""The picture of a system made in Python, as [picture] of a scene.
 
-A scene of the system's names and its picture alone, in which expressions stand as formulas.
+The result is a scene of the system's names and its picture only, with expressions as formulas.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from eomc.scene import read
 from eomc.scene.scene import Scene
 
 _EXAMPLE = '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
-_WORDS = (  # of advice, as TOML has them and as Python does
+_WORDS = (  # phrases of messages, for TOML and for Python
     ('lines = [["cart", "tip"]]', '"lines": [["cart", "tip"]]'),
     ("[picture.points], such as tip = [", '"points", such as "tip": ['),
     (
@@ -44,9 +44,9 @@ def picture_scene(
     parameters: Iterable[Parameter], inputs: Iterable[str],
     definitions: Sequence[tuple[Symbol, Expr]],
 ) -> tuple[Scene, str]:  # fmt: skip
-    """The scene from which pictures are drawn, and its text, which the same picture has again.
+    """Return the scene from which pictures are drawn, and its canonical text.
 
-    expression: from a user's expression to ours. Raises EomcError as a scene with that [picture].
+    expression: converts a user's expression. Raises EomcError as for a scene with that [picture].
     """
     if not isinstance(picture, Mapping):
         raise api_arguments.fault("picture", f"give a dict, such as {_EXAMPLE}, here {picture!r}")
@@ -59,31 +59,31 @@ def picture_scene(
         "parameters": {p.name: {"value": p.value, **_metres(p)} for p in parameters},
         "inputs": {name: {} for name in inputs},
         "definitions": _used(table, definitions),
-        "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # which a scene has; not drawn
+        "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # required in a scene; not drawn
         "picture": table,
     }
     try:
         scene = read.check_tree(tree, "System.make")
     except SceneError as wrong:
-        told = [replace(p, message=in_python(p.message)) for p in wrong.problems]
-        raise SceneError(told) from None
+        problems = [replace(p, message=in_python(p.message)) for p in wrong.problems]
+        raise SceneError(problems) from None
     return scene, json.dumps(table, sort_keys=True, default=str)
 
 
 def in_python(message: str) -> str:
-    """What is said of a scene's [picture], in the words of Python."""
+    """Convert a message about [picture] of a scene to the syntax of Python."""
     for toml, python in _WORDS:
         message = message.replace(toml, python)
     return message
 
 
 def _metres(one: Coordinate | Parameter) -> dict[str, str]:
-    """Its unit, of which pictures need to know whether it is a length."""
+    """Return the unit if it is a length, the only one that pictures use."""
     return {"unit": "m"} if one.unit == "m" else {}
 
 
 def _written(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
-    """A value as scenes have it: expressions as formulas, whatever holds them as lists."""
+    """Convert a value to that of a scene: expressions to formulas, sequences to lists."""
     if isinstance(value, Mapping):
         return {str(key): _written(entry, expression) for key, entry in value.items()}
     if isinstance(value, sympy.MatrixBase):
@@ -98,18 +98,18 @@ def _written(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
 
 
 def _used(table: Any, definitions: Sequence[tuple[Symbol, Expr]]) -> dict[str, str]:
-    """The definitions that a picture needs, in their order."""
-    wanted = {*re.findall(r"[A-Za-z_]\w*", json.dumps(table, default=str))}
-    found: dict[str, str] = {}
+    """Return the definitions on which a picture depends, in their order."""
+    names = {*re.findall(r"[A-Za-z_]\w*", json.dumps(table, default=str))}
+    used: dict[str, str] = {}
     for name, expr in reversed(definitions):
-        if name.name in wanted:
-            wanted |= {s.name for s in expr.free_symbols if isinstance(s, Symbol)}
-            found[name.name] = text(expr)
-    return dict(reversed(found.items()))
+        if name.name in names:
+            names |= {s.name for s in expr.free_symbols if isinstance(s, Symbol)}
+            used[name.name] = text(expr)
+    return dict(reversed(used.items()))
 
 
 class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
-    """SymPy in the words of formulas."""
+    """Printer of SymPy expressions as formulas of scenes."""
 
     def _print_Function(self, expr: Any) -> str:
         name = type(expr).__name__
@@ -134,7 +134,7 @@ class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def text(expr: Expr) -> str:
-    """An expression as a formula.
+    """Return an expression as a formula.
 
     >>> x = Symbol("x")
     >>> text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))

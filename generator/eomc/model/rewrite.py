@@ -1,4 +1,4 @@
-"""SymPy functions that the formula language has not, in those that it has, where that is exact."""
+"""Exact conversion of SymPy functions to those of the formula language."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ _ORDERS = (GreaterThan, LessThan, StrictGreaterThan, StrictLessThan)
 
 
 class JumpError(ValueError):
-    """A Piecewise whose pieces do not meet, or can't be seen to."""
+    """A Piecewise that is discontinuous, or whose continuity cannot be decided."""
 
 
 def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
-    """The same function in the words of the formula language.
+    """Return an equal expression over functions of the formula language.
 
-    fixed: symbols that do not vary, and whether each is known not to be negative. Raises JumpError.
+    fixed: constant symbols, and whether each is known to be nonnegative. Raises JumpError.
     """
     expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
     return expr.replace(lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, fixed))
 
 
-def _continuous(given: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
-    """A Piecewise whose pieces meet, as a sum of products with Max.
+def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
+    """Return a continuous Piecewise as a sum of products with Max.
 
-    From the last piece on: where d > 0 a piece takes the place of another, and where their
-    difference is q d, q finite, the sum grows by q Max(d, 0), at d = 0 and beyond.
+    Starts from the last piece. Where d > 0 a piece replaces another; if their difference is q d
+    with finite q, the term q Max(d, 0) is added.
     """
-    *pieces, (made, last) = given.args
+    *pieces, (result, last) = piecewise.args
     if last != sympy.true:
-        raise JumpError(f"{given} has no last piece: give one for all else, (0, True)")
-    last_piece = made
+        raise JumpError(f"{piecewise} has no last piece: give one for all else, (0, True)")
+    last_piece = result
     for k in reversed(range(len(pieces))):
         piece, condition = pieces[k]
         if not isinstance(condition, _ORDERS):
             raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
         d = condition.gts - condition.lts
-        other = _there(condition, given.args[k + 1 :], fixed)
+        other = _there(condition, piecewise.args[k + 1 :], fixed)
         q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
         if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed.keys():
             unknown = [str(s) for s in fixed if s in condition.free_symbols and not fixed[s]]
@@ -60,15 +60,15 @@ def _continuous(given: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
             if len(pieces) == 1:
                 jump = last_piece + (piece - last_piece) * jump
             raise JumpError(
-                f"{given} jumps where {d} = 0, or can't be seen not to: write {jump}, whose "
+                f"{piecewise} jumps where {d} = 0, or can't be seen not to: write {jump}, whose "
                 f"Heaviside is 1/2 there, or Max, Min or a smooth tanh{order}"
             )
-        made += q * sympy.Max(d, 0)
-    return made
+        result += q * sympy.Max(d, 0)
+    return result
 
 
 def _there(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
-    """Which of the later pieces holds where a condition does; None where that is not clear."""
+    """Return the later piece that applies where a condition holds; None if undecided."""
     for piece, other in later:
         if _never_both(condition, sympy.Not(other), fixed):
             return piece
@@ -78,7 +78,7 @@ def _there(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | N
 
 
 def _never_both(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
-    """Whether two conditions exclude one another: for d > 0 and e > 0, d + s e <= 0 with s > 0."""
+    """Return True if two conditions exclude each other: d > 0 and e > 0 if d + s e <= 0, s > 0."""
     if isinstance(one, _ORDERS) and isinstance(other, _ORDERS):
         (d, varying), (e, against) = (
             (x.gts - x.lts).expand().as_independent(*x.free_symbols - fixed.keys(), as_Add=True)

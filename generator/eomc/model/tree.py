@@ -34,18 +34,18 @@ class Link:
 
 @dataclass(frozen=True)
 class Tree:
-    """Links, parents first. beside_*: the energies that the tree does not account for.
+    """Links, parents first, and the energies of all other parts of the system (other_*).
 
-    still: the moment of the mass that does not move at all, which has potential energy. rates:
-    the coordinates that joints move by, and their velocities.
+    fixed_moment: first moment of mass that is fixed in the world, for its potential energy. rates:
+    coordinates of joints and their velocities.
     """
 
     links: tuple[Link, ...]
     rates: tuple[tuple[Symbol, Symbol], ...]
     gravity: Vector
-    still: Vector
-    beside_kinetic: Expr = S.Zero
-    beside_potential: Expr = S.Zero
+    fixed_moment: Vector
+    other_kinetic: Expr = S.Zero
+    other_potential: Expr = S.Zero
 
 
 @dataclass(frozen=True)

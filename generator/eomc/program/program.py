@@ -211,13 +211,13 @@ def _requested(system: System) -> Iterator[Function]:
     """Yield the functions that [run] requests: frames, inverse dynamics and momenta."""
     frames = [f.name for f in system.output_frames]
     if frames:
-        found = motions(system)
+        kinematics = motions(system)
         entries = ("x", "y", "angle") if system.plane else ("x", "y", "z")
         where = [f"{name}_{entry}" for name in frames for entry in entries]
         for name in ("poses", "velocities", "accelerations", "jacobians", "forces"):
             labels = where if name == "poses" and system.plane else ()
-            values = getattr(found, name)
-            yield lower(f"frame_{name}", found.tape, values, system.names, labels=labels)
+            values = getattr(kinematics, name)
+            yield lower(f"frame_{name}", kinematics.tape, values, system.names, labels=labels)
     if system.run.inverse_dynamics:
         tape, forces = inverse_dynamics(system)
         labels = [f"tau_{c.name}" for c in system.coordinates]

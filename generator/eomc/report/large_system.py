@@ -95,7 +95,7 @@ def _energies(system: System) -> list[tuple[str, Expr]]:
     linear = [("U", system.linear_potential)] if system.linear_potential != 0 else []
     if system.tree is None:
         return [("K", system.kinetic), ("P", system.potential), *linear]
-    remaining = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential), *linear)
+    remaining = (("K'", system.tree.other_kinetic), ("P'", system.tree.other_potential), *linear)
     return [(name, e) for name, e in remaining if e != 0]
 
 
@@ -156,7 +156,7 @@ def _quadratic(system: System) -> bool:
     """True if K is known to be homogeneous quadratic in the velocities."""
     tree = system.tree
     timed = any(e.has(t) for _, e in system.definitions)
-    return tree is not None and not timed and tree.beside_kinetic == 0
+    return tree is not None and not timed and tree.other_kinetic == 0
 
 
 def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
@@ -166,8 +166,8 @@ def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
     if any(link.armature != 0 for link in tree.links):
         wrench = rf"\left({wrench} + \alpha_{{k}} \ddot{{s}}_{{k}}\right)"
         energy = rf"\left({energy} + \alpha_{{k}} \dot{{s}}_{{k}}^{{2}}\right)"
-    other_terms = f" + {_slope(P, 'q')}" * (tree.beside_potential != 0)
-    if tree.beside_kinetic != 0:
+    other_terms = f" + {_slope(P, 'q')}" * (tree.other_potential != 0)
+    if tree.other_kinetic != 0:
         other_terms += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
     turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
     X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
@@ -186,11 +186,11 @@ def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
         rf"  D \, \ddot{{q}} + C \, {DQ} + g &= \sum_{{k}} {_slope('s_{k}', 'q')} "
         rf"{wrench}{other_terms}",
         rf"  K &= \frac{{1}}{{2}} \sum_{{k}} {energy}"
-        + f" + {K}" * (tree.beside_kinetic != 0)
+        + f" + {K}" * (tree.other_kinetic != 0)
         + r", \quad "
         rf"P = -\gamma{T} \sum_{{k}} \left(m_{{k}} \, o_{{k}} + O_{{k}} \, c_{{k}}\right)"
         + f" + {P}"
-        * (tree.beside_potential != 0),
+        * (tree.other_potential != 0),
         r"  o_{k} &= o_{p} + O_{p} \, r_{k}, \quad O_{k} = O_{p} \, R_{k}, \quad O_{0} = 1",
         rf"  X_{{k}} &= {_matrix(X)}, \quad I_{{k}} = {_matrix(body)}",
     ]
