@@ -15,7 +15,7 @@ from .by_name import ByName
 from .events import EventLog
 from .initial_checks import infinite_at_start
 from .input_schedule import sample_zero_order_hold
-from .package import is_made_in_python, option
+from .package import is_built_from_system, option
 from .status import STATUS_MESSAGES, state_text
 from .stepping import Stepping
 from .trajectory import Run
@@ -36,7 +36,9 @@ FRICTION_REMEDIES = (
 def _friction() -> str:
     """The option of a scene that adds Coulomb friction with sticking."""
     return (
-        "System.make(..., friction={...})" if is_made_in_python() else option("friction", '"stick"')
+        "System.make(..., friction={...})"
+        if is_built_from_system()
+        else option("friction", '"stick"')
     )
 
 

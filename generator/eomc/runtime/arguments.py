@@ -17,7 +17,7 @@ import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .package import Defaults, meant, of_a_start, reduced
+from .package import Defaults, initial_value_message, reduced, suggestion
 
 Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
@@ -251,7 +251,7 @@ class Arguments:
             complete = self.Params()
             for name, value in by_name(params).items():
                 if name in self.coordinates:
-                    raise ValueError(f"params: {of_a_start(self, name)}")
+                    raise ValueError(f"params: {initial_value_message(self, name)}")
                 complete._set(name, value)
             return np.asarray(complete._array)
         without_mask(params, "params")
@@ -593,7 +593,7 @@ def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
     """Return the message for an unknown name: the known names and a similar one."""
     if not known:
         return f"{argument}: there is no '{name}': this scene has none"
-    return f"{argument}: '{name}' is not one of {', '.join(known)}{meant(name, known)}"
+    return f"{argument}: '{name}' is not one of {', '.join(known)}{suggestion(name, known)}"
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from .arguments import Array, not_one_of
 from .atomic_write import File
 from .labels import mathtext, with_unit
-from .plot import Curve, Source, against, finished, given_axes, new_axes, no_files
+from .plot import Curve, Source, against, check_axes, finished, new_axes, no_files
 from .plugins import require_eomc
 
 _OF_ONE = {"phase", "section", "other", "labels"}
@@ -67,7 +67,7 @@ def fan(
     if ax is None and axes is None:
         panels = new_axes(len(curves))
     else:
-        panels = given_axes(ax, axes, len(curves))
+        panels = check_axes(ax, axes, len(curves))
     for place, curve in zip(panels, curves, strict=True):
         if over is not None:
             _ends(place, curve, *_over(run, over), style)

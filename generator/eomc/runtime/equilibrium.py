@@ -1,6 +1,7 @@
-"""Where a motion rests, or goes on steadily: Newton's method on the forces.
+"""Equilibria and steady motions, by Newton's method on the forces.
 
-Constraints bear forces: what their multipliers can't is what has to vanish, and rates of rows too.
+With constraints, the residual is the part of the forces that multipliers cannot balance, and the
+residuals of the velocity constraints.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from .constrained import Constrained
 from .package import reduced
 from .status import MotionError, state_text
 
-_MOST = 100  # steps of Newton's method
-_RANK_TOLERANCE = 1e-9  # of the largest singular value of A: a row that is none here
-_SHORTEST = 2.0**-20  # part of a step that is tried
-_TRIES, _STRIDE = 24, 0.2  # of Newton's method; rad, or of a coordinate: a step between them
+_MOST = 100  # maximum number of Newton steps
+_RANK_TOLERANCE = 1e-9  # relative to the largest singular value of A: rank tolerance
+_SHORTEST = 2.0**-20  # smallest fraction of a Newton step in the line search
+_TRIES, _STRIDE = 24, 0.2  # restarts of Newton's method; step between them, rad or relative
 
-_Of = Callable[[Array], Array]
+_Function = Callable[[Array], Array]
 
 
 class Equilibrium(NamedTuple):
@@ -47,13 +48,14 @@ def equilibrium(
     model: Constrained, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
     params: Any,
 ) -> Equilibrium:  # fmt: skip
-    """(q, qd, u) where tau + A^T lambda = C qd + g, from a guess, what is not `free` as it was.
+    """Solve tau + A^T lambda = C qd + g for the variables in `free`, by Newton's method.
 
-    Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,
-    which cost a step some digits and the result none. Where more is free than they determine, each
-    step is the shortest. u None: the signals, also where they depend on the state. Under
-    constraints what multipliers can't bear counts, and so do rates that rows don't allow, or don't
-    as the motion goes on; steps are along rows of positions.
+    q, qd, u: initial guess, and the values of all other variables. The residual is a force, not an
+    acceleration, since D may be singular. The Jacobian is a finite difference; its error slows
+    convergence but does not affect the result. Underdetermined systems: minimum-norm steps. u
+    None: the scene's signals. With constraints, the residual has the forces that multipliers
+    cannot balance, and the velocity constraints and their rates; steps are tangent to the position
+    constraints.
     """
     n, known = model.nq, (*model._states, *model.inputs)
     if strange := [name for name in free if name not in known]:
@@ -65,45 +67,47 @@ def equilibrium(
     moved = moved[: len(z)]
     rows = _Rows(model, moved, t, params) if model.constraint_names else None
 
-    def held(z: Array) -> Array | None:
+    def inputs(z: Array) -> Array | None:
         return None if u is None else z[2 * n :]
 
-    def whole(z: Array) -> Array:
+    def forces(z: Array) -> Array:
         at, moving = z[:n], z[n : 2 * n]
-        tau = model.tau(at, moving, t, held(z), params)
-        found: Array = tau.astype(float) - model.bias(at, moving, t=t, params=params)
-        return found
+        tau = model.tau(at, moving, t, inputs(z), params)
+        values: Array = tau.astype(float) - model.bias(at, moving, t=t, params=params)
+        return values
 
-    def rest(z: Array) -> Array:
-        return rows.left(z, whole(z)) if rows else whole(z)
+    def residual(z: Array) -> Array:
+        return rows.residual(z, forces(z)) if rows else forces(z)
 
     eps = float(np.finfo(model.dtype).eps)
     onto = rows.onto if rows else lambda z: z
 
     def D(z: Array) -> Array:
-        found: Array = model.D(z[:n], t=t, params=params)
-        return found.astype(float)
+        matrix: Array = model.D(z[:n], t=t, params=params)
+        return matrix.astype(float)
 
-    def ways(z: Array) -> Array:
-        return rows.along(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
+    def directions(z: Array) -> Array:
+        return rows.tangent_basis(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
 
     z, downhill, tried = onto(z), None, list[tuple[Array, Array]]()
     for _ in range(_TRIES):
-        z, now, sizes = _newton(z, n, rest, onto, ways, eps)
-        sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
+        z, now, sizes = _newton(z, n, residual, onto, directions, eps)
+        sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(forces(z))) if rows else 0.0)
         if rows:
             sizes[n:] += rows.sizes(z)
-        much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
+        much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # a smaller residual is rounding error
         tried.append((z, much))
         if not much.any():
             break
-        downhill = _downhill(model, z if downhill is None else downhill, ways, whole, onto, D)
+        downhill = _downhill(
+            model, z if downhill is None else downhill, directions, forces, onto, D
+        )
         if downhill is None:
             break
         z = downhill
     if much.any():
         z, much = tried[0]
-    _refuse(model, z, much, (q, qd), held(z), t, params)
+    _refuse(model, z, much, (q, qd), inputs(z), t, params)
     at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
     if u is not None:
         return Equilibrium(at, moving, z[2 * n :].astype(model.dtype))
@@ -112,49 +116,54 @@ def equilibrium(
 
 
 def _newton(
-    z: Array, n: int, rest: _Of, onto: _Of, ways_of: _Of, eps: float
+    z: Array, n: int, residual: _Function, onto: _Function, directions_of: _Function, eps: float
 ) -> tuple[Array, Array, Array]:
-    """Where Newton's method on `rest` ends from z, what is left there, and the sizes of its terms.
+    """Minimise `residual` from z by Newton's method; return (z, residual, sizes of its terms).
 
-    ways_of: the directions, (k, len(z)), in which z may go; onto: back on rows from there.
+    directions_of: directions (k, len(z)) in which z may change; onto: projection on constraints.
     """
-    now = rest(z)
+    now = residual(z)
     sizes = np.full(len(now), np.inf)
     for _ in range(_MOST):
-        ways = ways_of(z)
+        ways = directions_of(z)
         reach = np.maximum(1.0, np.abs(ways) @ np.abs(z))
         near = np.cbrt(eps) * reach[:, None] * ways
-        columns = [rest(onto(z + e)) - rest(onto(z - e)) for e in near]
+        columns = [residual(onto(z + e)) - residual(onto(z - e)) for e in near]
         slope = np.reshape(columns, (-1, len(now))).T / (2 * np.cbrt(eps) * reach)
         sizes = np.abs(slope) @ reach
         if not np.isfinite(sizes.sum() + now @ now) or not len(ways):
             break
         along = -np.linalg.lstsq(slope, now, rcond=1e-11)[0]
         step = along @ ways
-        fall = 1e-3 * (now @ slope @ along)  # what is asked for of one that is taken whole
-        # a coordinate by 1, or its own size, at most: angles come round
+        fall = 1e-3 * (now @ slope @ along)  # sufficient decrease for a full step
+        # a coordinate changes by 1, or its own size, at most, since angles are periodic
         part = 1 / max(1.0, *(np.abs(step[:n]) / np.maximum(1.0, np.abs(z[:n]))))
         while part > _SHORTEST:
             there = _tried(onto, z + part * step)
-            left = None if there is None else rest(there)
-            if left is not None and left @ left < now @ now + part * fall:
+            new = None if there is None else residual(there)
+            if new is not None and new @ new < now @ now + part * fall:
                 break
             part /= 2
         else:
             break
-        assert there is not None and left is not None
-        z, now = there, left
+        assert there is not None and new is not None
+        z, now = there, new
     return z, now, sizes
 
 
 def _downhill(
-    model: Constrained, z: Array, ways_of: _Of, forces: _Of, onto: _Of, inertia: _Of
+    model: Constrained,
+    z: Array,
+    directions_of: _Function,
+    forces: _Function,
+    onto: _Function,
+    inertia: _Function,
 ) -> Array | None:
-    """A step from z as the forces push what is at rest; None where they push nothing.
+    """Return a step from z along the accelerations from rest; None if they vanish.
 
-    Newton's method ends where forces are least, as halfway between two positions of rest.
+    It leaves local minima of the residual, as halfway between two equilibria.
     """
-    n, ways = model.nq, ways_of(z)
+    n, ways = model.nq, directions_of(z)
     ways = ways[:, :n][np.any(ways[:, :n], axis=1)]
     if not len(ways):
         return None
@@ -169,19 +178,19 @@ def _downhill(
 
 
 def _refuse(
-    model: Constrained, z: Array, much: Array, begun: tuple[Array, Array], u: Array | None,
+    model: Constrained, z: Array, much: Array, guess: tuple[Array, Array], u: Array | None,
     t: float, params: Any,
 ) -> None:  # fmt: skip
-    """Raise MotionError where a search ends with too much left."""
+    """Raise MotionError if the search ended with a residual above rounding error."""
     q, qd = z[: model.nq], z[model.nq : 2 * model.nq]
     why = _too_much(model, much) if much.any() else _slips(model, q, qd, u, t, params)
     if not why:
         return
-    found = f"q = {np.array2string(q, precision=6, threshold=12)}"
-    if np.any(qd != begun[1]):
-        found = state_text(q, qd)
+    end = f"q = {np.array2string(q, precision=6, threshold=12)}"
+    if np.any(qd != guess[1]):
+        end = state_text(q, qd)
     raise MotionError(
-        f"no equilibrium found from {state_text(*begun)}: the search ends at {found}, where "
+        f"no equilibrium found from {state_text(*guess)}: the search ends at {end}, where "
         f"{why}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
         f"another coordinate, rate (free=[..., '{model._states[model.nq]}']) or input be free",
         "no convergence",
@@ -189,19 +198,19 @@ def _refuse(
 
 
 def _too_much(model: Constrained, left: Array) -> str:
-    """What keeps a state from being an equilibrium: rates that rows don't allow, or a force."""
+    """Describe the largest residual: of a velocity constraint, or of a force."""
     n = model.nq
     rates, changes = np.split(left[n:], 2)
-    for found, words in ((rates, "break {} by {:.3g}"), (changes, "break {}, by {:.3g} a second")):
-        if found.any():
-            worst = int(np.argmax(np.abs(found)))
-            return f"the rates {words.format(model.constraint_names[worst], found[worst])}"
+    for values, words in ((rates, "break {} by {:.3g}"), (changes, "break {}, by {:.3g} a second")):
+        if values.any():
+            worst = int(np.argmax(np.abs(values)))
+            return f"the rates {words.format(model.constraint_names[worst], values[worst])}"
     worst = int(np.argmax(np.abs(left[:n])))
     return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
 
 
 def _slips(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
-    """What friction that sticks can't hold, in words; "" where all holds."""
+    """Describe a joint whose static friction is exceeded; "" if there is none."""
     if not model._rows.modes:
         return ""
     holds = dict(zip(model.constraint_names, model.multipliers(q, qd, t, u, params), strict=True))
@@ -216,19 +225,19 @@ def _slips(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, p
 
 
 def _beyond(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
-    """Which inputs ask for more than their limits let act, in words."""
+    """Describe the inputs that exceed their limits; "" if there are none."""
     if not model.has_limits:
         return ""
-    asked = model.signal(q, qd, t, params) if u is None else u
-    cut = asked != model.applied(q, qd, t, u, params)
+    requested = model.signal(q, qd, t, params) if u is None else u
+    cut = requested != model.applied(q, qd, t, u, params)
     names = [name for name, far in zip(model.inputs, cut, strict=True) if far]
     return f", with {', '.join(names)} beyond {'their' if names[1:] else 'its'} limits" * bool(
         names
     )
 
 
-def _tried(onto: _Of, z: Array) -> Array | None:
-    """`onto` of a state; None where the rows have none near."""
+def _tried(onto: _Function, z: Array) -> Array | None:
+    """Return `onto(z)`; None if the projection fails."""
     try:
         return onto(z)
     except MotionError:
@@ -237,7 +246,7 @@ def _tried(onto: _Of, z: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Constraints of a model around z = [q; qd; u], (len(z),), of which `moved` may be changed."""
+    """Constraints of a model at z = [q; qd; u], (len(z),); `moved` masks the free variables."""
 
     model: Constrained
     moved: Array
@@ -245,14 +254,14 @@ class _Rows:
     params: Any
 
     def onto(self, z: Array) -> Array:
-        """z with its free coordinates moved onto the rows. Raises MotionError."""
+        """Project the free coordinates of z onto the constraints. Raises MotionError."""
         n = self.model.nq
-        held = [not x for x in self.moved[:n]] + [False] * n
-        q, _ = self.model._projected(z[:n], np.zeros(n), self.t, self.params, held)
+        fixed = [not x for x in self.moved[:n]] + [False] * n
+        q, _ = self.model._projected(z[:n], np.zeros(n), self.t, self.params, fixed)
         return np.concatenate([q, z[n:]])
 
-    def along(self, z: Array) -> Array:
-        """(k, len(z)): the ways that rows of positions leave to what is free, orthonormal."""
+    def tangent_basis(self, z: Array) -> Array:
+        """Return an orthonormal basis (k, len(z)) of free directions tangent to the constraints."""
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
         _, s, V = np.linalg.svd(self._slopes(z)[: self.model._rows.holonomic, moved])
         rank = int(np.sum(s > _RANK_TOLERANCE * np.max(s, initial=0)))
@@ -260,10 +269,11 @@ class _Rows:
         ways[:, moved] = V[rank:]
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
-    def left(self, z: Array, forces: Array) -> Array:
-        """What no multipliers can bear of the forces (nq,), what the rates of rows lack, (nc,).
+    def residual(self, z: Array, forces: Array) -> Array:
+        """Return the forces that multipliers cannot balance, and the velocity residuals.
 
-        Then how fast that would change if the velocities did not, (nc,), by a difference.
+        The parts are: forces (nq,), residuals of the velocity constraints (nc,), and the rates of
+        these at constant velocities (nc,), by a central difference.
         """
         A, (q, qd) = self._slopes(z), self._halves(z)
         forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
@@ -275,7 +285,7 @@ class _Rows:
         return np.concatenate([forces, now, (then - before) / (2 * short)])
 
     def sizes(self, z: Array) -> Array:
-        """Of what `left` has of rows, (2 nc,): terms that are linear in the velocities."""
+        """Return the magnitudes (2 nc,) of the terms of the velocity residuals."""
         sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
         return np.concatenate([sizes, sizes * self._pace(z)])
 
@@ -284,7 +294,7 @@ class _Rows:
         return z[:n], z[n : 2 * n]
 
     def _pace(self, z: Array) -> float:
-        """How fast a state changes, 1/s."""
+        """Return the relative rate of change of the state, 1/s."""
         q, qd = self._halves(z)
         return float(np.max(np.abs(qd) / np.maximum(1.0, np.abs(q)), initial=1.0))
 

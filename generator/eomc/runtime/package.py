@@ -1,4 +1,4 @@
-"""A built package as a value: it can be pickled with all it makes, and refuses assignments.
+"""A built package as a value: it and its results can be pickled, and it refuses assignments.
 
 Functions are called with parameters; a
 parameter that is assigned to the module would change nothing there, or replace a function. Whoever
@@ -15,9 +15,9 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, NamedTuple, NoReturn
 
-# How another process finds this package where its name can't be imported, (function, place), set by
-# whoever loaded it under that name.
-found_by: tuple[Callable[..., Any], tuple[str, ...]] | None = None
+# How another process locates this package if its name cannot be imported: (function, place), set
+# by the loader.
+unpickler: tuple[Callable[..., Any], tuple[str, ...]] | None = None
 
 # the built package, such as "cartpole"; "eomc" within the generator, which is no build
 _BUILT = str(__package__).rpartition(".")[0]
@@ -25,7 +25,7 @@ MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all o
 
 
 class Identity(NamedTuple):
-    """What every pickled value carries of the build that pickled it.
+    """Identity of the build that pickled a value, stored in the pickle.
 
     extension: its name ends with the digest of the build. digest: of the scene. The names are in
     the order of the columns and indices of stored values.
@@ -56,20 +56,20 @@ def identity() -> tuple[Any, ...]:
 
 
 def own_model() -> Any:
-    """The model of this package."""
+    """Return the model of this package."""
     return import_module(_BUILT)._model
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
-    """What __reduce__ returns of a value that `made` makes again from a path and arguments."""
-    if found_by is None:
+    """Return the result of __reduce__ for a value that `call_path(path, arguments)` recreates."""
+    if unpickler is None:
         return unpickled, (identity(), path, arguments)
-    function, place = found_by
+    function, place = unpickler
     return function, (place, identity(), path, arguments)
 
 
-def made(path: str, arguments: tuple[Any, ...]) -> Any:
-    """What lies at a path in this package, such as "status.MotionError", called."""
+def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
+    """Call the object at a path in this package, such as "status.MotionError"."""
     first, *rest = path.split(".")
     if first.startswith("_"):  # an attribute of the built package, not a module of its runtime
         start, names = import_module(_BUILT), [first, *rest]
@@ -80,17 +80,17 @@ def made(path: str, arguments: tuple[Any, ...]) -> Any:
 
 
 def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
-    """A value pickled by a package of this name, imported by its own name; pickle calls this."""
+    """Recreate a value that was pickled by a package of this name; pickle calls this."""
     if why := refusal(pickled, path):
         return Unreadable(why, RuntimeError, (unpickled, (pickled, path, arguments)))
-    return made(path, arguments)
+    return call_path(path, arguments)
 
 
 def refusal(pickled: tuple[Any, ...], path: str) -> str:
-    """Why this build can't stand in for the one that pickled a value; "" where it can.
+    """Return the reason why this build cannot read a pickle of another build, or "".
 
-    The code of another build is refused. Data of another build are read, with a warning, where
-    their columns have the same names in the same order.
+    Code of another build is refused. Data of another build are read, with a warning, if their
+    columns have the same names in the same order.
     """
     if path.startswith("status."):  # errors have a text alone
         return ""
@@ -120,10 +120,10 @@ def refusal(pickled: tuple[Any, ...], path: str) -> str:
 
 
 class Unreadable:
-    """The place of a pickled value whose build is not there: any use of it raises an error.
+    """Placeholder for a pickled value whose build does not exist: any use of it raises an error.
 
-    Pools of processes wait for ever where reading a task raises, so the error comes with its use.
-    A function or a member that was pickled by its name is read, and is as unreadable.
+    The error is not raised when the pickle is read, since a process pool would then wait forever.
+    Attributes of the placeholder are placeholders as well.
     """
 
     _why: str
@@ -164,7 +164,7 @@ def option(key: str, value: str = "true") -> str:
 
     That is a key of [run] for a scene, an argument for a System.
     """
-    if not is_made_in_python():
+    if not is_built_from_system():
         return f"[run] {key} = {value}"
     if key in _ONLY_OF_SCENES:
         return f"[run] {key} = {value} of a scene with bodies, which System.make has not"
@@ -173,17 +173,17 @@ def option(key: str, value: str = "true") -> str:
 
 def named_outputs() -> str:
     """Return where the user names the outputs of a module."""
-    where = "System.make(..., outputs={...})" if is_made_in_python() else "[outputs]"
+    where = "System.make(..., outputs={...})" if is_built_from_system() else "[outputs]"
     return f"name them in {where}"
 
 
-def is_made_in_python() -> bool:
-    """Whether this package is built from a System that `System.make` returned."""
+def is_built_from_system() -> bool:
+    """Return True if this package is built from a System that `System.make` returned."""
     package = import_module(_BUILT)
     return bool(getattr(package, "_made_in_python", False))
 
 
-def meant(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
     import difflib  # of use here alone
 
@@ -193,8 +193,8 @@ def meant(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-def of_a_start(model: Any, name: str) -> str:
-    """That a name of `q` is no parameter, and where it is given."""
+def initial_value_message(model: Any, name: str) -> str:
+    """Return the message that a name is a coordinate, not a parameter."""
     if name in model.discrete_coordinates:
         return (
             f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
@@ -203,7 +203,7 @@ def of_a_start(model: Any, name: str) -> str:
     return f"'{name}' is a coordinate: give it in q0"
 
 
-# what newcomers call the arguments of a run
+# common names of other packages for the arguments of a run
 _CALLED = {
     "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
     "atol": "tol", "eps": "tol", "max_step": "h_most", "t_eval": "times", "tmax": "duration",
@@ -213,20 +213,24 @@ _CALLED = {
 
 
 def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]) -> TypeError:
-    """That a function of a model has no such argument, and what may be meant."""
+    """Return the error for an unknown argument of a function, with a suggestion."""
     from inspect import signature  # of use here alone
 
     name, known = next(iter(unknown)), [*signature(call).parameters][:-1]  # all but **unknown
     table = "params" if name in model.parameters else "u" if name in model.inputs else ""
-    near = f": write {table}={{'{name}': ...}}" if table else meant(_CALLED.get(name, name), known)
+    near = (
+        f": write {table}={{'{name}': ...}}"
+        if table
+        else suggestion(_CALLED.get(name, name), known)
+    )
     if name in model.coordinates:
-        near = f": {of_a_start(model, name)}"
+        near = f": {initial_value_message(model, name)}"
     near = near or f": it has {', '.join(known)}"
     return TypeError(f"{call.__name__} has no argument '{name}'{near}")
 
 
 def warn(words: str) -> None:
-    """A RuntimeWarning at the line that called into built packages, through however many calls."""
+    """Issue a RuntimeWarning at the line outside of built packages that called into them."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _of_eomc(str(frame.f_globals.get("__package__"))):
         level, frame = level + 1, frame.f_back
@@ -234,14 +238,14 @@ def warn(words: str) -> None:
 
 
 def _of_eomc(package: str) -> bool:
-    """Whether a module of the package is a built one's, or eomc's own."""
+    """Return True if the package is a built one, or eomc itself."""
     whole = sys.modules.get(package.removesuffix("._runtime"))
     return package.split(".")[0] == "eomc" or (
         type(whole).__name__ == Package.__name__ and "_model" in vars(whole)
     )
 
 
-# what only scenes with constraints have: functions, and what else
+# functions and other attributes of scenes with constraints only
 CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
 _CONSTRAINED = (*CONSTRAINED, "constraint_names", "loops", "reactions")
 
@@ -250,12 +254,12 @@ class Package(ModuleType):
     """The class of a built package."""
 
     def __getattr__(self, name: str) -> Any:
-        """Raises AttributeError: of what only scenes with constraints have, with the reason."""
+        """Raise AttributeError, with the reason for names that need constraints."""
         model = self.__dict__.get("_model")
         if model is not None and name in _CONSTRAINED:
-            there = "give them by System.make(..., constraints={...})" if is_made_in_python() else (
-                "a scene has them by [constraints] or [[loop]]"
-            )  # fmt: skip
+            there = "a scene has them by [constraints] or [[loop]]"
+            if is_built_from_system():
+                there = "give them by System.make(..., constraints={...})"
             closed = hasattr(model, name) and model.constraint_names
             what = "[[loop]]" if closed else f"constraints: {there}"
             raise AttributeError(f"{name}: {model.name} has no {what}")
@@ -268,7 +272,7 @@ class Package(ModuleType):
         super().__setattr__(name, value)
 
     def _why_not(self, name: str, value: Any) -> str:
-        """Why a name can't be assigned to and what serves instead; "" where nothing speaks."""
+        """Return the reason why a name cannot be assigned, with a remedy; "" if it can."""
         model, call = self._model, f"{self._model.name}.simulate"
         if name in model.parameters:
             return (
@@ -285,13 +289,13 @@ class Package(ModuleType):
             return f"a start is given to a call: {call}(q0=..., qd0=...), or eomc run --start"
         if name in self.__all__:
             return "belongs to the module and stays as it is"
-        near = meant(name, (*model.parameters, *model.inputs, *model.coordinates, *rates))
+        near = suggestion(name, (*model.parameters, *model.inputs, *model.coordinates, *rates))
         if not near or isinstance(value, ModuleType):  # one of its own files, imported
             return ""
         return f"is no name of the scene{near}; values are given to a call: {call}(params={{...}})"
 
     def __dir__(self) -> list[str]:
-        """The names that the module offers, without those of its files."""
+        """Return the public names of the module, without its submodules."""
         names = vars(self)
         return sorted({*names.get("__all__", names), *(n for n in names if n.startswith("__"))})
 
@@ -300,8 +304,8 @@ class Package(ModuleType):
         if model is None:  # not imported yet
             return super().__repr__()
         counts = {"coordinate": model.nq, "input": model.nu, "parameter": len(model.parameters)}
-        said = ", ".join(f"{n} {what}{'s' * (n != 1)}" for what, n in counts.items())
-        return f"<compiled scene {model.name}: {said}>"
+        summary = ", ".join(f"{n} {what}{'s' * (n != 1)}" for what, n in counts.items())
+        return f"<compiled scene {model.name}: {summary}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced(MODULE)
@@ -311,7 +315,7 @@ class Package(ModuleType):
 
 
 class Defaults(dict[str, float]):
-    """The scene's values of its parameters: to be read only, since no change reaches the C."""
+    """The scene's parameter values, read-only since the C code would not see a change."""
 
     def _refused(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError(

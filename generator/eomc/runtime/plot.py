@@ -16,10 +16,10 @@ from .atomic_write import File
 from .columns import imported
 from .labels import mathtext, plain, rate_unit, with_unit
 
-TOGETHER = 6  # curves of one panel, about; of more coordinates than this a few panels are made
-ALIKE = 30.0  # how much larger the largest curve of a panel may be than its smallest
-PANELS = 4  # of one kind, beyond which sizes no longer count
-DRAWN = 20_000  # rows of a curve, at most
+CURVES_PER_PANEL = 6  # approximate number
+MAX_SIZE_RATIO = 30.0  # of the largest to the smallest curve of a panel
+MAX_PANELS = 4  # of one kind, grouped by size; with more, the size is ignored
+MAX_ROWS = 20_000  # of a drawn curve
 
 
 @dataclass(frozen=True)
@@ -34,32 +34,32 @@ class Curve:
 
     @property
     def text(self) -> str:
-        """Its name as mathematics."""
+        """The name in mathtext."""
         return self.symbol or mathtext(self.name)
 
 
 def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
-    """Curves by panels: those of one kind, unit and size together, few enough to be told apart."""
-    made: list[list[Curve]] = []
+    """Group curves into panels by kind, unit and size, with a few curves per panel."""
+    panels: list[list[Curve]] = []
     for kind in dict.fromkeys((c.kind, c.unit) for c in curves):
         mine = [c for c in curves if (c.kind, c.unit) == kind]
         parts = _by_size(mine)
-        for part in parts if len(parts) <= PANELS else [mine]:
-            count = -(-len(part) // max(TOGETHER, -(-len(curves) // PANELS)))
+        for part in parts if len(parts) <= MAX_PANELS else [mine]:
+            count = -(-len(part) // max(CURVES_PER_PANEL, -(-len(curves) // MAX_PANELS)))
             size = -(-len(part) // count)
-            made += [part[k : k + size] for k in range(0, len(part), size)]
-    return made
+            panels += [part[k : k + size] for k in range(0, len(part), size)]
+    return panels
 
 
 def _by_size(curves: Sequence[Curve]) -> list[list[Curve]]:
-    """In their order; a curve goes to the first panel that it neither dwarfs nor vanishes in."""
+    """Group curves by size; a curve joins the first panel with curves of similar size."""
     panels: list[tuple[list[Curve], list[float]]] = []
     for curve in curves:
         finite = curve.values[np.isfinite(curve.values)]
         size = float(np.max(np.abs(finite), initial=0.0))
         for members, sizes in panels:
             some = [x for x in (*sizes, size) if x > 0]
-            if not some or max(some) <= ALIKE * min(some):
+            if not some or max(some) <= MAX_SIZE_RATIO * min(some):
                 members.append(curve)
                 sizes.append(size)
                 break
@@ -74,7 +74,7 @@ def wrapped(values: Array) -> Array:
 
 
 def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
-    """Rows of a curve with nan where an angle jumps by a turn, so that no line is drawn there."""
+    """Insert nan into a curve where an angle jumps by a turn, so that no line is drawn there."""
     jumps = np.flatnonzero(sum(np.abs(np.diff(a)) > np.pi for a in angles)) + 1
     return np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan)
 
@@ -83,7 +83,7 @@ def against(
     axes: Any, x: Array, curves: Sequence[Curve], suffix: str = "", **style: Any
 ) -> list[Any]:
     """Curves over x with their labels; its axis says what they are, in which unit."""
-    every = max(len(x) // DRAWN, 1)
+    every = max(len(x) // MAX_ROWS, 1)
     lines = []
     for curve in curves:
         at, values = x[::every], np.asarray(curve.values, float)[::every]
@@ -101,7 +101,7 @@ class Source:
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
         model, run = run._model, getattr(run, "_drawn", run)
         self.run, self.t = run, np.asarray(run.t, float)
-        self.held = getattr(run, "_u", None) is not None  # inputs, from row to row
+        self.is_held = getattr(run, "_u", None) is not None
         self.coordinates = tuple(model.coordinates)
         self._units = dict(model.units)
         self._energy = "J" if any(self._units.get(c) for c in model.coordinates) else ""
@@ -113,7 +113,7 @@ class Source:
             run[name]  # KeyError, with the names there are
 
     def default(self) -> list[str]:
-        """What is drawn where no name is given."""
+        """Return the names of the columns that are drawn by default."""
         return [*self.coordinates, *self._inputs, *self._outputs, "energy"]
 
     def curve(self, name: str) -> Curve:
@@ -146,20 +146,20 @@ def plot(
     sources = [Source(each, wrap) for each in (run, *others)]
     suffixes = _suffixes(len(sources), labels)
     pairs = _pairs(phase, sources[0])
-    asked = [*names] or ([] if pairs else sources[0].default())
-    panels = grouped([sources[0].curve(name) for name in asked])
+    columns = [*names] or ([] if pairs else sources[0].default())
+    panels = grouped([sources[0].curve(name) for name in columns])
     if ax is not None and panels:
         panels = [[c for panel in panels for c in panel]]
     count = len(panels) + len(pairs)
     if ax is None and axes is None:
-        made = new_axes(len(panels), len(pairs))
+        all_axes = new_axes(len(panels), len(pairs))
     else:
-        made = given_axes(ax, axes, count)
-    for place, panel in zip(made, panels, strict=False):
+        all_axes = check_axes(ax, axes, count)
+    for place, panel in zip(all_axes, panels, strict=False):
         _panel(place, sources, [c.name for c in panel], suffixes, style)
-    for place, (x, y) in zip(made[len(panels) :], pairs, strict=True):
+    for place, (x, y) in zip(all_axes[len(panels) :], pairs, strict=True):
         _portrait(place, sources, x, y, suffixes, section, style)
-    return finished(made, file)
+    return finished(all_axes, file)
 
 
 def no_files(names: Sequence[str]) -> None:
@@ -169,12 +169,12 @@ def no_files(names: Sequence[str]) -> None:
             raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
 
 
-def finished(made: Sequence[Any], file: File | None) -> Any:
+def finished(all_axes: Sequence[Any], file: File | None) -> Any:
     """The Axes, or an array of several; their figure is written to the file, if there is one."""
     if file is not None:
-        figure = made[0].figure
+        figure = all_axes[0].figure
         getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole
-    return made[0] if len(made) == 1 else np.array(made)
+    return all_axes[0] if len(all_axes) == 1 else np.array(all_axes)
 
 
 def _suffixes(count: int, labels: Sequence[str] | None) -> list[str]:
@@ -205,23 +205,23 @@ def new_axes(panels: int, portraits: int = 0) -> list[Any]:
     width, height = 10.5 if panels and portraits else 6.4, max(4.8, 1.7 * panels, 3.2 * portraits)
     figure = pyplot.figure(figsize=(width, height), layout="constrained")
     columns = figure.subfigures(1, 2, squeeze=False)[0] if panels and portraits else [figure]
-    made: list[Any] = []
+    all_axes: list[Any] = []
     if panels:
-        made += columns[0].subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
+        all_axes += columns[0].subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
     if portraits:
-        made += columns[-1].subplots(portraits, 1, squeeze=False)[:, 0].tolist()
-    return made
+        all_axes += columns[-1].subplots(portraits, 1, squeeze=False)[:, 0].tolist()
+    return all_axes
 
 
-def given_axes(ax: Any, axes: Any, count: int) -> list[Any]:
-    """Those that were given, one a panel; ValueError for another number."""
+def check_axes(ax: Any, axes: Any, count: int) -> list[Any]:
+    """Return the axes of the user, one for each panel. Raises ValueError for another number."""
     if ax is not None and axes is not None:
         raise ValueError("ax, axes: give one of them")
-    made = [ax] if ax is not None else [*np.ravel(axes)]
-    if len(made) != count:
+    all_axes = [ax] if ax is not None else [*np.ravel(axes)]
+    if len(all_axes) != count:
         name = "ax" if ax is not None else "axes"
-        raise ValueError(f"{name}: {len(made)} for {count} panels: give axes=, one a panel")
-    return made
+        raise ValueError(f"{name}: {len(all_axes)} for {count} panels: give axes=, one a panel")
+    return all_axes
 
 
 def _panel(
@@ -233,7 +233,7 @@ def _panel(
         curves = [source.curve(name) for name in names]
         for i, curve in enumerate(curves):
             own = {"color": colours[i], "linestyle": ("--", ":", "-.")[(k - 1) % 3]} if k else {}
-            if curve.kind == "inputs" and source.held:
+            if curve.kind == "inputs" and source.is_held:
                 own["drawstyle"] = "steps-post"
             lines = against(axes, source.t, [curve], suffix, **{**own, **style})
             colours += [line.get_color() for line in lines] if not k else []
@@ -260,7 +260,7 @@ def _portrait(
             values = [wrapped(c.values) if c.kind == "angles" else c.values for c in at]
             axes.plot(*values, **{"linestyle": "none", "marker": ".", **style})
             break
-        every = max(len(source.t) // DRAWN, 1)
+        every = max(len(source.t) // MAX_ROWS, 1)
         a, b = first.values[::every], second.values[::every]
         angles = [x for curve, x in ((first, a), (second, b)) if curve.kind == "angles"]
         if angles:

@@ -1,4 +1,4 @@
-"""Runs as .npz files: arrays only, nothing pickled, and of which scene they are."""
+"""Save and load runs as .npz files: arrays only, no pickles, and the scene's identity."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ KINDS = (
     "AdaptiveBatchRun",
 )
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
-_KIND = "eomc {} 1"  # and the version of what such a file holds
+_KIND = "eomc {} 1"  # name of the class and version of the format
 
 
 def write(run: Any, path: Path) -> None:
-    """All of a run or batch: its columns q, qd, u, energies and what makes it again."""
+    """Write a run or batch: its columns, and the arguments that reproduce it."""
     model = run._model
     arrays: dict[str, Any] = {
         "kind": _KIND.format(type(run).__name__), "scene": model.name, "digest": model.digest,
@@ -39,18 +39,18 @@ def write(run: Any, path: Path) -> None:
         "events": model.events,
         "t": run["t"], "energy": run.energy, "u": run.u,
     }  # fmt: skip
-    if asked := vars(model).get("_asked"):
-        arrays |= {"own": asked[0].digest, "asked": _text(asked[1])}
+    if additional := vars(model).get("_asked"):
+        arrays |= {"own": additional[0].digest, "asked": _text(additional[1])}
     if model.has_jacobi:
         arrays["jacobi"] = run.jacobi
     arrays |= {name: value for name, value in run._to_arrays().items() if value is not None}
-    made: Any = {name: np.asarray(value) for name, value in arrays.items()}
+    converted: Any = {name: np.asarray(value) for name, value in arrays.items()}
     with atomic_write(path) as new, new.open("wb") as file:
-        np.savez(file, **made)
+        np.savez(file, **converted)
 
 
 def _text(events: Any) -> str:
-    """Events that a call asked for; "" where formulas are SymPy's, which are no text."""
+    """Return the events of a call as JSON; "" if a formula is a SymPy expression."""
     try:
         return json.dumps(events)
     except TypeError:
@@ -58,45 +58,43 @@ def _text(events: Any) -> str:
 
 
 def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
-    """The model of a saved run, its kind, one of KINDS, and what it kept.
+    """Return the model of a saved run, its kind, one of KINDS, and its arrays.
 
-    The model is another than was given where a call had asked for events.
-
-    Raises ValueError where the file is none, or of another scene; warns where it is of another
-    version of the scene.
+    The model is extended if the run had additional events. Raises ValueError if the file is not a
+    saved run of the scene; warns if it is of another version of the scene.
     """
-    found = _arrays(file)
-    kind = next((k for k in KINDS if str(found.get("kind")) == _KIND.format(k)), "")
+    arrays = _arrays(file)
+    kind = next((k for k in KINDS if str(arrays.get("kind")) == _KIND.format(k)), "")
     if not kind:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
-    if found["scene"] != model.name:
-        raise ValueError(f"{file}: is a run of {found['scene']}, not of {model.name}")
-    if str(found.get("own", found["digest"])) != model.digest:
+    if arrays["scene"] != model.name:
+        raise ValueError(f"{file}: is a run of {arrays['scene']}, not of {model.name}")
+    if str(arrays.get("own", arrays["digest"])) != model.digest:
         warn(
             f"{model.name}: {file}: was saved from another version of the scene; what is computed "
             "from it now is of the present version"
         )
-    if "asked" in found:
-        model = _asked(model, found, file)
+    if "asked" in arrays:
+        model = _model_with_events(model, arrays, file)
     for what in ("coordinates", "parameters", "inputs", "events"):
         own = getattr(model, what)
-        saved = tuple(found.get(what, np.array(own)).tolist())  # old files have no events
+        saved = tuple(arrays.get(what, np.array(own)).tolist())  # old files have no events
         if saved != own:
             raise ValueError(
                 f"{file}: is a run of another version of {model.name}, whose {what} were "
                 f"{', '.join(saved) or 'none'}; here they are {', '.join(own) or 'none'}"
             )
-    if found["q"].dtype != model.dtype:
-        raise ValueError(f"{file}: has numbers of {found['q'].dtype}, {model.name} {model.dtype}")
-    return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
+    if arrays["q"].dtype != model.dtype:
+        raise ValueError(f"{file}: has numbers of {arrays['q'].dtype}, {model.name} {model.dtype}")
+    return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
 
 
-def _asked(model: ModelInfo, found: dict[str, Array], file: File) -> Any:
-    """The model with the events that a saved run's call asked for."""
+def _model_with_events(model: ModelInfo, arrays: dict[str, Array], file: File) -> Any:
+    """Return the model with the additional events of a saved run."""
     known = vars(model).get("_eventful", {}).values()
-    if same := [other for other in known if other.digest == found["digest"]]:
+    if same := [other for other in known if other.digest == arrays["digest"]]:
         return same[0]
-    if not (text := str(found["asked"])):
+    if not (text := str(arrays["asked"])):
         raise ValueError(
             f"{file}: its events= had formulas of SymPy, which files don't keep: call "
             f"{model.name}.simulate(events=...) with the same ones first; numpy.load reads its rows"
@@ -112,7 +110,7 @@ def _asked(model: ModelInfo, found: dict[str, Array], file: File) -> Any:
 
 
 def _arrays(file: File) -> dict[str, Array]:
-    """What an .npz file holds; a ValueError where it is none, OSError where it can't be read."""
+    """Read the arrays of an .npz file. Raises ValueError for other files, and OSError."""
     try:
         with np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

@@ -355,7 +355,7 @@ def load(built: Built, home: str = "") -> ModuleType:
         raise
     # other processes can't import the alias: pickled values refer to the build by its place
     place = (built.name, home or str(folder), key)
-    sys.modules[f"{alias}._runtime.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
+    sys.modules[f"{alias}._runtime.package"].unpickler = (unpickled, place)  # type: ignore[attr-defined]
     return module
 
 
@@ -386,7 +386,7 @@ def unpickled(
         package = importlib.import_module(f"{_build_of(place).__name__}._runtime.package")
         why = package.refusal(identity, path)
         if not why:
-            return package.made(path, arguments)
+            return package.call_path(path, arguments)
         why = f"{folder}: {why}"
     except Exception as fault:  # whatever it is, a pool would wait
         if path.startswith("status."):
