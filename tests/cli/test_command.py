@@ -134,7 +134,7 @@ def test_where_the_energy_went_is_told(there: Path) -> None:
     assert "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in told
     words = ["--json", "--every", "99"]
     said = json.loads(eomc("run", "kapitza_pendulum.toml", *words).output)["energy"]["balance"]
-    assert said["told"] and said["forces"] == pytest.approx(-1.71, abs=1e-3)
+    assert said["is_resolved"] and said["forces"] == pytest.approx(-1.71, abs=1e-3)
 
 
 def test_parameters_and_start_on_the_command_line(there: Path) -> None:

@@ -57,7 +57,7 @@ def rolling(modules: Modules) -> ModuleType:
 @pytest.mark.parametrize("held", [(), ("qx",), ("qw",), ("qy", "x")])
 def test_rows_of_rates_do_not_move_positions(rolling: ModuleType, held: tuple[str, ...]) -> None:
     q = np.array([0.3, 0.0, 0.98, 0.1, -0.1, 0.1])
-    found = rolling.project(q, np.zeros(6), held=list(held))[0]
+    found = rolling.project(q, np.zeros(6), fixed=list(held))[0]
     free = [k for k in range(2, 6) if rolling.coordinates[k] not in held]
     still = [k for k in range(6) if k not in free]
     np.testing.assert_array_equal(found[still], q[still])
@@ -77,7 +77,7 @@ def test_rows_of_rates_do_not_move_an_assembled_start() -> None:
 def test_a_coordinate_in_rows_of_rates_alone_and_without_inertia_stays(modules: Modules) -> None:
     counted = modules.unoptimised(COUNTED)
     for held in ([], ["y"]):
-        q = counted.project([1.1, 0.2, 0.5], np.zeros(3), held=held)[0]
+        q = counted.project([1.1, 0.2, 0.5], np.zeros(3), fixed=held)[0]
         assert q[2] == 0.5
         assert q[0] ** 2 + q[1] ** 2 == pytest.approx(1, abs=1e-14)
         assert q[1] == 0.2 if held else q[1] / q[0] == pytest.approx(0.2 / 1.1)
@@ -93,7 +93,7 @@ def test_the_change_is_the_least_in_the_metric_of_the_mass_matrix(
     random = np.random.default_rng(3)
     for _ in range(10):
         q = four_bar.start[0] + 0.05 * random.normal(size=four_bar.nq)
-        found = four_bar.project(q, 0 * q, held=list(held))[0]
+        found = four_bar.project(q, 0 * q, fixed=list(held))[0]
         assert np.max(np.abs(four_bar.constraints(found, 0 * q))) < 1e-14
         force = (four_bar.D(found) @ (found - q))[free]
         A = four_bar.constraint_jacobian(found)[:, free]

@@ -204,7 +204,7 @@ def test_multipliers_are_of_the_rows_as_they_are_written(bennett: ModuleType) ->
 
 @pytest.mark.slow
 def test_a_state_is_put_onto_such_rows(bennett: ModuleType) -> None:
-    q, qd = bennett.project([1.0, 2.7, -0.9], [1.0, 0.0, -1.0], held=["q1", "q1_dot"])
+    q, qd = bennett.project([1.0, 2.7, -0.9], [1.0, 0.0, -1.0], fixed=["q1", "q1_dot"])
     assert q[0] == 1 and qd[0] == 1 and q[2] == pytest.approx(-1, abs=1e-14)
     assert qd[2] == pytest.approx(-1, abs=1e-14)
 

@@ -102,9 +102,9 @@ def test_a_damped_spring_loses_what_is_exact(pushed: ModuleType) -> None:
     v = -math.exp(-d * T) * 4 / w * math.sin(w * T)
     lost = 2 - (v**2 / 2 + 2 * x**2)
     balance = pushed.simulate().balance()
-    assert balance.told and balance.inputs == balance.forces == 0
-    assert abs(balance.lost - lost) < 1e-6
-    assert abs(pushed.simulate(**EXACT).balance().lost - lost) < 1e-12
+    assert balance.is_resolved and balance.inputs == balance.forces == 0
+    assert abs(balance.dissipated - lost) < 1e-6
+    assert abs(pushed.simulate(**EXACT).balance().dissipated - lost) < 1e-12
     assert balance.words.startswith(f"{lost:.3g} J were lost; numerical error 1")
 
 
@@ -120,8 +120,8 @@ def test_inputs_and_forces_are_told_apart(pushed: ModuleType) -> None:
     )
     assert balance.inputs == pytest.approx(3 * (run.q[-1, 0] - run.q[0, 0]), rel=1e-6)
     change = run.energy[-1] - run.energy[0]
-    work = balance.inputs + balance.forces - balance.lost
-    assert abs(work - change) <= balance.left + 1e-14
+    work = balance.inputs + balance.forces - balance.dissipated
+    assert abs(work - change) <= balance.error + 1e-14
     assert "inputs took 1.38 J, forces put in 0.0673 J, 0.101 J were lost; " in balance.words
 
 
@@ -131,9 +131,9 @@ def test_what_is_left_is_the_error_of_the_method(
 ) -> None:
     """It falls by sixteen and more where h is halved, and is that of the energy along the run."""
     left = [pushed.simulate(h=h, duration=8.0, params=params).balance() for h in (0.04, 0.02, 0.01)]
-    assert all(b.left > 10 * b.unsure for b in left)
+    assert all(b.error > 10 * b.uncertainty for b in left)
     for one, other in pairwise(left):
-        assert 14 < one.left / other.left < 40
+        assert 14 < one.error / other.error < 40
 
 
 @pytest.mark.parametrize("rows", [20, 33, 60, 100, 200, 500, 3000])
@@ -152,7 +152,7 @@ def test_an_integral_is_off_by_no_more_than_is_said(rows: int, sharp: float) -> 
 
 def test_of_few_steps_nothing_is_told(pushed: ModuleType) -> None:
     balance = pushed.simulate(h=0.9, steps=12).balance()
-    assert not balance.told
+    assert not balance.is_resolved
     assert balance.words == "steps are too long to tell what was put in and what was lost"
 
 
@@ -163,17 +163,19 @@ def test_rows_that_were_not_kept_are_made_again(pushed: ModuleType) -> None:
 def test_a_conservative_run_has_its_error_only(cartpole: ModuleType) -> None:
     run = cartpole.simulate()
     balance = run.balance()
-    assert (balance.inputs, balance.forces, balance.lost) == (0, 0, 0)
-    assert balance.left == np.max(np.abs(run.energy - run.energy[0])) > 1e-9
-    assert balance.told and balance.words.startswith("nothing was put in or lost; numerical error")
+    assert (balance.inputs, balance.forces, balance.dissipated) == (0, 0, 0)
+    assert balance.error == np.max(np.abs(run.energy - run.energy[0])) > 1e-9
+    assert balance.is_resolved and balance.words.startswith(
+        "nothing was put in or lost; numerical error"
+    )
     assert not cartpole._model.has_power
 
 
 def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Modules) -> None:
     run = modules("kapitza_pendulum").simulate(duration=2.0)
     balance = run.balance()
-    assert balance.forces == pytest.approx(run.jacobi[-1] - run.jacobi[0], abs=2 * balance.left)
-    assert balance.told and balance.left < 1e-7 and balance.lost == 0
+    assert balance.forces == pytest.approx(run.jacobi[-1] - run.jacobi[0], abs=2 * balance.error)
+    assert balance.is_resolved and balance.error < 1e-7 and balance.dissipated == 0
 
 
 def test_a_potential_that_moves_with_time_puts_in_what_it_does(modules: Modules) -> None:
@@ -197,7 +199,7 @@ batch = true
     runs = swayed.simulate_batch([[0.0], [0.5]])
     assert np.array_equal(runs.jacobi, runs.energy)
     balance = run.balance()
-    assert balance.told and balance.left < 1e-9
+    assert balance.is_resolved and balance.error < 1e-9
     assert balance.forces == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-9)
 
 
@@ -224,9 +226,9 @@ def test_work_of_inputs_that_are_held_is_told(pushed: ModuleType, how: dict[str,
     u = np.repeat(how["u"], 20 // len(how["u"])) if how["u"] is not law else run.u[:-1, 0]
     if how["u"] is law and "times" in how:
         u = pushed.simulate(steps=20, **how | {"times": None}).u[:-1, 0]
-    assert balance.told and balance.left < 1e-7
-    assert balance.inputs == pytest.approx(np.sum(u * np.diff(ends)), abs=2 * balance.left)
-    assert 0 < balance.lost < 1 and balance.unsure < 1e-3 * balance.left
+    assert balance.is_resolved and balance.error < 1e-7
+    assert balance.inputs == pytest.approx(np.sum(u * np.diff(ends)), abs=2 * balance.error)
+    assert 0 < balance.dissipated < 1 and balance.uncertainty < 1e-3 * balance.error
 
 
 def test_work_of_inputs_that_a_period_holds_is_told_by_a_tolerance(falling: ModuleType) -> None:
@@ -236,8 +238,8 @@ def test_work_of_inputs_that_a_period_holds_is_told_by_a_tolerance(falling: Modu
         u = run.u[np.searchsorted(run.t, periods[:-1]), 0]
         work = np.sum(u * np.diff(run(periods)[0][:, 0]))
         balance, gained = run.balance(), run.energy[-1] - run.energy[0]
-        assert balance.told and balance.inputs == pytest.approx(work, abs=1e-11)
-        assert balance.inputs - balance.lost == pytest.approx(gained, abs=1e-11)
+        assert balance.is_resolved and balance.inputs == pytest.approx(work, abs=1e-11)
+        assert balance.inputs - balance.dissipated == pytest.approx(gained, abs=1e-11)
 
 
 @pytest.mark.parametrize("times", [None, [0.0, 0.3, 1.5]])
@@ -250,7 +252,7 @@ def test_impacts_within_periods_are_told_too(
     periods = np.array([*(0.15 * np.arange(10)), 1.5])
     u = np.array([law(t, q, qd)[0] for t, q, qd in zip(periods, *run(periods), strict=True)])
     jumps = np.sum((0.8**2 - 1) * impacts.qd[:, 0] ** 2 / 2)
-    assert len(impacts.t) > 1 and balance.told and balance.left < 1e-9
+    assert len(impacts.t) > 1 and balance.is_resolved and balance.error < 1e-9
     assert balance.inputs == pytest.approx(np.sum(u[:-1] * np.diff(run(periods)[0][:, 0])))
     assert balance.jumps == pytest.approx(jumps, abs=1e-11)
 
@@ -286,7 +288,7 @@ def test_jumps_where_a_period_or_the_run_ends_count(
     balance, gained = run.balance(), run.energy[-1] - run.energy[0]
     assert run.status == status and len(run.events["sheds"].t) == 1 and run["m"][-1] == 0.5
     assert balance.inputs + balance.jumps == pytest.approx(gained, abs=1e-11)
-    assert balance.told and balance.left < 1e-11 and balance.jumps < -1
+    assert balance.is_resolved and balance.error < 1e-11 and balance.jumps < -1
 
 
 @pytest.mark.filterwarnings("ignore:.*a Python function")
@@ -297,7 +299,7 @@ def test_inputs_that_rows_do_not_tell_have_none(pushed: ModuleType) -> None:
 @pytest.mark.parametrize("steps", [0, 1, 2, 3, 9])
 def test_short_runs_have_one(pushed: ModuleType, steps: int) -> None:
     balance = pushed.simulate(steps=steps, every=2).balance()
-    assert math.isfinite(balance.left) and math.isfinite(balance.unsure)
+    assert math.isfinite(balance.error) and math.isfinite(balance.uncertainty)
 
 
 def test_a_balance_travels(pushed: ModuleType) -> None:
@@ -317,9 +319,9 @@ def test_each_impact_takes_what_is_exact(falling: ModuleType, times: np.ndarray 
     run = falling.simulate() if times is None else falling.simulate(times=times)
     count = len(run.events["impact"])
     balance = run.balance()
-    assert count == 3 and balance.inputs == balance.forces == balance.lost == 0
+    assert count == 3 and balance.inputs == balance.forces == balance.dissipated == 0
     assert balance.jumps == pytest.approx(-9.81 * (1 - 0.8 ** (2 * count)), rel=1e-12)
-    assert balance.told and balance.left < 1e-9
+    assert balance.is_resolved and balance.error < 1e-9
     assert balance.words.startswith("jumps took 7.24 J; numerical error")
     assert pickle.loads(pickle.dumps(balance)) == balance
 
@@ -339,24 +341,28 @@ def test_work_between_jumps_is_told_apart(falling: ModuleType) -> None:
         if end < 2.0:
             jumps -= (1 - 0.7**2) * y[1] ** 2 / 2
             y[1] *= -0.7
-    assert len(times) > 4 and balance.told
-    assert balance.lost == pytest.approx(lost, rel=1e-9)
+    assert len(times) > 4 and balance.is_resolved
+    assert balance.dissipated == pytest.approx(lost, rel=1e-9)
     assert balance.jumps == pytest.approx(jumps, rel=1e-9)
     assert balance.inputs == pytest.approx(1.5 * (run.q[-1, 0] - 1.0), rel=1e-9)
     assert balance.forces == pytest.approx(0, abs=1e-9)
     change = run.energy[-1] - run.energy[0]
-    assert abs(balance.inputs - balance.lost + balance.jumps - change) <= balance.left + 1e-12
+    assert (
+        abs(balance.inputs - balance.dissipated + balance.jumps - change) <= balance.error + 1e-12
+    )
     assert "J were lost, jumps took" in balance.words
 
 
 def test_what_a_jump_sheds_is_its_own_energy(falling: ModuleType) -> None:
     """Half of the mass at 0.2 s: of K + P = m g, which it has all the way down, half."""
     balance = falling.simulate(duration=0.4, params={"at": 0.2}).balance()
-    assert balance.jumps == pytest.approx(-9.81 / 2, rel=1e-12) and balance.told
+    assert balance.jumps == pytest.approx(-9.81 / 2, rel=1e-12) and balance.is_resolved
     with pytest.warns(RuntimeWarning, match="ever sooner"):
         resting = falling.simulate(duration=9.0, params={"c": 0.2}).balance()
-    assert resting.told and resting.lost - resting.jumps == pytest.approx(9.81, rel=1e-9)
-    assert resting.left < 1e-8
+    assert resting.is_resolved and resting.dissipated - resting.jumps == pytest.approx(
+        9.81, rel=1e-9
+    )
+    assert resting.error < 1e-8
 
 
 @pytest.mark.slow
@@ -366,9 +372,11 @@ def test_friction_that_sticks_loses_all_and_its_jumps_take_nothing(modules: Modu
     balance = run.balance()
     fall = 5 * (1 - run.q[-1, 0] ** 2)
     assert (
-        balance.told and abs(balance.jumps) < 1e-12 and balance.forces == pytest.approx(0, abs=1e-9)
+        balance.is_resolved
+        and abs(balance.jumps) < 1e-12
+        and balance.forces == pytest.approx(0, abs=1e-9)
     )
-    assert balance.lost == pytest.approx(fall, rel=1e-10) and run.qd[-1, 0] == 0
+    assert balance.dissipated == pytest.approx(fall, rel=1e-10) and run.qd[-1, 0] == 0
     assert balance.words.startswith(f"{fall:.3g} J were lost; numerical error")
 
 
@@ -376,8 +384,8 @@ def test_of_many_jumps_it_is_told_without_many_rows(falling: ModuleType) -> None
     """Thousands of them, elastic: nothing is taken, and nothing lost."""
     run = falling.simulate(duration=2500.0, params={"e": 1.0})
     balance = run.balance()
-    assert len(run.events["impact"]) > 2500 and balance.told
-    assert abs(balance.jumps) < 1e-9 and balance.left < 1e-6
+    assert len(run.events["impact"]) > 2500 and balance.is_resolved
+    assert abs(balance.jumps) < 1e-9 and balance.error < 1e-6
 
 
 STOP = """
@@ -402,9 +410,9 @@ def test_short_contacts_are_seen(modules: Modules, times: np.ndarray | None) -> 
     """Rows equally far apart passed over them, and a right run had a numerical error of 8 %."""
     run = modules.of_text(STOP).simulate(times=times)
     found = run.balance()
-    assert found is not None and found.told
-    assert max(found.left, found.unsure) < 1e-8
-    assert found.lost == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)
+    assert found is not None and found.is_resolved
+    assert max(found.error, found.uncertainty) < 1e-8
+    assert found.dissipated == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)
 
 
 @pytest.mark.parametrize("roundings", [-2, 0, 1, 5])
@@ -418,5 +426,5 @@ def test_jumps_within_roundings_of_an_end_count(falling: ModuleType, roundings: 
         falling.simulate(duration=0.3, params={"at": max(0.0, -roundings)}),
     ):
         found = run.balance()
-        assert found is not None and found.told and found.left < 1e-13
+        assert found is not None and found.is_resolved and found.error < 1e-13
         assert found.jumps == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-12)

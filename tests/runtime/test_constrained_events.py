@@ -198,7 +198,7 @@ def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float, how: dict
 
     In fixed steps velocities are compared with what accelerations make of them.
     """
-    start = yoke.project([0, at, 0, 0], [0, 0, 0, 0], held=["phi"])
+    start = yoke.project([0, at, 0, 0], [0, 0, 0, 0], fixed=["phi"])
     for bearing, rub, torque in ((0.1, 10.0, 1.0), (2.0, 1e-3, 1.0), (0.0, 9.0, -0.7)):
         params = {"bearing": bearing, "rub": rub}
         run = yoke.simulate(*start, params=params, u=torque, **how)
@@ -229,7 +229,7 @@ def test_a_start_whose_rates_the_rows_give_slides(yoke: ModuleType) -> None:
     many = yoke.simulate_batch(q0=[[0, 1.0]], qd0=[[0, -2.0]], duration=0.1, tol=1e-11)
     assert many.q[0, -1].tolist() == run.q[-1].tolist()
     with pytest.raises(yoke.MotionError, match="with s, phi as given"):
-        yoke.project([1, 1, 1, 1], [0, 0, 0, 0], held=["s", "phi", "s_slides"])
+        yoke.project([1, 1, 1, 1], [0, 0, 0, 0], fixed=["s", "phi", "s_slides"])
 
 
 @pytest.mark.slow

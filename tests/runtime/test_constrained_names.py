@@ -78,11 +78,11 @@ def test_where_something_is_not_finite_is_told(
 def test_what_is_held_is_a_list_of_names(module: ModuleType) -> None:
     for held in (3, 2.5, True):
         with pytest.raises(ValueError, match="no list of names: x, y, x_dot, y_dot"):
-            module.project(*module.start, held=held)
+            module.project(*module.start, fixed=held)
     for held in ("z", ["z"], ["z", "x"], ["x", "z"]):
-        with pytest.raises(ValueError, match="held: 'z'"):
-            module.project(*module.start, held=held)
-    q, _ = module.project([0.6, 1.0], [0.0, 0.0], held=(name for name in ["x"]))
+        with pytest.raises(ValueError, match="fixed: 'z'"):
+            module.project(*module.start, fixed=held)
+    q, _ = module.project([0.6, 1.0], [0.0, 0.0], fixed=(name for name in ["x"]))
     np.testing.assert_allclose(q, [0.6, 0.8], rtol=1e-15)
 
 

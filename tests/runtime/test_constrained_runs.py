@@ -30,7 +30,7 @@ def system(name: str, starts: Any, K: str, P: str, rows: dict[str, str], **given
     made = System.make(name, starts, K, P, outputs=rows, **given)
     constraints = tuple(Constraint(o.name, o.formula) for o in made.outputs)
     first, *rest = made.coordinates
-    free = (first, *(replace(c, held=False, held_rate=False) for c in rest))
+    free = (first, *(replace(c, start_fixed=False, rate_fixed=False) for c in rest))
     return replace(made, outputs=(), constraints=constraints, coordinates=free)
 
 
@@ -81,14 +81,14 @@ def test_a_batch_ends_on_the_constraints_too(rod: ModuleType) -> None:
 
 
 def test_a_start_is_assembled_and_held_values_stay(rod: ModuleType) -> None:
-    q, qd = rod.project([0.5, -0.9], [1.0, 0.0], held=["x", "x_dot"])
+    q, qd = rod.project([0.5, -0.9], [1.0, 0.0], fixed=["x", "x_dot"])
     assert q[0] == 0.5 and qd[0] == 1.0
     np.testing.assert_allclose(q[1], -np.sqrt(0.75), rtol=1e-15)
     np.testing.assert_allclose(qd[1], 0.5 / np.sqrt(0.75), rtol=1e-14)
     near, _ = rod.project([0.5, -0.9], [0.0, 0.0])  # the least change: along the rod
     np.testing.assert_allclose(near, np.array([0.5, -0.9]) / np.hypot(0.5, 0.9), rtol=1e-14)
     with pytest.raises(rod.MotionError, match="with x as given: leave one free") as caught:
-        rod.project([1.5, -0.9], [0.0, 0.0], held="x")
+        rod.project([1.5, -0.9], [0.0, 0.0], fixed="x")
     assert caught.value.status == "locked"
     longer = rod.simulate([0.0, -1.9], [0.0, 0.0], params={"l": 2.0}, steps=1)
     assert longer.q[0].tolist() == [0.0, -2.0]
@@ -134,7 +134,7 @@ def four_bars() -> System:
         parameters={"r": 1, "s": -1, "l": 1, "d": 1, "n": 1, "m": 1, "k": 0, "g": 0},
         h=1 / 64, duration=6 / 64,
     )  # fmt: skip
-    free = tuple(replace(c, held=False) for c in made.coordinates)
+    free = tuple(replace(c, start_fixed=False) for c in made.coordinates)
     return replace(made, coordinates=free)
 
 
@@ -234,7 +234,7 @@ def test_a_start_where_rows_depend_on_each_other_is_left_as_it_is(tmp_path: Path
         h=0.01, duration=0.1,
     )  # fmt: skip
     module = eomc.load(made, tmp_path)
-    q, qd = module.project(np.zeros(3), np.zeros(3), held=["a"])
+    q, qd = module.project(np.zeros(3), np.zeros(3), fixed=["a"])
     assert not q.any() and not qd.any()
 
 
@@ -331,7 +331,7 @@ def test_equilibrium_is_where_forces_and_multipliers_balance(rod: ModuleType) ->
 def test_equilibrium_of_a_linkage_with_a_spring(four_bar: ModuleType) -> None:
     """Its crank is held by a torsion spring: no acceleration, and rows hold."""
     m, how = four_bar, {"params": {"s": 3, "l": -2, "d": 2.5, "n": 3, "m": 2, "k": 4, "g": 9.81}}
-    start, _ = m.project([0.7, 0.3, 1.2], np.zeros(3), held=["a"], **how)
+    start, _ = m.project([0.7, 0.3, 1.2], np.zeros(3), fixed=["a"], **how)
     q, _, u = m.equilibrium(start, **how)
     assert u is None
     assert np.abs(m.constraints(q, 0 * q, **how)).max() < 1e-14
@@ -397,7 +397,7 @@ def test_a_row_that_what_is_held_makes_depend_on_others_is_left_out(
         modules.append(eomc.load(made, tmp_path))
     for x, y in np.random.default_rng(7).uniform(-0.5, -0.1, (20, 2)):
         (alone, _), (q, _) = (
-            module.project([x, y, 0.0], np.zeros(3), held=["z"]) for module in modules
+            module.project([x, y, 0.0], np.zeros(3), fixed=["z"]) for module in modules
         )
         np.testing.assert_allclose(q, alone, rtol=0, atol=1e-12)
 

@@ -238,7 +238,7 @@ def test_a_linkage_comes_to_hang_from_where_its_forces_are_least(modules: Module
     assert np.abs(four_bar.acceleration(q, [0, 0, 0])).max() < 1e-12
     assert np.abs(four_bar.constraints(q, [0, 0, 0])).max() < 1e-14
     beside = [
-        four_bar.project(q + np.array([d, 0, 0]), [0, 0, 0], held=["q1"])[0] for d in (-0.01, 0.01)
+        four_bar.project(q + np.array([d, 0, 0]), [0, 0, 0], fixed=["q1"])[0] for d in (-0.01, 0.01)
     ]
     assert all(four_bar.potential_energy(x) > four_bar.potential_energy(q) for x in beside)
 

@@ -88,7 +88,7 @@ def test_several_at_once_happen_in_the_order_of_the_scene(ball: ModuleType) -> N
         run = ball.simulate(
             [0, height], [speed, 0], params={"wall": speed * end}, duration=1.2 * end
         )
-        which, rows = run._happened
+        which, rows = run._event_data
         assert which.tolist() == [0, 2], (height, speed)
         assert rows[:, 0] == pytest.approx([end, end], abs=1e-14)
 
@@ -133,7 +133,7 @@ def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType
     run = ball.simulate(params={"far": 0.7}, duration=5.0, estimate=True)
     assert run.stopped == "away" and max(run.error.end.values()) < 1e-9 and run.error.resolved
     assert ball.simulate(duration=1.0).balance().jumps == pytest.approx(-0.36 * G, rel=1e-8)
-    assert ball.simulate(duration=0.3).balance().left < 1e-9
+    assert ball.simulate(duration=0.3).balance().error < 1e-9
     with pytest.warns(RuntimeWarning, match="ever sooner"):
         resting = ball.simulate(duration=10.0)
     assert resting.estimate().resolved

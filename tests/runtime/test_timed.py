@@ -112,7 +112,7 @@ def test_its_error_is_estimated(cartpole: ModuleType) -> None:
     off = np.abs(run.q - exact)
     assert np.all(run.error.q[1:] > 0.5 * off[1:]) and np.all(run.error.q < 5 * off + 1e-15)
     balance = cartpole.simulate(h=0.01, duration=2.0).balance()
-    assert run.balance().left == balance.left  # of all steps, not of three rows
+    assert run.balance().error == balance.error  # of all steps, not of three rows
 
 
 def test_one_that_cannot_go_on_ends_with_its_last_good_state() -> None:

@@ -59,14 +59,14 @@ class Bent:
 
 def lost(run: Any) -> None:
     """One event is not told."""
-    which, rows = run._happened
-    run._happened = which[which != 0], rows[which != 0]
+    which, rows = run._event_data
+    run._event_data = which[which != 0], rows[which != 0]
 
 
 def late(run: Any) -> None:
     """The state at each event is that of a moment later."""
-    which, rows = run._happened
-    run._happened = which, rows + np.array([0, 1e-9, 0])
+    which, rows = run._event_data
+    run._event_data = which, rows + np.array([0, 1e-9, 0])
 
 
 def aside(run: Any) -> None:

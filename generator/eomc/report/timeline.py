@@ -172,7 +172,7 @@ def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:
 def select_instances(batch: Any, numbers: Sequence[int]) -> Any:
     """Return a batch of the instances `numbers` only."""
     fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "_codes")}
-    for name in ("_params", "_held"):  # one row if all instances share it
+    for name in ("_params", "_row_inputs"):  # one row if all instances share it
         values = getattr(batch, name)
         if values is not None and len(values) > 1:
             fields[name] = values[numbers]

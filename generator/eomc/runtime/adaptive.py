@@ -72,10 +72,10 @@ class AdaptiveRun(AdaptiveTrajectory):
     def _rerun(self, times: Array | None, end: float) -> AdaptiveRun:
         """Repeat the run with rows at `times`; None: after each step and on both sides of jumps."""
         q, qd = self._begin
-        held = self._held
+        inputs = self._period_inputs
         return run(
             self._model, q, qd, self.t0, end, self.tol, times,
-            self._u if held is None else ZeroOrderHold(held, self._period, self._periods),
+            self._u if inputs is None else ZeroOrderHold(inputs, self._period, self._periods),
             self._params, self._h_most, None, self._stiff, method=self._by,
         )  # fmt: skip
 
@@ -310,11 +310,14 @@ def run(
     if times is not None:
         trajectory._last = work.t, np.frombuffer(model._ffi.buffer(work.x), model.dtype).copy()
     if acting.periods:
-        trajectory._period, trajectory._held = acting.periods.period, np.array(acting.values)
+        trajectory._period, trajectory._period_inputs = (
+            acting.periods.period,
+            np.array(acting.values),
+        )
         trajectory._periods = acting.periods.count
-        trajectory._told_inputs()
+        trajectory._update_applied_inputs()
     if events:
-        trajectory._happened = events.all()
+        trajectory._event_data = events.all()
         trajectory.stopped = model.events[work.stopped - 1] if work.stopped else ""
         trajectory.limit = work.limit if status == "accumulated" else trajectory.limit
     if model.constraint_names:

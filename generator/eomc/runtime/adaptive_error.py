@@ -81,7 +81,7 @@ def error_by_tighter_tolerance(
         left[-1] = np.abs(x[-1] - events.end)
     elif not events.stops:
         left[-1] = np.inf
-    if len(own._happened[0]) or (left > _UNRESOLVED_ERROR * scale).any():
+    if len(own._event_data[0]) or (left > _UNRESOLVED_ERROR * scale).any():
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
         if full.any():  # where so little fills the scale, rounding fills a quarter of it

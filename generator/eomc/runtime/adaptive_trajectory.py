@@ -64,11 +64,11 @@ class AdaptiveTrajectory(Run):
     _last: tuple[float, Array] = field(default=(0.0, _NONE[1]), init=False)  # t, [q; qd] reached
     _stiff: bool = field(default=False, init=False)
     # event indices (n,), rows of t, q, qd
-    _happened: tuple[Array, Array] = field(default=_NONE, init=False)
+    _event_data: tuple[Array, Array] = field(default=_NONE, init=False)
     stopped: str = field(default="", init=False)
     limit: float = field(default=float("nan"), init=False)
     _period: float = field(default=0.0, init=False)  # control period, s; 0 without one
-    _held: Array | None = field(default=None, init=False)  # inputs of the periods, (n, nu)
+    _period_inputs: Array | None = field(default=None, init=False)  # inputs of the periods, (n, nu)
     _periods: int = field(default=0, init=False)  # number of control periods in the run
 
     @property
@@ -102,7 +102,7 @@ class AdaptiveTrajectory(Run):
     @cached_property
     def events(self) -> dict[str, EventLog]:
         """Times and states of each event of the scene, by name."""
-        which, rows = self._happened
+        which, rows = self._event_data
         nq, names = self._model.nq, self._model.events
         each = (rows[which == k] for k in range(len(names)))
         logs = (EventLog(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
@@ -125,13 +125,15 @@ class AdaptiveTrajectory(Run):
         for name in ("q", "qd", "outputs"):  # cached properties
             run.__dict__.pop(name, None)
         run._rows, run._times, run._energy = rows, times, None
-        run._told_inputs()
+        run._update_applied_inputs()
         return run
 
-    def _told_inputs(self) -> None:
+    def _update_applied_inputs(self) -> None:
         """Set the inputs that are applied at each row (zero-order hold)."""
-        if self._held is not None:
-            self._applied = sample_zero_order_hold(self._times, self.t0, self._period, self._held)
+        if self._period_inputs is not None:
+            self._applied = sample_zero_order_hold(
+                self._times, self.t0, self._period, self._period_inputs
+            )
 
     def _repeat(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
         raise ValueError("an adaptive run has no steps of one size")
@@ -140,9 +142,9 @@ class AdaptiveTrajectory(Run):
         own = {
             "tol": self.tol, "rejected": self.rejected, "stiff_steps": self.stiff_steps,
             "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
-            "t_end": self._t_end, "which": self._happened[0],
-            "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
-            "period": self._period, "values": self._held, "by": self._by,
+            "t_end": self._t_end, "which": self._event_data[0],
+            "event_rows": self._event_data[1], "stopped": self.stopped, "limit": self.limit,
+            "period": self._period, "values": self._period_inputs, "by": self._by,
             "periods": self._periods,
         }  # fmt: skip
         return super()._to_arrays() | own
@@ -151,21 +153,21 @@ class AdaptiveTrajectory(Run):
     def _from_arrays(cls, model: Stepping, arrays: Mapping[str, Any], **own: Any) -> Self:
         held, values = arrays.get("held"), arrays.get("values")
         u = held if values is None or held is not None else LEFT_OUT
-        made = cls(
+        run = cls(
             model, arrays["t0"], (arrays["q"], arrays["qd"]), arrays["h"], arrays["steps"],
             arrays["status"], arrays["params"], 1, u, arrays["method"], arrays["evaluations"],
             tol=arrays["tol"], rejected=arrays["rejected"],
             stiff_steps=arrays.get("stiff_steps", 0), _times=arrays["times"],
             _t_end=arrays["t_end"],
         )  # fmt: skip
-        made._h_most, made._stiff = arrays["h_most"], bool(arrays.get("stiff", False))
-        made._by = arrays.get("by", "")
-        made._begin, made._happened = arrays["begin"], (arrays["which"], arrays["event_rows"])
-        made.stopped, made.limit = arrays["stopped"], arrays["limit"]
-        made._period, made._held = arrays.get("period", 0.0), values
-        made._periods = arrays.get("periods", 0 if values is None else len(values))
-        made._told_inputs()
-        return made
+        run._h_most, run._stiff = arrays["h_most"], bool(arrays.get("stiff", False))
+        run._by = arrays.get("by", "")
+        run._begin, run._event_data = arrays["begin"], (arrays["which"], arrays["event_rows"])
+        run.stopped, run.limit = arrays["stopped"], arrays["limit"]
+        run._period, run._period_inputs = arrays.get("period", 0.0), values
+        run._periods = arrays.get("periods", 0 if values is None else len(values))
+        run._update_applied_inputs()
+        return run
 
     def _state(self) -> dict[str, Any]:
         state = super()._state() | {"_times": self._times}

@@ -26,39 +26,43 @@ _MAX_ROWS = 400_000  # rows of all pieces
 
 @dataclass(frozen=True)
 class Balance:
-    """J: E(end) - E(0) = inputs + forces - lost + jumps, and what method and rounding made of it.
+    """Energy balance E(end) - E(0) = inputs + forces - dissipated + jumps, J.
 
-    E is the energy, or Jacobi's integral where that is another. inputs: their work, the signals'
-    too. lost: what forces took that are odd in the velocities, as friction and dampers are. forces:
-    the work of all others, and of what moves with time. jumps: what the jumps of events put in,
-    less than 0 where they took, as impacts do. left: E - E(0) less all of these, the largest
-    along the run: the method's error. unsure: how far the work may be off, since steps are long;
-    less than that can't be seen of `left`. told: whether that is little beside the work.
+    E is the energy, or the Jacobi integral if it differs.
+
+    inputs : work of the inputs, including signals.
+    forces : work of all other forces and of prescribed motion.
+    dissipated : energy dissipated by forces that are odd in the velocities, such as friction.
+    error : largest difference of both sides along the run, the error of the method.
+    uncertainty : error bound of the quadrature of the work; smaller values of `error` cannot be
+        observed.
+    is_resolved : whether `uncertainty` is small compared with the work.
+    jumps : energy added by state jumps; negative for impacts.
     """
 
     inputs: float
     forces: float
-    lost: float
-    left: float
-    unsure: float
-    told: bool
+    dissipated: float
+    error: float
+    uncertainty: float
+    is_resolved: bool
     jumps: float = 0.0
 
     @property
     def words(self) -> str:
         """Describe supplied and dissipated energy and the numerical error in a sentence."""
-        if not self.told:
+        if not self.is_resolved:
             return "steps are too long to tell what was put in and what was lost"
         ways = (
             (self.inputs, "inputs put in {} J", "inputs took {} J"),
             (self.forces, "forces put in {} J", "forces took {} J"),
-            (self.lost, "{} J were lost", "negative damping put in {} J"),
+            (self.dissipated, "{} J were lost", "negative damping put in {} J"),
             (self.jumps, "jumps put in {} J", "jumps took {} J"),
         )
         messages = [(more if x > 0 else less).format(f"{abs(x):.3g}")
-                 for x, more, less in ways if abs(x) > self.unsure]  # fmt: skip
-        error = f"{self.left:.2g}" if self.left > 3 * self.unsure else ""
-        error = error or f"at most {self.left + self.unsure:.1g}"
+                 for x, more, less in ways if abs(x) > self.uncertainty]  # fmt: skip
+        error = f"{self.error:.2g}" if self.error > 3 * self.uncertainty else ""
+        error = error or f"at most {self.error + self.uncertainty:.1g}"
         return f"{', '.join(messages) or 'nothing was put in or lost'}; numerical error {error} J"
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -118,7 +122,7 @@ def balance(run: Trajectory) -> Balance | None:
     left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
     jumped = float(jump_work[-1])
     is_resolved = off <= max(_MAX_RELATIVE_ERROR * max(map(abs, (*parts, jumped))), 10 * rounding)
-    return Balance(*parts, left, off + rounding, told=is_resolved, jumps=jumped)
+    return Balance(*parts, left, off + rounding, is_resolved=is_resolved, jumps=jumped)
 
 
 def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
@@ -139,7 +143,7 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
         states = _in_steps(run) or _between_jumps(run)
         return _PowerSamples(model, run._params, *states, u)
     run = with_jumps(run)
-    ends, values = _held(run)
+    ends, values = _piecewise_inputs(run)
     if not len(values):
         return None
     after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # rows after jumps
@@ -163,11 +167,11 @@ def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
     return both, values[np.searchsorted(ends, both[:-1], side="right") - 1]
 
 
-def _held(run: Any) -> tuple[Array, Array]:
+def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
     """Return times (n + 1,) and the constant inputs between them, (n, nu); n = 0: unknown."""
     unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
     if hasattr(run, "tol"):
-        values = run._held
+        values = run._period_inputs
         if values is None:
             return unknown
         starts = run.t0 + run._period * np.arange(len(values))
@@ -232,7 +236,7 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
 
 def with_jumps(run: Any) -> Any:
     """Return the run with both rows of each jump, also if its rows are at requested times."""
-    event_indices = getattr(run, "_happened", ((),))[0]
+    event_indices = getattr(run, "_event_data", ((),))[0]
     if not len(event_indices) or (np.diff(run.t) == 0).any():
         return run
     return _after_steps(run)

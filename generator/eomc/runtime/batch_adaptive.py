@@ -64,7 +64,7 @@ class AdaptiveBatchRun(BatchRun):
     _period: float = field(default=0.0, kw_only=True)  # control period, s; 0 without one
     _by: str = field(default="", kw_only=True)  # the method of fixed steps
     _max_evaluations: int = field(default=0, kw_only=True)  # 0: no limit
-    _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
+    _event_data: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + index of the event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
 
@@ -81,9 +81,9 @@ class AdaptiveBatchRun(BatchRun):
     @cached_property
     def events(self) -> dict[str, BatchEventLog]:
         """Times, states and instances of each event of the scene, by name."""
-        if self._happened is None:
+        if self._event_data is None:
             return ByName("events", (), ())
-        nq, (instances, which, rows) = self._model.nq, self._happened
+        nq, (instances, which, rows) = self._model.nq, self._event_data
         logs = []
         for k in range(len(self._model.events)):
             own = which == k
@@ -94,7 +94,7 @@ class AdaptiveBatchRun(BatchRun):
     def _states(self, times: Array) -> Array:
         model: Any = self._model
         p, limits = self._params, (float(self._times[-1]), self.tol, self._h_most)
-        inputs = self._held if self._u is None else self._u
+        inputs = self._row_inputs if self._u is None else self._u
         work = _Work(
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
             (inputs, self._period), p, self._stiff, self._by,
@@ -151,20 +151,20 @@ class AdaptiveBatchRun(BatchRun):
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
     def _to_arrays(self) -> dict[str, Any]:
-        found = super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
-        if self._happened is not None:
-            found |= zip(_EVENT_FIELDS, self._happened, strict=True)
-            found |= {"stopped": self._stopped, "limit": self._limit}
-        return found
+        arrays = super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
+        if self._event_data is not None:
+            arrays |= zip(_EVENT_FIELDS, self._event_data, strict=True)
+            arrays |= {"stopped": self._stopped, "limit": self._limit}
+        return arrays
 
     @classmethod
-    def _from_arrays(cls, model: Any, kept: Mapping[str, Any]) -> AdaptiveBatchRun:
-        made = BatchRun._from_arrays(model, kept)._all()
-        found = cls(*made, **{name: kept[name] for name in _NAMES if name in kept})
-        if "which" in kept:
-            found._happened = tuple(kept[name] for name in _EVENT_FIELDS)
-            found._stopped, found._limit = kept["stopped"], kept["limit"]
-        return found
+    def _from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> AdaptiveBatchRun:
+        fields_of_batch = BatchRun._from_arrays(model, arrays)._all()
+        run = cls(*fields_of_batch, **{name: arrays[name] for name in _NAMES if name in arrays})
+        if "which" in arrays:
+            run._event_data = tuple(arrays[name] for name in _EVENT_FIELDS)
+            run._stopped, run._limit = arrays["stopped"], arrays["limit"]
+        return run
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self.tol, self._times.tolist())
@@ -275,7 +275,7 @@ def _run(
         _period=period, _by=method, _max_evaluations=limit,
     )  # fmt: skip
     if work.events:
-        batch._happened = work.events.all()
+        batch._event_data = work.events.all()
         batch._stopped = work.counts["stopped"]
         at_limit = codes == STATUS.index("accumulated")
         batch._limit = np.where(at_limit, work.counts["limit"], np.nan)
@@ -301,7 +301,7 @@ class _Work:
         method: method of fixed steps; "": adaptive steps.
         """
         self.model, (self.q, self.qd), self.times = model, begin, times
-        (self.held, self.period), self.table, self.limits = inputs, table, limits
+        (self.inputs, self.period), self.table, self.limits = inputs, table, limits
         (count, _), n = self.q.shape, len(times)
         self.t0, self.t = t0, np.full(count, t0, model.dtype)
         self.rows = np.empty((2, count, n, model.nq), model.dtype)
@@ -359,7 +359,7 @@ class _Work:
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
         """Simulate instances at, ..., at + count - 1 to the end, one control period at a time."""
-        model, inputs = self.model, self.held
+        model, inputs = self.model, self.inputs
         u, periods, each = model._c[2], 1, 0
         if inputs is not None:
             many, periods, _ = inputs.shape

@@ -52,10 +52,10 @@ class TimedBatchRun(BatchRun):
         return super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
-    def _from_arrays(cls, model: Any, kept: Mapping[str, Any]) -> TimedBatchRun:
-        made = BatchRun._from_arrays(model, kept)._all()
-        own: Any = {name: kept.get(name) for name in _NAMES}
-        return cls(*made, **own)
+    def _from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> TimedBatchRun:
+        fields_of_batch = BatchRun._from_arrays(model, arrays)._all()
+        own: Any = {name: arrays.get(name) for name in _NAMES}
+        return cls(*fields_of_batch, **own)
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self._times.tolist())

@@ -51,16 +51,16 @@ class BatchRun(Values, Fans, Columns):
     steps: Array
     _codes: Array
     every: int
-    _wanted: int
+    _requested_steps: int
     _params: Array  # (batch or 1, np)
-    _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
+    _row_inputs: Array | None  # at the rows, (batch or 1, n or 1, nu)
     method: str
-    _u: Array | None = None  # (batch or 1, steps or 1, nu), if _held has only a part of it
+    _u: Array | None = None  # (batch or 1, steps or 1, nu), if _row_inputs has only a part of it
 
     @cached_property
     def t(self) -> Array:
         """The time of each row, (n,), s."""
-        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._wanted)
+        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._requested_steps)
         return np.asarray(self.t0 + self.h * steps)
 
     @cached_property
@@ -90,9 +90,9 @@ class BatchRun(Values, Fans, Columns):
     @property
     def _requested_inputs(self) -> Array:
         """Inputs at each row before saturation, (batch, n, nu)."""
-        if self._held is None:
+        if self._row_inputs is None:
             return self._evaluate(self._model.signal, (self._model.nu,))
-        inputs = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
+        inputs = np.broadcast_to(self._row_inputs, (*self.q.shape[:2], self._model.nu)).copy()
         inputs[np.isnan(self.q[..., 0])] = np.nan
         return inputs
 
@@ -111,8 +111,8 @@ class BatchRun(Values, Fans, Columns):
 
     def _states(self, times: Array) -> Array:
         """Return states (2, batch, n, nq) at ascending times, from the row before each."""
-        inputs, every = self._held if self._u is None else self._u, self.every
-        whole, rest = parts(times, self.t0, self.h, self._wanted)
+        inputs, every = self._row_inputs if self._u is None else self._u, self.every
+        whole, rest = parts(times, self.t0, self.h, self._requested_steps)
         rows = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         for row in np.unique(whole // every):
             own, first = (whole // every == row).nonzero()[0], int(row) * every
@@ -140,13 +140,13 @@ class BatchRun(Values, Fans, Columns):
         return dict(zip(_FIELDS, self._all()[1:], strict=True))
 
     @classmethod
-    def _from_arrays(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
-        values: Any = map(kept.get, _FIELDS)
+    def _from_arrays(cls, model: Model, arrays: Mapping[str, Any]) -> BatchRun:
+        values: Any = map(arrays.get, _FIELDS)
         return cls(model, *values)
 
     @classmethod
-    def _of_pickled(cls, kept: Mapping[str, Any]) -> BatchRun:
-        return cls._from_arrays(own_model(), kept)
+    def _of_pickled(cls, arrays: Mapping[str, Any]) -> BatchRun:
+        return cls._from_arrays(own_model(), arrays)
 
     @property
     def message(self) -> str:
@@ -154,7 +154,7 @@ class BatchRun(Values, Fans, Columns):
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
-        total_steps = len(self) * self._wanted
+        total_steps = len(self) * self._requested_steps
         steps = f"{step_count} of {total_steps} steps of {self.h:g} s"
         return f"{len(self)} instances, {steps}: {statuses}"
 
@@ -194,10 +194,18 @@ class BatchRun(Values, Fans, Columns):
 
     def _settings(self) -> tuple[Any, ...]:
         model = self._model
-        return (model.name, model.digest, self.t0, self.h, self.every, self._wanted, self.method)
+        return (
+            model.name,
+            model.digest,
+            self.t0,
+            self.h,
+            self.every,
+            self._requested_steps,
+            self.method,
+        )
 
     def _arrays(self) -> tuple[Array, ...]:
-        inputs = np.empty(0) if self._held is None else self._held
+        inputs = np.empty(0) if self._row_inputs is None else self._row_inputs
         return self.q, self.qd, self.steps, self._codes, self._params, inputs
 
     def __len__(self) -> int:

@@ -22,7 +22,7 @@ class Values:
     q: Array
     qd: Array
     _params: Array  # (batch or 1, np)
-    _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
+    _row_inputs: Array | None  # at the rows, (batch or 1, n or 1, nu)
     t: Any
     __len__: Callable[[], int]
 
@@ -81,7 +81,9 @@ class Values:
 
     def _evaluate_with_inputs(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
         """Evaluate a function of the state and the inputs at all rows."""
-        return self._evaluate(function, shape, None if self._held is None else {"u": self._held})
+        return self._evaluate(
+            function, shape, None if self._row_inputs is None else {"u": self._row_inputs}
+        )
 
     def _evaluate(
         self, function: Callable[..., Any], shape: tuple[int, ...],

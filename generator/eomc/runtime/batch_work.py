@@ -35,7 +35,7 @@ class Work:
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # start time of all or of each
         self.first = 0  # the step that `run` begins with
-        self.held, self.table = inputs, table
+        self.inputs, self.table = inputs, table
         self.starts = starts
         self.rows = 0 if q_rows is None else q_rows.shape[1]
         self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
@@ -115,10 +115,10 @@ class Work:
         begin = pointer(self.begin[at:end] if times else self.begin)
         table = pointer(self.table[at:end] if each else self.table)
         u, u_instance, u_step = null, 0, 0
-        if self.held is not None:
-            _, many, width = self.held.shape
-            u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
-            u_instance = many * width if len(self.held) > 1 else 0
+        if self.inputs is not None:
+            _, many, width = self.inputs.shape
+            u = pointer(self.inputs[at:end] if len(self.inputs) > 1 else self.inputs)
+            u_instance = many * width if len(self.inputs) > 1 else 0
             u_step = width if many > 1 else 0
         first, kind = self.first, (self.step, count.bit_length())
         # the first chunk is short: the measured speed may be that of an easier batch
@@ -170,7 +170,7 @@ class BatchStepper:
         """
         work, (whole, rest) = self.work, places
         last = work.count * int(whole[-1])
-        look = progress and (lambda done, _: progress(done, last))
+        look = progress and (lambda count, _: progress(count, last))
         for k, (n, left) in enumerate(zip(whole.tolist(), rest.tolist(), strict=True)):
             work.first, work.steps = work.steps, n
             if not work.run(threads, look):
@@ -183,7 +183,7 @@ class BatchStepper:
     def _between(self, rest: float) -> tuple[Array, Array]:
         """Return the states `rest` seconds after the last step; nan for failed instances."""
         work, (q, qd) = self.work, np.array(self.state)
-        good, inputs = work.status == 0, work.held
+        good, inputs = work.status == 0, work.inputs
         if not rest and not work.steps:
             return q, qd  # initial states, also those that cannot be assembled
         if rest:

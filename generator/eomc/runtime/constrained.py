@@ -32,7 +32,7 @@ class ConstraintRows(NamedTuple):
 
     names: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
-    held: tuple[bool, ...] = ()
+    fixed: tuple[bool, ...] = ()
     holonomic: int = 0
     redundant: tuple[int, ...] = ()
     modes: tuple[tuple[int, int], ...] = ()
@@ -164,22 +164,22 @@ class Constrained(Frames):
 
     def project(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
-        held: Sequence[str] | None = None,
+        fixed: Sequence[str] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Project (q, qd) onto the constraints by the smallest change in the metric of D.
 
-        held: names of coordinates and velocities that are fixed; None: all may change.
+        fixed: names of coordinates and velocities that are fixed; None: all may change.
         Raises MotionError, status "locked", if no such state is found.
         """
-        if isinstance(held, str):
-            held = (held,)
-        if not (held is None or isinstance(held, Iterable)):
-            raise ValueError(f"held: {held!r} is no list of names: {', '.join(self._states)}")
-        held = held and tuple(held)
-        for name in held or ():
+        if isinstance(fixed, str):
+            fixed = (fixed,)
+        if not (fixed is None or isinstance(fixed, Iterable)):
+            raise ValueError(f"fixed: {fixed!r} is no list of names: {', '.join(self._states)}")
+        fixed = fixed and tuple(fixed)
+        for name in fixed or ():
             if name not in self._states:
-                raise ValueError(not_one_of("held", name, self._states))
-        flags = tuple(name in held for name in self._states) if held else ()
+                raise ValueError(not_one_of("fixed", name, self._states))
+        flags = tuple(name in fixed for name in self._states) if fixed else ()
         return self._projected(q, qd, t, params, flags)
 
     def _projected(
@@ -263,7 +263,7 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
     ) -> tuple[Array, Array]:
         """Project a start onto the constraints and set friction modes from its velocities."""
-        fixed = self._rows.held
+        fixed = self._rows.fixed
         if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
             return self._projected(q, qd, t0, params, fixed)
         q = self._sliding(q)
@@ -275,7 +275,7 @@ class Constrained(Frames):
         self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
         """Project many starts; return their status too. Failed ones are unchanged."""
-        fixed = self._rows.held
+        fixed = self._rows.fixed
         if not self._rows.modes:
             return self._projected_rows(q, qd, t0, params, fixed)
         found_q, found_qd, first = self._projected_rows(self._sliding(q), qd, t0, params, fixed)

@@ -83,7 +83,9 @@ class ProjectionChecks:
             expected = of.sampler.expected(expected_state)
             if expected is None:
                 return None
-            result = self.module.project(s.q, s.qd, t=s.t, params=s.params, held=self._names(fixed))
+            result = self.module.project(
+                s.q, s.qd, t=s.t, params=s.params, fixed=self._names(fixed)
+            )
             size = np.abs([expected_state.q, expected_state.qd]) + scale + expected.size["place"]
             displacement = np.abs(np.array([expected_state.q - s.q, expected_state.qd - s.qd]))
             if np.any(displacement > (100 if fixed else 10) * part * scale):  # there may be several

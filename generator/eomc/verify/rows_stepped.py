@@ -74,7 +74,7 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 
     The states at the start before a jump, and between jumps at one time, are in no row.
     """
-    _, recorded = run._happened
+    _, recorded = run._event_data
     first = int(len(recorded) > 0 and recorded[0, 0] <= run.t[0])
     for k in range(first, len(run) - 1):
         if run.t[k + 1] > run.t[k]:
