@@ -18,7 +18,7 @@ from eomc.derive import lagrange
 from eomc.integrators.tableaux import METHODS
 from eomc.model import from_scene as system
 from eomc.program import program
-from eomc.program.trig import apart
+from eomc.program.trig import separate_angles
 from eomc.scene import read as scene
 from eomc.toolchain.subprocesses import write_files
 
@@ -42,7 +42,7 @@ def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.nd
 
 def test_angles_that_are_linear_in_coordinates_are_found() -> None:
     made = odd()
-    angles, rest = apart(made["acceleration"], ["a", "b"])
+    angles, rest = separate_angles(made["acceleration"], ["a", "b"])
     found = {(frozenset(angle.terms), angle.offset) for angle in angles}
     half = Rational(1, 2)
     one, two = S.One, S(2)

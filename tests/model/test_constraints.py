@@ -73,7 +73,7 @@ def test_without_constraints_everything_is_held():
 def test_dependence_follows_definitions():
     x, y = Coordinate("x"), Coordinate("y")
     p, v = symbol("p"), symbol("v")
-    of = VelocityDegree([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).of
+    of = VelocityDegree([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).degree
 
     def found(e):
         rates = of(e)

@@ -8,7 +8,7 @@ import sympy
 
 from eomc.model.from_scene import from_scene
 from eomc.model.kinematics import Kinematics
-from eomc.model.loops import across
+from eomc.model.loops import perpendicular_axes
 from eomc.model.symbols import needed
 from eomc.scene.joints import CLOSINGS
 from eomc.scene.read import parse
@@ -197,7 +197,7 @@ def test_rows_of_axes_are_small_rotations_about_the_named_axes(kind):
         axes = {f"r{letter}": R[:, k] for k, letter in enumerate("xyz")}
     else:
         loop = two.scene.assembly.loops[0]
-        u, v, _ = (np.array(e, float) for e in across(loop.axes[0], False))
+        u, v, _ = (np.array(e, float) for e in perpendicular_axes(loop.axes[0], False))
         axes = {"ru": u, "rv": v}
     for name, axis in axes.items():
         np.testing.assert_allclose(slopes[name], axis @ omega, atol=1e-8)

@@ -74,8 +74,8 @@ def test_it_is_drawn_as_that_of_a_scene() -> None:
     scene = from_scene(parse(SCENE + PICTURE))
     system = made(tomllib.loads(PICTURE)["picture"])
     same(drawing(system, T, Q), drawing(scene, T, Q))
-    longer = drawing(system.at({"l": 3.0}), T, Q)
-    same(longer, drawing(scene.at({"l": 3.0}), T, Q))
+    longer = drawing(system.with_parameters({"l": 3.0}), T, Q)
+    same(longer, drawing(scene.with_parameters({"l": 3.0}), T, Q))
 
 
 def test_expressions_stand_as_formulas_do() -> None:

@@ -100,7 +100,9 @@ def test_a_start_is_assembled_once(name: str) -> None:
     for one, other in zip(start_of(made), start_of(again), strict=True):
         np.testing.assert_array_equal(one, other)
     assert again.constraints == made.constraints
-    changed = assembled(made.at({made.parameters[0].name: made.parameters[0].value * 1.001}))
+    changed = assembled(
+        made.with_parameters({made.parameters[0].name: made.parameters[0].value * 1.001})
+    )
     assert changed.closure is not made.closure
 
 

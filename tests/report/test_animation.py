@@ -143,7 +143,7 @@ def test_names_are_set_as_in_print():
 
 def test_a_loaded_module_knows_its_scene(modules, tmp_path):
     run = modules("cartpole").simulate(duration=1.0, params={"l": 1.0})
-    assert system_of(run).at({}).parameters[2].value == 1.0
+    assert system_of(run).with_parameters({}).parameters[2].value == 1.0
     made = run.animate(tmp_path / "a.html", run, title="Two")
     text = (tmp_path / "a.html").read_text()
     assert text == made.page and "<h1>Two</h1>" in text and text.count('class="stage"') == 2
@@ -210,7 +210,7 @@ def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
     assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
-    fifth = system_of(batch).at({"l": batch._params[4, 2]})
+    fifth = system_of(batch).with_parameters({"l": batch._params[4, 2]})
     alone = drawing(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
     path = alone.points[:, alone.paths[0].point]

@@ -246,7 +246,7 @@ def test_what_has_no_place_is_not_drawn():
 
 
 def test_parameters_of_the_run_count():
-    made = from_scene(scene("simple_pendulum")).at({"l": 3.0})
+    made = from_scene(scene("simple_pendulum")).with_parameters({"l": 3.0})
     found = drawing(made, np.zeros(1), np.zeros((1, 1)))
     assert np.allclose(marks(found, "line")[0][0, 1], [0, -3])
 

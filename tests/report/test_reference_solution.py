@@ -119,7 +119,7 @@ def test_it_is_kept_until_start_or_parameters_change(
         again = reference_solution.solve(system, rows=8, root=folder)
     np.testing.assert_array_equal(made.q, again.q)
     np.testing.assert_array_equal(made.digits, again.digits)
-    other = reference_solution.solve(system.at({"k": 4.0}), rows=8, root=folder)
+    other = reference_solution.solve(system.with_parameters({"k": 4.0}), rows=8, root=folder)
     assert float(other.q[-1, 0]) == pytest.approx(np.cos(4.0), abs=1e-14)
 
 
@@ -127,10 +127,14 @@ def test_accelerations_that_are_not_the_plain_ones_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = reference_solution._compile
-    monkeypatch.setattr(reference_solution, "_compile", lambda s, f: wrong(s.at({"k": 9.0}), f))
+    monkeypatch.setattr(
+        reference_solution, "_compile", lambda s, f: wrong(s.with_parameters({"k": 9.0}), f)
+    )
     right = reference_solution._run
     monkeypatch.setattr(
-        reference_solution, "_run", lambda e, s, *how: right(e, s.at({"k": 9.000000001}), *how)
+        reference_solution,
+        "_run",
+        lambda e, s, *how: right(e, s.with_parameters({"k": 9.000000001}), *how),
     )
     with pytest.raises(EomcError, match="agree to 10 digits only"):
         reference_solution.solve(oscillator(), rows=4, root=tmp_path)

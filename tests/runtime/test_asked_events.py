@@ -282,7 +282,7 @@ def test_a_system_that_was_read_or_changed(scene: Path, tmp_path: Path) -> None:
     own = eomc.read(scene)
     run = eomc.load(own, tmp_path).simulate(duration=1.0, events=BESIDE)
     assert run.events["through"].t == pytest.approx([math.pi / 6], abs=TOL)
-    for changed in (own.at({"k": 5.0}), swinging().at({"w": 1.0})):
+    for changed in (own.with_parameters({"k": 5.0}), swinging().with_parameters({"w": 1.0})):
         m = SimpleNamespace(name=changed.name, source=changed, events=("turns",))
         with pytest.raises(EomcError, match=r"was changed since .* made it: give"):
             pipeline.with_events(m, BESIDE, tmp_path)

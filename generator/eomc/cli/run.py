@@ -143,7 +143,10 @@ def command(
 
         drawn = run._drawn
         jacobi = drawn.jacobi if own.has_jacobi else None
-        system, rows = pipeline.read(scene).at(values), (drawn.t, drawn.q, drawn.qd, drawn.energy)
+        system, rows = (
+            pipeline.read(scene).with_parameters(values),
+            (drawn.t, drawn.q, drawn.qd, drawn.energy),
+        )
         words = balance.words if balance else ""
         acted = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
         plots.draw(

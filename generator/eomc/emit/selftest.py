@@ -29,7 +29,7 @@ from eomc.model.symbols import ALONG
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.outline import weight
 from eomc.program.program import TIME
-from eomc.program.trig import apart
+from eomc.program.trig import separate_angles
 
 # by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
 LIMIT = {True: 2.0**20, False: 2.0**13}
@@ -766,7 +766,7 @@ def _large(target: Target) -> Iterator[dict[str, float]]:
     program, limit = target.program, LIMIT[target.real is DOUBLE]
     coordinates = {c.name: i for i, c in enumerate(program.system.coordinates)}
     found = chain.from_iterable(
-        apart(program[name], coordinates)[0] for name in ("bias", "acceleration")
+        separate_angles(program[name], coordinates)[0] for name in ("bias", "acceleration")
     )
     angles = [a for a in found if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)]
     if not angles:

@@ -55,7 +55,7 @@ class Chains:
         moves = any(self.steps[name].motions for name in self.path(ancestor) if name in self.steps)
         return ancestor if moves else WORLD
 
-    def seen(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
+    def relative_pose(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
         """Return the position and rotation of a body in the frame of one of its ancestors."""
         at, R, angle, path = ZERO, ONE, S.Zero, self.path(name)
         for body in reversed(path[: path.index(base)]):

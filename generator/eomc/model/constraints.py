@@ -62,13 +62,13 @@ class VelocityDegree:
         for c in coordinates:
             self.known |= {c.q: _POSITION, c.qd: _RATE}
         for name, e in definitions:
-            self.known[name] = self.of(e)
+            self.known[name] = self.degree(e)
 
-    def of(self, e: Expr) -> Degree:
+    def degree(self, e: Expr) -> Degree:
         """Return the degree of an expression over symbols of the system."""
         degree = self.known.get(e)
         if degree is None:
-            degree = self._combine(e, [self.of(part) for part in e.args])
+            degree = self._combine(e, [self.degree(part) for part in e.args])
             self.known[e] = degree
         return degree
 
@@ -115,13 +115,13 @@ class Rows:
         self.values = values
         self.fault = fault
         self.doubt = doubt
-        self.depends = VelocityDegree(coordinates, definitions)
+        self.velocity_degree = VelocityDegree(coordinates, definitions)
 
     def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
         """Return the constraints with `holonomic` set, holonomic ones first."""
         holonomic, others = [], []
         for row in rows:
-            degree = self.depends.of(row.formula)
+            degree = self.velocity_degree.degree(row.formula)
             if degree.moves < 2:
                 self.fault(row, NOTHING_MOVES)
             elif degree.degree > 1:
@@ -156,7 +156,7 @@ class Rows:
 
     def _fixed(self, e: Expr) -> float | None:
         """Return the value of an expression that depends on no coordinate; None otherwise."""
-        if self.depends.of(e).moves == 2:
+        if self.velocity_degree.degree(e).moves == 2:
             return None
         known: dict[Expr, Expr] = {name: sympy.Float(v) for name, v in self.values.items()}
         for name, formula in needed(self.definitions, [e]):

@@ -18,7 +18,7 @@ from sympy import Expr, S
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model.constraint_report import ConstraintSummary
-from eomc.model.mechanics import Made, Mechanics
+from eomc.model.mechanics import AnySystem, Mechanics
 from eomc.model.symbols import Constraint, Coordinate, Event, FrictionMode
 
 NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
@@ -33,7 +33,7 @@ class Friction:
     key: str
 
 
-def add_stick_slip(system: Made, frictions: Sequence[Friction]) -> Made:
+def add_stick_slip(system: AnySystem, frictions: Sequence[Friction]) -> AnySystem:
     """Return the system with stick-slip friction; forces along the same coordinate are added.
 
     Raises SceneError where a name that is needed is in use.
@@ -125,7 +125,7 @@ def _set_modes(event: Event, sliding: Mapping[str, str]) -> Event:
     return replace(event, jump=(*event.jump, *modes))
 
 
-def without_modes(system: Made) -> Made:
+def without_modes(system: AnySystem) -> AnySystem:
     """Return the system without friction modes, as where all joints slide."""
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
@@ -144,7 +144,7 @@ def without_modes(system: Made) -> Made:
     )
 
 
-def with_modes(system: Made, core: Made) -> Made:
+def with_modes(system: AnySystem, core: AnySystem) -> AnySystem:
     """Return the system with initial values and constraints of `core`, its assembled form without
     friction modes.
     """

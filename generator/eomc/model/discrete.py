@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model.mechanics import Made, Mechanics
+from eomc.model.mechanics import AnySystem, Mechanics
 from eomc.model.symbols import Coordinate, Parameter
 
 
-def add_discrete_coordinates(system: Made) -> Made:
+def add_discrete_coordinates(system: AnySystem) -> AnySystem:
     """Return the system with parameters that jumps set as additional, discrete coordinates.
 
     Raises SceneError where a name that is needed is in use, an input limit depends on such a
@@ -90,7 +90,7 @@ def _idle(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem
     return problems
 
 
-def with_constant_parameters(system: Made) -> Made:
+def with_constant_parameters(system: AnySystem) -> AnySystem:
     """Return the system without events, with parameters in place of its discrete variables."""
     if not system.discrete:
         return system
@@ -114,7 +114,7 @@ def with_constant_parameters(system: Made) -> Made:
     )
 
 
-def with_parameters_as_states(system: Made, core: Made) -> Made:
+def with_parameters_as_states(system: AnySystem, core: AnySystem) -> AnySystem:
     """Return the system with initial values and constraints of `core`, its assembled form with
     parameters in place of discrete variables.
     """

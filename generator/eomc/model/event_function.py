@@ -6,10 +6,10 @@ import sympy
 from sympy import Expr, Heaviside, Symbol, sign
 
 from eomc.base.errors import SceneError
-from eomc.model.mechanics import Made
+from eomc.model.mechanics import AnySystem
 
 
-def check_event_functions(system: Made) -> Made:
+def check_event_functions(system: AnySystem) -> AnySystem:
     """Return the system. Raises SceneError for an event function that is piecewise constant."""
     if not system.events:
         return system

@@ -18,7 +18,7 @@ from eomc.model.algebra import UNDEFINED
 from eomc.model.api_arguments import name_of
 from eomc.model.coulomb_friction import Friction
 from eomc.model.generalized_potential import NotLinearError, split
-from eomc.model.mechanics import Made
+from eomc.model.mechanics import AnySystem
 from eomc.model.picture_from_sympy import picture_scene
 from eomc.model.picture_from_sympy import text as formula_text
 from eomc.model.rewrite import JumpError, rewritten
@@ -130,13 +130,13 @@ class Maker:
         return declared
 
     def make(
-        self, of: type[Made], coordinates: Any, kinetic: Any, potential: Any,
+        self, of: type[AnySystem], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
-    ) -> Made:  # fmt: skip
+    ) -> AnySystem:  # fmt: skip
         """Return the system, of the class `of`."""
         declarations = (coordinates, parameters, inputs, definitions)
         starts = api_arguments.symbols(coordinates, "coordinates", None)

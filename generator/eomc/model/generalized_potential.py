@@ -57,13 +57,13 @@ def split(
     variables = [*(rest.free_symbols & {*velocities}), *stand_ins.values()]
     variables.sort(key=str)
     at_rest = dict.fromkeys(variables, S.Zero)
-    slopes = [_without(sympy.diff(rest, x), variables) for x in variables]
+    slopes = [_eliminate_variables(sympy.diff(rest, x), variables) for x in variables]
     linear = sympy.Add(*(a * x for a, x in zip(slopes, variables, strict=True)))
     back = {dummy: e for e, dummy in stand_ins.items()}
     return conservative + rest.xreplace(at_rest), linear.xreplace(back)
 
 
-def _without(slope: Expr, variables: Sequence[Expr]) -> Expr:
+def _eliminate_variables(slope: Expr, variables: Sequence[Expr]) -> Expr:
     """A slope in a form without the variables. Raises NotLinearError where there is none."""
     for attempt in (lambda e: e, sympy.expand, sympy.simplify):
         slope = attempt(slope)

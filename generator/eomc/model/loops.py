@@ -57,7 +57,7 @@ class _Pull:
 
 @dataclass
 class Closed:
-    """A loop's rows and its reaction, which a gear has not; the points that it joins."""
+    """The constraints of a loop, its reaction (none for a gear) and the points that it joins."""
 
     rows: list[Constraint]
     reactions: list[Reaction] = field(default_factory=list)
@@ -65,12 +65,12 @@ class Closed:
 
 
 def close(
-    loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, seen: Matrix
+    loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, to_world: Matrix
 ) -> Closed:
-    """The rows of one loop between bodies, and its reaction, along the world's axes.
+    """Return the constraints of a loop between two bodies, and its reaction in world axes.
 
-    turned: how the second frame stands in the first when closed; length: of a distance, m. seen:
-    how the frame stands in the world in which the ends are told.
+    turned: rotation of the second frame relative to the first when closed. length: of a distance,
+    m. to_world: rotation from the frame of `ends` to the world.
     """
     first, second = ends
     R = (product(first.R, turned), second.R)
@@ -79,23 +79,23 @@ def close(
     pulls = {**_of_points(p, length), **dict(_of_frames(*R, plane=plane))}
     if loop.axes:
         pulls |= _of_axes(loop.axes, plane, (first.R, second.R), p)
-    made, force, moment = list[Constraint](), ZERO, ZERO
+    rows, force, moment = list[Constraint](), ZERO, ZERO
     for kind, name in kinds.items():
         pull = pulls[kind]
         unit = {"length": "m^2"}.get(kind, "m" if kind in "xyzuv" else "")
         row = Constraint(name, pull.row, True, unit, loop.note, loop.name)
         row = replace(row, rotation_error=pull.rotation_error)
-        made.append(row)
+        rows.append(row)
         force = plus(force, scaled(pull.force, row.multiplier))
         moment = plus(moment, scaled(pull.moment, row.multiplier))
-    force, moment = apply(seen, force), apply(seen, moment)
+    force, moment = apply(to_world, force), apply(to_world, moment)
     values = (*force[:2], moment[2]) if plane else (*force, *moment)
     branches = [*_branches(kinds, *R)]
     if "ru" in kinds:
         a, b = (apply(end.R, _unit(axis)) for end, axis in zip(ends, loop.axes, strict=True))
         branches.append(dot(a, b))
     reaction = Reaction(loop.name, values, loop.note, tuple(branches))
-    return Closed(made, [reaction], (first.point, second.point))
+    return Closed(rows, [reaction], (first.point, second.point))
 
 
 def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
@@ -108,7 +108,7 @@ def _of_axes(
     axes: Sequence[Sequence[float]], plane: bool, R: tuple[Matrix, Matrix], p: Vector
 ) -> dict[str, _Pull]:
     """Rows of an axis of each body."""
-    u, v, a = (apply(R[0], axis) for axis in across(axes[0], plane))
+    u, v, a = (apply(R[0], axis) for axis in perpendicular_axes(axes[0], plane))
     b = apply(R[1], _unit(axes[1]))
     half = (1 + dot(a, b)) / 2
     return {
@@ -154,8 +154,8 @@ def _unit(axis: Sequence[float]) -> Vector:
     return x, y, z
 
 
-def across(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
-    """Two directions across an axis, and it, right-handed; in the plane the first is in it."""
+def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
+    """Return a right-handed triad (u, v, axis); in the plane u lies in the plane."""
     along = _unit(axis)
     if plane:
         return (-along[1], along[0], S.Zero), (S.Zero, S.Zero, S.One), along
@@ -165,7 +165,7 @@ def across(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
 
 
 def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
-    """The row of a gear: the second coordinate less ratio times the first, less the offset."""
+    """Return the constraint of a gear: second coordinate - ratio * first - offset = 0."""
     first, second = (symbol(name) for name in loop.coordinates)
     row = second - ratio * first - offset
     return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])

@@ -165,7 +165,7 @@ class Mechanics:
             return Problem(message, key, f"System {self.name}", severity=severity)
         return self.place(key, message, severity=severity)
 
-    def at(self, parameters: Mapping[str, float]) -> Self:
+    def with_parameters(self, parameters: Mapping[str, float]) -> Self:
         """Return the system with other values for some of its parameters."""
         changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
         return replace(self, parameters=changed)
@@ -235,6 +235,5 @@ class Mechanics:
         return faults
 
 
-Made = TypeVar(
-    "Made", bound=Mechanics
-)  # of functions that return a changed system of the same class
+# type of functions that return a changed system of the same class
+AnySystem = TypeVar("AnySystem", bound=Mechanics)

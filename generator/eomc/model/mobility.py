@@ -57,12 +57,14 @@ class Mobility:
         """Return the result as text."""
         d, freedoms = self.d, partial(_freedoms, d=self.d)
         kinds = [f"{n} {kind} (f = {freedoms(kind)})" for kind, n in self.joints.items()]
-        closing = [f"{n} {kind} (f = {_left(kind, d)})" for kind, n in self.loops.items()]
+        closing = [
+            f"{n} {kind} (f = {_closure_freedoms(kind, d)})" for kind, n in self.loops.items()
+        ]
         if closing:
             kinds.append("in loops " + ", ".join(closing))
         loops = sum(self.loops.values())
         j, total = self.bodies + loops, sum(n * freedoms(k) for k, n in self.joints.items())
-        total += sum(n * _left(k, d) for k, n in self.loops.items())
+        total += sum(n * _closure_freedoms(k, d) for k, n in self.loops.items())
         rows = f" - {self.constraints}" if self.constraints else ""
         where = "in the plane" if d == 3 else "in space"
         where += ", by the count" if loops or rows else ""
@@ -102,7 +104,7 @@ def count(scene: Scene) -> Mobility:
     joints = Counter(body.joint or FORMULAS for body in bodies)
     loops = Counter(loop.joint for loop in assembly.loops)
     tree = sum(n * _freedoms(kind, d) for kind, n in joints.items())  # there N - 1 - j = 0
-    closed = sum(n * (d - _left(kind, d)) for kind, n in loops.items())
+    closed = sum(n * (d - _closure_freedoms(kind, d)) for kind, n in loops.items())
     kinematics = Kinematics(scene, assembly)
     names = kinematics.coordinates
     samples = list(kinematics.states())
@@ -178,12 +180,12 @@ def _freedoms(kind: str, d: int) -> int:
     return d if kind == FORMULAS else len(JOINTS[kind].motions)
 
 
-def _left(kind: str, d: int) -> int:
-    """The freedoms that a joint of a loop leaves."""
+def _closure_freedoms(kind: str, d: int) -> int:
+    """Return the degrees of freedom that a joint of a loop leaves."""
     return d - len(CLOSINGS[kind].rows(plane=d == 3))
 
 
-# --- what there is to say -------------------------------------------------------------------------
+# --- remarks -------------------------------------------------------------------------------------
 
 
 def _fixed(assembly: Assembly) -> Iterator[str]:

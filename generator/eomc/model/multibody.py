@@ -284,7 +284,7 @@ class Builder:
             place, point = self.places[name], self._vector(f"{key}.points", given)
             at, R = place.at, place.R
             if base != WORLD:
-                at, R = self.chains.seen(name, base, self._later(f"{loop.name}_"))
+                at, R = self.chains.relative_pose(name, base, self._later(f"{loop.name}_"))
             ends.append(loops.End(plus(at, apply(R, point)), R))
         length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
         turned = self._rotation(f"{key}.rotation", loop)

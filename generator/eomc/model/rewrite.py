@@ -51,7 +51,7 @@ def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Exp
         if not isinstance(condition, _ORDERS):
             raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
         d = condition.gts - condition.lts
-        other = _there(condition, piecewise.args[k + 1 :], fixed)
+        other = _applicable_piece(condition, piecewise.args[k + 1 :], fixed)
         q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
         if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed.keys():
             unknown = [str(s) for s in fixed if s in condition.free_symbols and not fixed[s]]
@@ -67,7 +67,7 @@ def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Exp
     return result
 
 
-def _there(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
+def _applicable_piece(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
     """Return the later piece that applies where a condition holds; None if undecided."""
     for piece, other in later:
         if _never_both(condition, sympy.Not(other), fixed):

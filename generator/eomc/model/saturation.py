@@ -6,11 +6,11 @@ from dataclasses import replace
 
 from sympy import Symbol
 
-from eomc.model.mechanics import Made
+from eomc.model.mechanics import AnySystem
 from eomc.model.symbols import symbol
 
 
-def saturate_inputs(system: Made) -> Made:
+def saturate_inputs(system: AnySystem) -> AnySystem:
     """Return the system with each limited input replaced by a definition, as `force_limited`."""
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
     limited_symbols: dict[Symbol, Symbol] = {}

@@ -124,8 +124,8 @@ class System(Mechanics):
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
-        asked = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
-        api_arguments.check_arguments(unknown, asked)
+        arguments = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
+        api_arguments.check_arguments(unknown, arguments)
         if kinetic is None:
             raise api_arguments.fault(
                 "kinetic", f"None is not an expression: {api_arguments.LAGRANGIAN}"
@@ -147,4 +147,4 @@ class System(Mechanics):
             add_discrete_coordinates(saturate_inputs(check_event_functions(system))),
             maker.frictions,
         )
-        return replace(system, again=partial(cls.make, **asked))
+        return replace(system, again=partial(cls.make, **arguments))

@@ -26,7 +26,9 @@ class Angle:
     cosine: str
 
 
-def apart(function: Function, coordinates: Collection[str]) -> tuple[tuple[Angle, ...], Function]:
+def separate_angles(
+    function: Function, coordinates: Collection[str]
+) -> tuple[tuple[Angle, ...], Function]:
     """Separate the angles that depend on coordinates only. Returns them and the function without
     them.
     """

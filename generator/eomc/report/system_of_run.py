@@ -49,4 +49,4 @@ def system_of(run: Any, scene: Source | None = None) -> System:
             "load it again with eomc.load"
         )
     values = np.atleast_2d(run._params)[0]
-    return system.at(dict(zip(model.parameters, map(float, values), strict=True)))
+    return system.with_parameters(dict(zip(model.parameters, map(float, values), strict=True)))

@@ -112,7 +112,7 @@ class BatchTimeline(Timeline):
         self.names = tuple(names) or self._default()
         table = np.broadcast_to(self.run._params, (len(numbers), len(system.parameters)))
         self.systems = [
-            system.at(dict(zip(batch._model.parameters, map(float, row), strict=True)))
+            system.with_parameters(dict(zip(batch._model.parameters, map(float, row), strict=True)))
             for row in table
         ]
         self.key = tuple(

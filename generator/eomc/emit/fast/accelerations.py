@@ -77,7 +77,7 @@ class Accelerations:
         """The projection, and whether it reads the sines of the accelerations."""
         assert self._split_projection is not None
         remaining = self._split_projection[1]
-        angles, separated = trig.apart(remaining, self.target.names)
+        angles, separated = trig.separate_angles(remaining, self.target.names)
         known = {(frozenset(a.terms), a.offset): a for a in self.angles}
         pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]
         names = {
@@ -98,7 +98,7 @@ class Accelerations:
         """The angles, and the function that reads their sines and cosines."""
         if not self.target.real.reach:
             return (), self.staged[1]
-        return trig.apart(self.staged[1], self.target.names)
+        return trig.separate_angles(self.staged[1], self.target.names)
 
     @property
     def angles(self) -> tuple[Angle, ...]:
