@@ -355,15 +355,15 @@ def _padded(run: Trajectory, rows: int, every: int) -> Array:
     return out
 
 
-def rounding_words(model: Stepping, amplification: float, t_lost: float) -> str:
-    """Explain why rounding reaches a tenth of the motion at the time `t_lost`."""
+def rounding_words(model: Stepping, amplification: float, t_limit: float) -> str:
+    """Explain why rounding reaches a tenth of the motion at the time `t_limit`."""
     if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
         return (
             f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
-            f"rounding with it; no run in {model.dtype} means anything from t = {t_lost:.4g} s on"
+            f"rounding with it; no run in {model.dtype} means anything from t = {t_limit:.4g} s on"
         )
     return (
-        f"rounding of {model.dtype} is a tenth of the motion from t = {t_lost:.4g} s on, which is "
+        f"rounding of {model.dtype} is a tenth of the motion from t = {t_limit:.4g} s on, which is "
         "small beside its coordinates: measure these from a nearer origin"
     )
 
@@ -382,8 +382,8 @@ def _verdict(
             f"({stopped.status})"
         )
     if (walk[-1] > _UNRESOLVED).any():
-        t_lost = run.t[int(np.argmax((walk > _UNRESOLVED).any(axis=1)))]
-        words.append(rounding_words(run._model, amplification, float(t_lost)))
+        t_limit = run.t[int(np.argmax((walk > _UNRESOLVED).any(axis=1)))]
+        words.append(rounding_words(run._model, amplification, float(t_limit)))
     wrong = relative > _UNRESOLVED
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))

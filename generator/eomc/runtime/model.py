@@ -1,4 +1,4 @@
-"""What every compiled scene offers in Python: arrays in, arrays out, the loop in C.
+"""The Python interface of a compiled scene: arrays in, arrays out, the loop in C.
 
 This file and its neighbours are copied next to each compiled extension, so that a built scene needs
 NumPy and cffi only. Angles in rad, everything in SI units.
@@ -43,30 +43,29 @@ from .trajectory import Run
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
-LARGE = 2**24  # positions from which a look at the memory is worth its time
+LARGE = 2**24  # runs with more positions are checked against the memory
 RARELY = 2**48  # steps from row to row, more than any run makes
 
 
 class Model(Stepping):
-    """The functions of one compiled scene; the package hands them on under their own names."""
+    """The functions of a compiled scene; the package exports them under the same names."""
 
     def load_run(self, file: File) -> Any:
-        """A run, or a batch, that `save` has written to an .npz file; its columns are the same.
+        """Load a run, or a batch, from an .npz file that `save` has written.
 
-        Raises ValueError where the file is none of this scene's, OSError where it can't be read;
-        warns where it is of another version of the scene. Events that its call asked for are
-        compiled where they are not there yet.
+        Raises ValueError if the file is not of this scene, OSError if it cannot be read; warns if
+        it is of another version of the scene. Additional events of the run are compiled if needed.
         """
-        model, kind, kept = saved.read(self, file)
-        if (of := model._kinds.get(kind)) is None:
+        model, kind, arrays = saved.read(self, file)
+        if (run_class := model._kinds.get(kind)) is None:
             raise ValueError(
                 f"{file}: is a run of many at once: build the module with {option('batch')}"
             )
-        return of._from_arrays(model, kept)
+        return run_class._from_arrays(model, arrays)
 
     @property
     def _kinds(self) -> dict[str, Any]:
-        """The classes of its runs by their names."""
+        """The classes of runs by their names."""
         kinds = (Run, output_times.TimedRun, adaptive.AdaptiveRun, adaptive.SteppedRun)
         return {x.__name__: x for x in kinds}
 
@@ -111,8 +110,8 @@ class Model(Stepping):
         Interrupted.
         """
         if events is not None or unknown:
-            other, given = with_events(self.simulate, dict(locals()))
-            return cast(Run, other.simulate(**given))
+            other, arguments = with_events(self.simulate, dict(locals()))
+            return cast(Run, other.simulate(**arguments))
         if (params is not None and self._follows) or is_by_name(q0, qd0):
             q0, qd0 = initial_state_for_parameters(self, q0, qd0, self._parameters(params))
         usual = (out is None and progress is None and control_period is None and not estimate
@@ -129,14 +128,14 @@ class Model(Stepping):
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         by_tol = uses_adaptive_steps(self, h, steps, method, tol, h_most, stiff)
         if by_tol or (self.events and not self._passes_over):
-            given = q0, qd0, duration, u, params, t0, progress, times, control_period
+            common = q0, qd0, duration, u, params, t0, progress, times, control_period
             fixed = h, steps, method, every, out
             if not by_tol:
                 return self._finished(
-                    fixed_step_events.simulate(self, *given, fixed, self._look), estimate
+                    fixed_step_events.simulate(self, *common, fixed, self._look), estimate
                 )
-            made = adaptive.simulate(self, *given, tol, h_most, stiff, fixed)
-            return self._finished(made, estimate)
+            run = adaptive.simulate(self, *common, tol, h_most, stiff, fixed)
+            return self._finished(run, estimate)
         method = self.methods[0] if method is None else self._method(method)
         (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0
         if q0 is not None:
@@ -147,7 +146,7 @@ class Model(Stepping):
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
-        usual = usual and abs(t0) <= 1e6 * h  # all else goes the long way
+        usual = usual and abs(t0) <= 1e6 * h  # other calls take the general path
         if usual and u is duration is None and type(steps) is type(every) is int and every > 0:
             _, run, short, stages, _, _ = self._loops[method]
             if 0 <= steps <= short >= every and (steps < SOME or (method, h) in self._warned):
@@ -173,7 +172,7 @@ class Model(Stepping):
         return self._finished(result, estimate)
 
     def _finished(self, run: Run, estimate: bool) -> Run:
-        """A run as `simulate` returns it: with warnings to its caller, and its error if asked."""
+        """Issue the warnings of a run and estimate its error on request; return the run."""
         if run.status == "interrupted":
             raise Interrupted(run)
         if words := run.message if run.status != "ok" else run._remark:
@@ -199,26 +198,26 @@ class Model(Stepping):
         u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
         t0: float = 0.0,
     ) -> str | None:  # fmt: skip
-        """Where h is beyond the stability limit of the method at a start: that, in a sentence."""
-        given, method = self._parameters(params), self._method(method)
-        q, qd = self._state(*initial_state_for_parameters(self, q0, qd0, given))
+        """Return a message if h is beyond the stability limit at the initial state, else None."""
+        p, method = self._parameters(params), self._method(method)
+        q, qd = self._state(*initial_state_for_parameters(self, q0, qd0, p))
         h = self.h if h is None else as_step_size(h, self.dtype)
-        return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
+        return advice(self, q, qd, h, as_number(t0, "t0"), u, p, method)
 
     def _trajectory(
         self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
         u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,
         progress: Callable[[int, int], None] | None, hold: int = 1, at: Array | None = None,
     ) -> Run:  # fmt: skip
-        """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p.
+        """Run from checked arguments and return the run, whatever its status.
 
-        at: the times of its rows, where it is not `every` that says them.
+        from_q, from_qd, at_p: addresses for C. at: output times, in place of `every`.
         """
         _, run, _, stages, work_type, counted = self._loops[method]
         nq, (address, real, null) = self.nq, self._c
-        law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every, hold)
+        law, inputs, stride = (None, None, 0) if u is None else self._table(u, steps, every, hold)
         if at is not None:
-            acts = law, held, stride, hold
+            acts = law, inputs, stride, hold
             return output_times.run(self, q, qd, t0, h, steps, at, acts, p, method, progress)
         rows = 1 - -steps // every
         both: Any = out
@@ -235,10 +234,10 @@ class Model(Stepping):
             ) from None
         q_rows, qd_rows = both[0], both[1]
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
-        at_u = null if held is None else address(real, held)
+        at_u = null if inputs is None else address(real, inputs)
         # a step of an implicit method may solve for all its stages
         done, chunk = 0, hold if law else CHUNK // (nq**3 if counted else nq) or 1
-        # what goes from one call to the next, and what is counted; a single call may do without
+        # workspace from call to call, with counters; a single call may do without
         single = steps <= chunk and counted is None and not self._rows.names
         work = null if single else self._ffi.new(work_type)
         try:
@@ -247,48 +246,48 @@ class Model(Stepping):
                     if done:  # else the start is not among the rows yet
                         row = -(-done // every)
                         q, qd = q_rows[row], qd_rows[row]
-                    held = law(t0 + done * h, q, qd)
-                    at_u = address(real, held)
+                    inputs = law(t0 + done * h, q, qd)
+                    at_u = address(real, inputs)
                 count = steps - done
                 if count > chunk:
-                    count, begun = chunk, perf_counter()
-                found = run(
+                    count, start_time = chunk, perf_counter()
+                code = run(
                     to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
                 )
-                done, said = found >> 3, STATUS[found & 7]
-                if said != "ok":
+                done, status = code >> 3, STATUS[code & 7]
+                if status != "ok":
                     break
                 if progress is not None and done:
                     progress(done, steps)
                 if done == steps:
                     break
                 if not law:
-                    chunk = next_chunk(count, perf_counter() - begun)
+                    chunk = next_chunk(count, perf_counter() - start_time)
         except KeyboardInterrupt:
-            done, said = work.done if work else done, "interrupted"
+            done, status = work.done if work else done, "interrupted"
             if not done:
                 q_rows[0], qd_rows[0] = q, qd
         if done < steps:
-            kept = 1 - -done // every
-            both = q_rows[:kept], qd_rows[:kept]
+            count = 1 - -done // every
+            both = q_rows[:count], qd_rows[:count]
         evaluations = counted(work) if counted else stages * done
-        given = law.law if law else None if held is None else held.copy()
-        made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
-        self._record_singular_steps(made, method, work)
+        stored = law.law if law else None if inputs is None else inputs.copy()
+        result = Run(self, t0, both, h, done, status, p, every, stored, method, evaluations)
+        self._record_singular_steps(result, method, work)
         if law:
-            made._hold = hold
-            made._applied = law.rows(len(made), self.nu)
-        return made
+            result._hold = hold
+            result._applied = law.rows(len(result), self.nu)
+        return result
 
     def _first(self, u: Any, steps: int, hold: int) -> Array | None:
-        """What is held over the first step; None: a signal, or a function."""
-        held = self._table(u, steps, 1, hold)[1]
-        return held[0] if held is not None and held.ndim == 2 else held
+        """Return the inputs of the first step; None for a signal or a function."""
+        inputs = self._table(u, steps, 1, hold)[1]
+        return inputs[0] if inputs is not None and inputs.ndim == 2 else inputs
 
     def _table(
         self, u: Any, steps: int, every: int, hold: int
     ) -> tuple[FeedbackLaw | None, Array | None, int]:
-        """(function, held values, values from one step to the next)."""
+        """Return (feedback law, constant inputs or rows, stride from step to step)."""
         if u is None:
             return None, None, 0
         if not self.nu:
