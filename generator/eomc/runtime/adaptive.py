@@ -96,14 +96,14 @@ class AdaptiveRun(AdaptiveTrajectory):
         whole = np.concatenate([steps.t[own], times])
         order = np.argsort(whole, kind="stable")
         both = zip((steps.q[own], steps.qd[own]), self(times), strict=True)
-        return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
+        return self._with_rows(whole[order], np.array([np.concatenate(x)[order] for x in both]))
 
     def _insert_rows(self, times: Array) -> AdaptiveRun:
         """Return a copy of the run with additional rows at `times`."""
         whole = np.concatenate([self.t, times])
         order = np.argsort(whole, kind="stable")
         both = zip((self.q, self.qd), self(times), strict=True)
-        return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
+        return self._with_rows(whole[order], np.array([np.concatenate(x)[order] for x in both]))
 
     def _crossings(
         self, name: str, value: float, rising: bool | None, period: float | None
@@ -128,17 +128,17 @@ class AdaptiveRun(AdaptiveTrajectory):
         )
         for _ in range(2):  # Newton's method
             places = times, np.clip(times - by, *ends), np.clip(times + by, *ends)
-            here, one, other = (self._at(x, np.array(self(x)))[name] for x in places)
+            here, one, other = (self._with_rows(x, np.array(self(x)))[name] for x in places)
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = (here - value - turns) / (other - one) * (places[2] - places[1])
             times = np.clip(np.where(np.isfinite(step), times - step, times), *ends)
-        return self._at(times, np.array(self(times))).to_dict()
+        return self._with_rows(times, np.array(self(times))).to_dict()
 
     def _equidistant(self) -> Run:
         if (np.diff(self.t) == 0).any() or len(self) < 2:
             return self
         times = np.linspace(self.t[0], self.t[-1], _ROWS_PER_STEP * (self.steps + 1))
-        return self._at(times, np.array(self(times)))
+        return self._with_rows(times, np.array(self(times)))
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
         return error_by_tighter_tolerance(self, run, progress)
@@ -187,7 +187,7 @@ def simulate(
     trajectory = run(model, q, qd, t0, end, tol, later_times, inputs, p, most, progress, stiff)
     if first:
         both = np.concatenate([np.array([[q], [qd]]), trajectory._rows], axis=1)
-        return trajectory._at(rows[: both.shape[1]], both)  # type: ignore[index]
+        return trajectory._with_rows(rows[: both.shape[1]], both)  # type: ignore[index]
     return trajectory
 
 

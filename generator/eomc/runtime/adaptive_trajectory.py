@@ -118,7 +118,7 @@ class AdaptiveTrajectory(Run):
         how = "" if self.status == "ok" else f"{self.status} after "
         return f"<Run of {self._model.name}: {how}{self.steps} steps, tolerance {self.tol:g}>"
 
-    def _at(self, times: Array, rows: Array) -> Self:
+    def _with_rows(self, times: Array, rows: Array) -> Self:
         """Return a copy of the run with other times (n,) and rows (2, n, nq)."""
         run = copy(self)
         run._begin = self._begin

@@ -229,7 +229,7 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
             times.append(np.linspace(begin, end, rows)[1:-1])
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
-    bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
+    bare = adaptive._with_rows(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
     dense: Trajectory = bare._insert_rows(np.concatenate(times)) if times else bare
     return dense.t, dense.q, dense.qd
 

@@ -58,7 +58,7 @@ def simulate(
     stamps, (t, x) = rows[: both.shape[1]], run._last
     if times is None and t > stamps[-1]:  # an event stopped the run between two rows
         both, stamps = np.append(both, x.reshape(2, 1, -1), axis=1), np.append(stamps, t)
-    return run._at(stamps, both)
+    return run._with_rows(stamps, both)
 
 
 def as_rows(
