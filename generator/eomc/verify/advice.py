@@ -46,7 +46,7 @@ class Advice:
         self.duration = runs.duration
 
     def failing_fraction(self, method: str) -> Measurement:
-        """The least of PARTS of the advised h with which a run is lost.
+        """Return the least of PARTS of the advised h with which a run is unstable.
 
         From where the start of the motion allows the shortest h. Lost: it stops, or a difference
         grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
@@ -83,7 +83,7 @@ class Advice:
 
     @cached_property
     def stiffest_state(self) -> State:
-        """Where, along the start of the motion, the shortest h is advised.
+        """Return the state near the start of the motion for which the shortest h is advised.
 
         As far as that stays near: steps that are too long for it end at 1e40, where no difference
         has a digit.
@@ -127,7 +127,7 @@ class Advice:
         return message is not None
 
     def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """The end of a run over SPAN times `longest`, scaled, and the growth of a difference.
+        """Return the scaled final state of a run over SPAN times `longest`, and the growth.
 
         The larger of that of a small difference and of one so small that stiff forces, which are
         soon at their bounds, are linear in it.
@@ -153,7 +153,7 @@ class Advice:
         return ends[0], float(max(growths))
 
     def _step_by_eigenvalues(self, method: str) -> float:
-        """The longest stable h of the motion linearised at `stiff`, by differences; s.
+        """Return the longest stable h, s, of the motion linearised at `stiff` by differences.
 
         Under constraints the longer of two: along them, as what leaves them is put back after each
         step, though they turn with the motion; and of all changes.

@@ -1,4 +1,4 @@
-"""A compiled module compared with the reference, and with what mechanics says of any scene.
+"""Comparison of a compiled module with the reference and with general laws of mechanics.
 
 Two kinds of row. A value of the module is compared with the independent `reference`, in units of
 rounding (see `sampling`). A property (symmetry, order of convergence, power balance) is tested on
@@ -64,7 +64,7 @@ def check(
 
 
 def _report(comparison: Comparison, module: Any) -> Report:
-    """All rows."""
+    """Append all checks."""
     system = comparison.system
     comparison.row("names, defaults, start", 0, "that differ", comparison.metadata_differences)
     compiled = hasattr(module, "_model")

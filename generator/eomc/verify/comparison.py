@@ -1,4 +1,4 @@
-"""A compiled module compared with the reference, and with what mechanics says of any scene."""
+"""Comparison of a compiled module with the reference and with general laws of mechanics."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _corrected(e: Expected) -> Vector | float:
 
 
 class Comparison:
-    """All rows of one report. plain: the module of the plain form of C, or None."""
+    """The checks of one report. plain: the module of the plain form of C, or None."""
 
     def __init__(
         self, system: System, module: Any, random: np.random.Generator, states: int | None,
@@ -66,7 +66,7 @@ class Comparison:
         self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
-        """Orders, advised steps, the balance of power: see `convergence`."""
+        """Append checks of orders, advised steps and the balance of power; see `convergence`."""
         runs, methods = self.convergence, self.methods
         for method in methods:
             least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
@@ -110,7 +110,7 @@ class Comparison:
     def smooth_row(
         self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
-        """A row about orders, which is not judged where the scene's functions have corners."""
+        """Append a check of orders; it is not judged if the scene has discontinuities or kinks."""
         self.row(name, limit, unit, measure, minimum=True)
         row = self.rows[-1]
         if math.isinf(row.error):
@@ -120,7 +120,7 @@ class Comparison:
             self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
 
     def advice_row(self, method: str) -> None:
-        """At which part of the advised h a run is lost: not at an eighth of it, but at twice it."""
+        """Append a check of the advised h: an eighth of it is stable, twice it is not."""
         unit = "of the advised h, where runs are lost"
         find = partial(self.advice.failing_fraction, method)
         self.row(f"h of {method}", PARTS[0], unit, find, minimum=True)
@@ -131,12 +131,12 @@ class Comparison:
 
     @cached_property
     def advice(self) -> Advice:
-        """The rows about the step sizes that the module advises."""
+        """Checks of the step sizes that the module advises."""
         return Advice(self.convergence, [c.holonomic for c in self.system.constraints])
 
     @cached_property
     def convergence(self) -> Convergence:
-        """The rows that come from runs of several step sizes."""
+        """Checks that use runs with several step sizes."""
         own = [e for e in self.expected if e.state.params is None]
         typical = own[1:4] or self.expected[:3]  # the scene's own parameters, away from its start
         return Convergence(
@@ -154,28 +154,28 @@ class Comparison:
 
     @cached_property
     def unusual_states(self) -> list[Expected]:
-        """States that a run hardly comes to, where values have to be right too."""
+        """States that runs hardly reach, at which values must be correct as well."""
         return self.sampler.unusual_states(1 if self.large else 2)
 
     @cached_property
     def corners(self) -> str:
-        """The functions in the scene that jump or bend."""
+        """Functions in the scene that have discontinuities or kinks."""
         return nonsmooth_functions(self.system)
 
     @property
     def forms(self) -> list[tuple[Any, str]]:
-        """The modules of both forms of C, as far as there are, with what their rows begin with."""
+        """Modules of both forms of C, if present, with the prefix of their checks."""
         plain = [] if self.plain is None else [(self.plain, "plain C: ")]
         return [(self.module, ""), *plain]
 
     def largest(self, error: Callable[[Expected], float], few: int | None = None) -> float:
-        """The largest error over all states, or a few; nan wins."""
+        """Return the largest error over all states, or a few; nan if any is nan."""
         return float(np.max([error(e) for e in (self.few(few) if few else self.expected)]))
 
     # against the reference
 
     def metadata_differences(self) -> float:
-        """How many of the module's names, defaults and start values are not the system's."""
+        """Count the module's names, defaults and start values that differ from the system's."""
         s, m, start = self.system, self.module, self.sampler.start
         pairs = [
             (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),
@@ -201,7 +201,7 @@ class Comparison:
         return float(np.max([error(e) for e in (*self.expected, *self.unusual_states)]))
 
     def steps(self) -> float | Measurement:
-        """One step of the scene's h from a few states."""
+        """Return the error of one step of the scene's h from a few states."""
         h, far = self.system.run.h, MAX_DISTANCE * self.sampler.scale
 
         def reference(**rows: Any) -> Vector:
@@ -234,7 +234,7 @@ class Comparison:
         return largest(errors, "no step from any state is finite")
 
     def accelerations(self, s: State) -> one_step.Acceleration:
-        """The reference's, of one state or many, with the inputs and parameters of one."""
+        """Return the reference's accelerations at one or many states, with one state's inputs."""
 
         def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
             inputs = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
@@ -243,7 +243,7 @@ class Comparison:
         return acceleration
 
     def one_step_error(self, method: str, e: Expected, longest: float) -> float | None:
-        """None where the reference has no such step; inf where the module refuses what it has.
+        """Return the error of a step; None without a reference step, inf if the module refuses it.
 
         That is, its shortest; or two in a row whose stages the module does not find.
         """
@@ -281,12 +281,12 @@ class Comparison:
         return math.inf if failures == 2 or refused else None
 
     def runs(self) -> float | Measurement:
-        """A short run from the start, and one from a random state with random parameters."""
+        """Return the error of a short run from the start, and of one from a random state."""
         errors = map(self.run, self.few(2))
         return largest(errors, "a difference grows too much in one step")
 
     def run(self, e: Expected, h: float = 0.0, steps: int = 0) -> float | None:
-        """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
+        """Return the error of a run, while a perturbation grows by less than GROWTH_LIMIT."""
         s, h = e.state, h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         key = id(s), h, steps  # the states live as long
@@ -333,17 +333,17 @@ class Comparison:
         return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
     def start_time(self, s: State) -> float:
-        """When runs from a state begin: where rows may stand in time, when it is on them."""
+        """Return the start time of runs from a state: its own if constraints depend on time."""
         return s.t if self.system.constraints else 0.0
 
     def simulate(self, s: State, **how: Any) -> Any:
-        """The module's run from a state."""
+        """Return the module's run from a state."""
         if begin := self.start_time(s):
             how.setdefault("t0", begin)
         return simulate(self.module, projected_start(self.module, s), **how)
 
     def run_energy(self) -> float:
-        """The energy that a run reports, at the states that it reports."""
+        """Return the error of the energy of a run, at the states of the run."""
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
         far = MAX_DISTANCE * self.sampler.scale
@@ -355,11 +355,11 @@ class Comparison:
         return float(np.max(errors, initial=0))
 
     def ask(self, name: str, s: State) -> Vector:
-        """The module's value of that name."""
+        """Return the module's value of this name."""
         return evaluate_module(self.module, name, s)
 
     def has_finite_accelerations(self, s: State) -> bool:
-        """Whether the module's accelerations are finite: single precision overflows sooner."""
+        """Return whether the module's accelerations are finite, also in single precision."""
         if self.dtype == np.float64:
             return True
         try:
@@ -374,13 +374,13 @@ class Comparison:
         return self.expected[:half] + self.expected[half:][-half:]
 
     def units(self, values: Any, expected: Any, size: Any) -> float:
-        """The largest difference in units of the module's rounding."""
+        """Return the largest difference in units of the module's rounding."""
         return units(values, expected, size, self.eps)
 
     # properties of the module alone
 
     def symmetry(self) -> float:
-        """D = D^T."""
+        """Return the error of D = D^T."""
 
         def error(e: Expected) -> float:
             D = evaluate_module(self.module, "D", e.state)
@@ -389,7 +389,7 @@ class Comparison:
         return self.largest(error)
 
     def definiteness(self) -> float:
-        """The least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
+        """Return the least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
 
         def least_eigenvalue(e: Expected) -> float:
             D = evaluate_module(self.module, "D", e.state)
@@ -431,7 +431,7 @@ class Comparison:
         return self.largest(error)
 
     def bias(self) -> float:
-        """bias = C qd + g."""
+        """Return the error of bias = C qd + g."""
 
         def error(e: Expected) -> float:
             bias, C, g = (
@@ -442,7 +442,7 @@ class Comparison:
         return self.largest(error)
 
     def motion(self) -> float:
-        """D qdd + bias = tau, + A^T lambda under constraints."""
+        """Return the error of D qdd + bias = tau, or tau + A^T lambda with constraints."""
 
         def error(e: Expected) -> float:
             names = ("D", "acceleration", "bias", "tau")

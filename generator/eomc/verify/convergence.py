@@ -1,4 +1,4 @@
-"""What a module's runs say of its steppers: orders and balances of power; `advice` has that on h.
+"""Checks of a module's steppers by its runs: orders of convergence and balances of power.
 
 The rules are such that a right module is not blamed where nothing can be
 seen, and a wrong one is wherever it can be:
@@ -50,14 +50,14 @@ DRAWS = 2  # of starts moved by a rounding
 
 
 class _End(Protocol):
-    """The scaled end of a run from a state, (2, nq); None where it does not get there."""
+    """Scaled final states (2, nq) of runs from a state; None if a run stops early."""
 
     def __call__(self, s: State, *, span: float, steps: int) -> Vector | None: ...
 
 
 @dataclass(frozen=True)
 class Place:
-    """A state to run from, and the size of its energy, of which a rounding is eps."""
+    """A state from which to run, and the scale of its energy."""
 
     state: State
     energy: float
@@ -65,7 +65,7 @@ class Place:
 
 @dataclass(frozen=True)
 class _Ladder:
-    """Differences of ends of one span in more and more steps; `noise` of them is rounding."""
+    """Differences of final states over one span as h is halved. noise: rounding error."""
 
     span: float
     differences: tuple[float, ...]
@@ -83,7 +83,7 @@ class _Ladder:
 
     @property
     def exact(self) -> bool:
-        """Whether all differences are rounding."""
+        """Whether all differences are rounding error."""
         return max(self.differences) <= NOISE_FACTOR * self.noise
 
     def best(self, least: float) -> float:
@@ -96,7 +96,7 @@ class _Ladder:
 
     @property
     def agreed_order(self) -> float:
-        """The order on which the last two halvings clear of rounding agree, or nan."""
+        """Order on which the last two halvings above rounding error agree, or nan."""
         observed = [p for p, clear in self.orders if clear]
         if len(observed) < 2 or abs(observed[-1] - observed[-2]) > ORDER_TOLERANCE:
             return math.nan
@@ -104,7 +104,7 @@ class _Ladder:
 
 
 class Convergence:
-    """The rows of one module that come from runs of several step sizes.
+    """Checks of one module that use runs with several step sizes.
 
     places: where to run from, with the scene's own parameters; start: where its motion starts.
     scale: (2, nq), of q and qd. h, duration: the scene's, s.
@@ -118,7 +118,7 @@ class Convergence:
         self.scale, self.h, self.duration = scale, h, duration
 
     def run(self, s: State, method: str, **how: Any) -> Any:
-        """A run from a state, whatever its status."""
+        """Return a run from a state, whatever its status."""
         if method != self.methods[0]:
             how["method"] = method
         if getattr(self.module, "constraint_names", ()):  # rows may stand in time
@@ -127,7 +127,7 @@ class Convergence:
         return simulate(self.module, s, **how)
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
-        """The scaled end of a run, (2, nq); None where it does not get there."""
+        """Return the scaled final state of a run, (2, nq); None if it stops early."""
         run = self.run(s, method, h=span / steps, steps=steps, every=steps)
         if str(run.status) != "ok":
             return None
@@ -195,7 +195,7 @@ class Convergence:
         return math.nan if moved else math.inf
 
     def _has_kink(self, at: Place, method: str, span: float) -> bool:
-        """Whether another method is of low orders over a span too: steps leap over a bend.
+        """Return whether another method has a low order over the span too: it contains a kink.
 
         RK4 on the module's accelerations is one, beside those that the module has.
         """
@@ -212,7 +212,7 @@ class Convergence:
         return False
 
     def _end_by_hand(self, s: State, span: float, steps: int) -> Vector | None:
-        """As `end`, by RK4 in Python."""
+        """Return the same as `end`, by RK4 in Python."""
 
         def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
             return self.ask("acceleration", replace(s, q=q, qd=qd, t=t))
@@ -234,7 +234,7 @@ class Convergence:
     # --- two methods ------------------------------------------------------------------------------
 
     def compare_methods(self, method: str) -> Measurement:
-        """How far another method ends from the first, over what halving h changes in the two.
+        """Return the distance of two methods' final states, relative to the changes by halving h.
 
         From each place the lesser of two spans: errors may meet by chance at one. The median of
         the places.
@@ -272,22 +272,22 @@ class Convergence:
 
     @property
     def _best_method(self) -> str:
-        """The one that balances are taken by: rk4, or the one of the highest order."""
+        """Return the method for power balances: rk4, or the one of the highest order."""
         names = self.methods
         return "rk4" if "rk4" in names else max(names, key=lambda name: METHODS[name].order)
 
     @property
     def closing_limit(self) -> float:
-        """Half of the order of the method and Simpson's rule; a wrong power does not close: 0."""
+        """Return the least accepted order: half of that of the method and Simpson's rule."""
         return min(METHODS[self._best_method].order, 4) / 2
 
     def closing(self) -> Measurement:
-        """The order at which jacobi(T) - jacobi(0) - integral of power vanishes; inf: it is 0."""
+        """Return the order of jacobi(T) - jacobi(0) - integral of power; inf if that is 0."""
         orders = [self._closing(at) for at in self.places]
         return _pick_order(orders, min, "the balance is neither closed nor left open")
 
     def _closing(self, at: Place) -> float:
-        """From spans that are short enough upwards, until a rest of the balance shows.
+        """Return the order of the balance over spans of increasing length, until it has a residual.
 
         A rest that two halvings leave as it is, in two spans in a row, is a wrong power, 0, or
         rounding within formulas, which is another beside the state.
@@ -313,7 +313,7 @@ class Convergence:
         return math.inf if closed else math.nan
 
     def _gap_persists(self, at: Place, span: float, rest: float) -> bool:
-        """Whether as much is left of the balance beside that state."""
+        """Return whether the balance has the same residual near that state."""
         s = at.state
         near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in NEARBY_FACTORS)
         gaps = [self._gaps(x, span)[0][-1:] for x in near]
@@ -339,14 +339,14 @@ class Convergence:
         return (gaps if np.all(np.isfinite(gaps)) else []), False
 
     def ask(self, name: str, s: State) -> Vector:
-        """The module's value of that name."""
+        """Return the module's value of this name."""
         return evaluate_module(self.module, name, s)
 
 
 def _pick_order(
     values: Iterable[float], pick: Callable[[Iterable[float]], float], why: str
 ) -> Measurement:
-    """The one that `pick` takes of several places; inf where all that are known are exact."""
+    """Return the order that `pick` selects from several places; inf if all are exact."""
     known = [x for x in values if not math.isnan(x)]
     orders = [x for x in known if math.isfinite(x)]
     if orders:

@@ -49,7 +49,7 @@ def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, V
 
 
 def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
-    """At one state; rows of zeros say nothing, and have the multiplier 0."""
+    """Solve at one state; zero rows are ignored and have the multiplier 0."""
     multipliers, nonzero = np.zeros(len(A)), A.any(axis=1)
     A, level = A[nonzero], level[nonzero]
     n, m = len(D), len(A)
@@ -68,7 +68,7 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
 
 
 def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """D and A with which the coordinates `fixed` do not change."""
+    """Return D and A for which the coordinates `fixed` do not change."""
     D, A = D.copy(), A.copy()
     for i in fixed:
         D[i] = D[:, i] = A[:, i] = 0
@@ -87,7 +87,7 @@ def absolute_inverse(D: Vector, A: Vector) -> Vector:
 
 
 def is_regular(D: Vector, A: Vector, least: float) -> bool:
-    """Whether the scaled matrix is far from singular: its singular values above `least`.
+    """Return whether all singular values of the scaled matrix exceed `least`.
 
     Those of rows are squares of A's.
     """
@@ -136,7 +136,7 @@ def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
 
 
 def is_nonnegative(D: Vector, A: Vector) -> bool:
-    """Whether D is negative along nothing that rows A leave; True where that can't be judged."""
+    """Return whether D is nonnegative on the null space of A; True if that can't be decided."""
     return not least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE
 
 

@@ -1,4 +1,4 @@
-"""One step of any Runge-Kutta method by its tableau, on accelerations that are given.
+"""One step of any Runge-Kutta method by its tableau, for a given acceleration function.
 
 The formulas of `steppers`, in NumPy, with all stages kept: what a generated stepper is compared
 with. Nothing is shared with the templates but the coefficients.
@@ -71,7 +71,7 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
 
 
 def contraction_factor(m: Method, slopes: Vector, h: float) -> float:
-    """By how much a plain sweep makes errors of an implicit method's stages less, at the end.
+    """Return the contraction factor of fixed-point iteration for the stages of an implicit method.
 
     slopes: (nq, 2 nq), da/dq and da/dqd.
     """
@@ -79,7 +79,7 @@ def contraction_factor(m: Method, slopes: Vector, h: float) -> float:
 
 
 def _sweep(m: Method, slopes: Vector, h: float) -> Vector:
-    """(S nq, S nq): what a plain sweep makes of errors of the accelerations at the stages."""
+    """Return the matrix (S nq, S nq) of fixed-point iteration of the stages' accelerations."""
     A, AA = (_square(rows, m.stages) for rows in (m.a, m.a_squared))
     n = len(slopes)
     return np.asarray(h * np.kron(A, slopes[:, n:]) + h**2 * np.kron(AA, slopes[:, :n]))
@@ -120,7 +120,7 @@ def step_by_newton(
 
 
 def _square(rows: tuple[tuple[Any, ...], ...], n: int) -> Vector:
-    """The rows of a triangle or a square as an (n, n) array."""
+    """Return the rows of a triangular or square tableau as an (n, n) array."""
     full = np.zeros((n, n))
     for i, row in enumerate(rows):
         full[i, : len(row)] = [float(x) for x in row]

@@ -40,7 +40,7 @@ MARK = -7.0  # what is to be left alone
 
 
 def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
-    """The state with nan or inf in place of one coordinate or velocity: which, at which place."""
+    """Yield the state with nan or inf in place of one coordinate or velocity, and its index."""
     for field in ("q", "qd"):
         for i in range(len(s.q)):
             for what in (math.nan, math.inf):
@@ -50,7 +50,7 @@ def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
 
 
 class Refusals:
-    """Rows on refusals."""
+    """Checks of refusals."""
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.module, self.model = check, check.module, check.module._model
@@ -90,7 +90,7 @@ class Refusals:
     # where D is singular
 
     def negative_inertia_errors(self) -> float:
-        """How often the module finds accelerations where D is negative along the rows.
+        """Count accelerations that are not refused though D is indefinite on the constraints.
 
         Rows hold what has no inertia of its own, so that D alone says nothing.
         """
@@ -109,7 +109,7 @@ class Refusals:
         return float(wrong)
 
     def definite(self) -> float:
-        """How often the module finds D regular where it is not, or singular where it is regular."""
+        """Count states at which the module wrongly accepts or refuses D."""
         suspects = self.suspects()
         stacked: dict[str, Any] = {
             "q": np.array([s.q for s in suspects]),
@@ -135,7 +135,7 @@ class Refusals:
         return float(wrong)
 
     def exact(self, s: State) -> bool:
-        """Whether a D that is singular, or regular, to the last digit is so before rounding.
+        """Return whether D is singular, or regular, independently of rounding errors.
 
         Where one inertia is 2^60 times another, D may have lost the other, or a pivot may.
         """
@@ -143,7 +143,7 @@ class Refusals:
         return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)
 
     def natural(self, s: State) -> bool:
-        """Whether all parameters have the signs of their defaults.
+        """Return whether all parameters have the signs of their defaults.
 
         Link multipliers divide by masses: they refuse one that is not positive, whatever D is.
         """
@@ -157,7 +157,7 @@ class Refusals:
         return bool(np.any(off > PRECISION_LOSS * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
-        """The start and some other states with parameters changed in every way."""
+        """Return the start and some other states with parameters changed in several ways."""
         states = self.places()
         suspects_ = []
         changes: list[dict[str, float]] = [{}]
@@ -182,7 +182,7 @@ class Refusals:
         return [suspects_[k] for k in sorted(order)]
 
     def places(self) -> list[State]:
-        """Where a D may be singular: at the start, upright, level, and anywhere."""
+        """Return states at which D may be singular: start, upright, level, and random ones."""
         own = self.check.sampler.start
         drawn = [e.state for e in self.check.few(4)[1:]]
         states = [own, *drawn]
@@ -191,7 +191,7 @@ class Refusals:
         return [replace(s, t=0.0, u=None) for s in states]
 
     def accelerate(self, s: State) -> tuple[int, bool]:
-        """The status of the C function, and whether it has left alone what it was to leave."""
+        """Return the C function's status, and whether outputs are unchanged after an error."""
         model = self.model
         a = np.full(model.nq, MARK, model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -220,11 +220,11 @@ class Refusals:
         return float(wrong)
 
     def call(self, name: str, s: State) -> Any:
-        """A function of the module at a state."""
+        """Call a function of the module at a state."""
         return getattr(self.module, name)(s.q, s.qd, t=s.t, u=s.u, params=s.params)
 
     def raises(self, call: Callable[[], Any], status: str) -> bool:
-        """Whether a call raises with this status and says where."""
+        """Return whether a call raises with this status and names the state."""
         try:
             call()
         except ArithmeticError as fault:
@@ -232,7 +232,7 @@ class Refusals:
         return False
 
     def stays(self, method: str, s: State, status: str) -> bool:
-        """Whether a step and a run refuse: where they were, with the words for it."""
+        """Return whether a step and a run stop at the initial state with the right message."""
         out = tuple(np.full(len(s.q), MARK, self.model.dtype) for _ in range(2))
         options = {"params": s.params, "u": s.u, "method": method}
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **options)
@@ -248,7 +248,7 @@ class Refusals:
         )
 
     def run_into(self) -> float:
-        """How many runs with a regular start go on where D is singular, or keep such a state.
+        """Count runs from a regular start that continue past a singular D, or store such a state.
 
         Not where rounding decides which D is singular along them.
         """
@@ -272,7 +272,7 @@ class Refusals:
         return float(wrong)
 
     def regular_neighbour(self, s: State, turn: int) -> list[State]:
-        """A regular state that differs from a singular one in one coordinate, if one is found.
+        """Return a regular state that differs from a singular one in one coordinate, or None.
 
         From there a run may come gently to where D is singular: nothing else moves.
         """
@@ -286,7 +286,7 @@ class Refusals:
         return []
 
     def goes_on(self, method: str, s: State, steps: int) -> bool:
-        """Whether a run has kept a state whose D is not positive definite."""
+        """Return whether a run has stored a state whose D is not positive definite."""
         run = run_in_c(self.model, method, s, self.check.system.run.h, steps + 3)
         rows = run.rows[:, : run.steps + 1].astype(float)
         if not np.all(np.isfinite(rows)):
@@ -305,7 +305,7 @@ class Refusals:
         return bool(np.any(least < -EIGENVALUE_TOLERANCE))
 
     def positions_along_step(self, starts: Vector, ends: Vector) -> list[Vector]:
-        """Positions along all steps, by the cubic through both ends of each: (n, nq) for ALONG."""
+        """Return positions within steps by cubic interpolation: (n, nq) for each of ALONG."""
         (q, qd), (r, v), h = starts, ends, self.check.system.run.h
         return [
             q + (r - q) * x**2 * (3 - 2 * x) + h * x * (1 - x) * (qd * (1 - x) - v * x)
@@ -323,7 +323,7 @@ class Refusals:
     # what is not finite
 
     def nonfinite_errors(self) -> float:
-        """How many functions take a number for granted that is none, or infinite."""
+        """Count functions that do not refuse nan or infinity."""
         s, wrong = self.check.few(2)[-1].state, 0
         for field, i, what, at in with_nonfinite_entries(s):
             status, clean = self.accelerate(at)
@@ -340,7 +340,7 @@ class Refusals:
         return float(wrong)
 
     def multiplied(self, s: State) -> bool:
-        """Whether multipliers are finite, or refused by the C function: nan for each then."""
+        """Return whether multipliers are finite, or refused by the C function as nan."""
         model = self.model
         multipliers = np.zeros(len(model.constraint_names), model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -353,7 +353,7 @@ class Refusals:
         return bool(np.all(np.isnan(multipliers) if refused else np.isfinite(multipliers)))
 
     def matters(self, s: State, field: str, i: int) -> bool:
-        """Whether accelerations depend on a coordinate or velocity."""
+        """Return whether accelerations depend on a coordinate or velocity."""
         x = getattr(s, field).copy()
         x[i] += 0.1 * (1 + abs(x[i]))
         one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
@@ -369,7 +369,7 @@ class Refusals:
         return all(bool(np.all(np.isfinite(value))) for value in values)
 
     def linearized(self, s: State) -> bool:
-        """Whether the derivatives are finite, or were not written."""
+        """Return whether the derivatives are finite, or were not written."""
         model, n = self.model, self.model.nq
         A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -383,7 +383,7 @@ class Refusals:
         return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
-        """Steps so long that the state leaves the finite numbers, or no stages are found."""
+        """Check steps so long that the state overflows, or that the stages do not converge."""
         s, wrong = self.check.few(2)[-1].state, 0
         ended = []
         for power in (4, 8, 16, 40, 100, 160, 300):

@@ -1,4 +1,4 @@
-"""Rows of `check` about runs: long steps, cuts, kept rows, inputs row by row, angles far out.
+"""Checks of runs: long steps, runs in pieces, stored rows, inputs of each step, large angles.
 
 A run may take another way through the C than one step from the start does: sines and cosines are
 predicted while steps are short, Kahan remainders are kept, and a run that was cut goes on from its
@@ -69,7 +69,7 @@ class RunResult:
 
 
 def parameters(model: Any, s: State) -> Vector:
-    """The parameters of a state, (np,)."""
+    """Return the parameters of a state, (np,)."""
     values = [(s.params or model.defaults)[name] for name in model.parameters]
     return np.array(values, model.dtype)
 
@@ -109,7 +109,7 @@ def run_in_c(
 
 
 def _reads_time(system: System) -> bool:
-    """Whether a formula of a system depends on the time by itself."""
+    """Return whether a formula of a system depends explicitly on time."""
     parts = (
         system.kinetic, system.potential, system.dissipation, *system.forces,
         *(x for pair in system.applied for x in pair), *(i.signal for i in system.inputs),
@@ -120,7 +120,7 @@ def _reads_time(system: System) -> bool:
 
 
 class Runs:
-    """Rows on runs."""
+    """Checks of runs."""
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.model = check, check.module._model
@@ -162,7 +162,7 @@ class Runs:
     limit = 1e3
 
     def written(self) -> float:
-        """How many values leave entries as they were."""
+        """Count functions that do not write all of their outputs."""
         s, n, left = self.states[-1], self.model.nq, 0
         for name in ("D", "C", "g", "bias", "tau"):
             out = np.full((n, n) if name in "DC" else n, np.nan, self.model.dtype)
@@ -190,7 +190,7 @@ class Runs:
         return min([*steps, 100 * self.h]) if steps else self.h
 
     def long(self) -> float | Measurement:
-        """Long steps beside the reference's."""
+        """Compare long steps with the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         pairs = [
             (e, h)
@@ -205,7 +205,7 @@ class Runs:
         return largest(errors, "a difference grows too much in one long step")
 
     def short(self) -> float | Measurement:
-        """Steps in which angles hardly turn beside the reference's."""
+        """Compare steps in which angles hardly change with the reference's."""
         starts = self.check.few(2 if self.check.large else 8)
         errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
         return largest(errors, "a difference grows too much in one short step")
@@ -330,7 +330,7 @@ class Runs:
         return self.check.units(end, x[:, 0], size)
 
     def inputs(self) -> float | Measurement:
-        """A row of inputs each step beside the reference, and cut as one."""
+        """Compare a run with inputs for each step with the reference and with runs in pieces."""
         errors, spread = [], self.sampler.scale
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
@@ -382,13 +382,13 @@ class Runs:
         return float(wrong)
 
     def table(self, s: State) -> State:
-        """The state with a row of inputs each step."""
+        """Return the state with a row of inputs for each step."""
         u = self.random.normal(size=(STEPS, self.model.nu))
         u[::2] = u[1::2]  # inputs that jump at some steps and not at others
         return replace(s, u=u)
 
     def differ(self, method: str, s: State, h: float) -> int:
-        """How many of the runs of one state and step differ."""
+        """Count the runs of one state and step that differ."""
         whole = run_in_c(self.model, method, s, h, STEPS)
         pieces = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS)
         sparse = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)

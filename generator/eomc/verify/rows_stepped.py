@@ -1,4 +1,4 @@
-"""Rows of `check` about events in fixed steps: each row is one step of the method from that before.
+"""Checks of events in fixed steps: each row is one step of the method from the previous row.
 
 So is the state at each event; and where what an event watches changes its sign, there it is.
 """
@@ -85,7 +85,7 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 
 
 def _missing(check: Comparison, module: Any, run: Any, s: State) -> bool:
-    """Whether what an event watches comes from clearly one side to the other, which is not told."""
+    """Return whether an event function changes sign clearly without a detected event."""
     events = check.system.events
     values = module._model._evaluate("events", run.q, run.qd, run.t, s.u, s.params)
     for event, g in zip(events, values.T, strict=True):

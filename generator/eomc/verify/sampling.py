@@ -92,14 +92,14 @@ class State:
 
 
 def evaluate_module(module: Any, name: str, s: State) -> Vector:
-    """The module's value of that name."""
+    """Return the module's value of this name."""
     place = (s.q,) if name in OF_POSITIONS else (s.q, s.qd)
     inputs = {"u": s.u} if name in OF_INPUTS else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
 
 
 def projected_start(module: Any, s: State) -> State:
-    """The state as a run starts from it: on the module's constraints, nothing held."""
+    """Return the state projected onto the module's constraints, as at the start of a run."""
     if not getattr(module, "constraint_names", ()):
         return s
     q, qd = module.project(s.q, s.qd, t=s.t, params=s.params)
@@ -107,19 +107,19 @@ def projected_start(module: Any, s: State) -> State:
 
 
 def simulate(module: Any, s: State, **how: Any) -> Any:
-    """The module's run from a state; one that stops early does so without a warning."""
+    """Return the module's run from a state, without a warning if it stops early."""
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         return module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
 
 
 def states_of_run(run: Any, s: State) -> list[State]:
-    """The states that a run from `s` went through."""
+    """Return the states of the rows of a run from `s`."""
     rows = zip(run.t, run.q, run.qd, strict=True)
     return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
 
 
 def perturb_each_input(s: State, defaults: Mapping[str, float]) -> list[State]:
-    """The state with one input after the other changed by a small part of itself."""
+    """Return the state with one input at a time changed by a small part of itself."""
     states = []
     for field in ("q", "qd", "u"):
         values = getattr(s, field)
@@ -136,7 +136,7 @@ def perturb_each_input(s: State, defaults: Mapping[str, float]) -> list[State]:
 
 
 def _perturbed(s: State, defaults: Mapping[str, float], random: np.random.Generator) -> State:
-    """The state with all inputs changed at random by small parts of themselves."""
+    """Return the state with all inputs changed at random by small parts of themselves."""
 
     def shake(x: Any) -> Any:
         return x * (1 + NUDGE * random.standard_normal(np.shape(x)))
@@ -147,7 +147,7 @@ def _perturbed(s: State, defaults: Mapping[str, float], random: np.random.Genera
 
 
 def _stacked(states: Sequence[State], defaults: Mapping[str, float]) -> dict[str, Any]:
-    """States, all with inputs from outside or none, as arguments with a row each."""
+    """Return states as arguments with a row each; all have external inputs or none."""
     params = [s.params or defaults for s in states]
     return {
         "q": np.array([s.q for s in states]),
@@ -214,7 +214,7 @@ class Sampler:
         return np.asarray(np.max(np.nan_to_num(ranges, posinf=0), axis=1))
 
     def states(self, count: int) -> list[Expected]:
-        """The start, some states with the parameters' defaults, then all at random."""
+        """Return the start, some states with default parameters, then random states."""
         states_: list[Expected] = []
         nearness = 1.0  # every rejection moves the next draw closer to the start
         for attempt in range(20 * count):
@@ -330,7 +330,7 @@ class Sampler:
         return find_wrong_rotations(self.system)
 
     def wrong_rotations(self, s: State) -> list[str]:
-        """The loops that are closed by another rotation than is meant, though their rows hold."""
+        """Return the loops that are closed by a wrong rotation though their equations hold."""
         if not (self.system.reactions and np.all(np.isfinite(s.q))):
             return []
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
@@ -361,12 +361,12 @@ class Sampler:
         return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
 
     def regular_expected(self, s: State) -> Expected | None:
-        """As `expected`; None where D is not regular, too."""
+        """Return `expected`, or None if D is not regular."""
         with np.errstate(all="ignore"):
             return self.expected(s) if self.regular(s) else None
 
     def expected(self, s: State) -> Expected | None:
-        """The reference's values and their sizes; None where something is not finite."""
+        """Return the reference's values and their scales; None if any is not finite."""
         value: dict[str, Vector] = {}
         reach: dict[str, Vector] = {}
         for name, field in VALUES.items():
@@ -412,7 +412,7 @@ class Sampler:
         return Expected(s, value, size)
 
     def _rows_of(self, s: State, value: dict[str, Vector], size: dict[str, Vector]) -> None:
-        """Values of the constraints; sizes of these, multipliers, accelerations and corrections."""
+        """Add values and scales of constraints, multipliers, accelerations and corrections."""
         for name in ("constraint_jacobian", "constraints", "constraint_rates", "gamma"):
             value[name], size[name] = self.value_and_size(partial(self.reference.evaluate, name), s)
         A, a, n = size["constraint_jacobian"], np.abs(value["acceleration"]), len(s.q)
@@ -461,7 +461,7 @@ class Sampler:
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
-        """K + P and its size."""
+        """Return K + P and its scale."""
         names = ("kinetic", "potential")
         K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
         size = np.maximum(K + P, self.reference.terms("energy", vars(s)))

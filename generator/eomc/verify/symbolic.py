@@ -1,4 +1,4 @@
-"""The independent answer: Euler-Lagrange as a textbook writes it, in SymPy, NumPy and plain Python.
+"""Independent reference: textbook Euler-Lagrange equations in SymPy, NumPy and plain Python.
 
 It starts from the `System` and shares nothing else with the compiled way: definitions are
 substituted, everything is differentiated as it stands, evaluated in doubles,
@@ -145,12 +145,12 @@ def reference_for(system: System) -> Reference:
 
 
 def is_small(system: System, most: float | None = None) -> bool:
-    """Whether `derive` takes seconds at most; or what is to have at most so many operations."""
+    """Return whether the expanded equations have few enough operations for `derive`."""
     return _expanded_size(system) <= (MAX_SIZE if most is None else most)
 
 
 def _expanded_size(system: System) -> float:
-    """Roughly how many operations `derive` would have in hand: those of K, written out, nq^2 times.
+    """Estimate the number of operations in `derive`: those of the expanded K, times nq^2.
 
     What a definition hangs on is counted as often as it is named; dot(e) is e once a coordinate.
     """
@@ -177,7 +177,7 @@ def _expanded_size(system: System) -> float:
 
 
 def _expander(system: System) -> Callable[[Expr], Expr]:
-    """A function that puts definitions in and carries every dot(...) out."""
+    """Return a function that substitutes definitions and carries out every dot(...)."""
     known: dict[Expr, Expr] = {}
 
     def rate(e: Expr) -> Expr:
@@ -197,7 +197,7 @@ def _expander(system: System) -> Callable[[Expr], Expr]:
 
 
 def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
-    """`e`, an entry of D, in a form without velocities. Raises EomcError where there is none."""
+    """Return `e`, an entry of D, without velocities. Raises EomcError if it depends on them."""
     for attempt in (lambda x: x, sympy.expand, sympy.simplify):
         e = attempt(e)
         if not e.has(*velocities):
@@ -210,7 +210,7 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 @dataclass(frozen=True)
 class SymbolicReference(Reference):
-    """The equations of `system` as expressions over q, qd, t, u and the parameters.
+    """Equations of motion as expressions in q, qd, t, u and the parameters.
 
     constraints, constraint_rates, gamma: (m, 1); constraint_jacobian: (m, nq); D, C: (nq, nq);
     g, bias, tau, friction: (nq, 1), tau = Q - friction; signals: (nu, 1), the
@@ -241,21 +241,21 @@ class SymbolicReference(Reference):
 
     @cached_property
     def motion(self) -> ImmutableMatrix:
-        """D by rows, bias and tau, which an acceleration needs together: (nq^2 + 2 nq, 1)."""
+        """Entries of D by rows, bias and tau in one column, for accelerations: (nq^2 + 2 nq, 1)."""
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
     @cached_property
     def energy_terms(self) -> Expr:
-        """The sizes of the terms of K and P, added up."""
+        """Sum of |terms| of K and P."""
         return _magnitude(self.kinetic) + _magnitude(self.potential)
 
     @cached_property
     def power_terms(self) -> Expr:
-        """The sizes of the terms of the power, added up."""
+        """Sum of |terms| of the power."""
         return _magnitude(self.power)
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """As `Answer.terms`."""
+        """Implement `Reference.terms`."""
         return float(self.evaluate(f"{name}_terms", **s))
 
     def _value(
@@ -269,7 +269,7 @@ class SymbolicReference(Reference):
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """D and tau - bias, of one evaluation."""
+        """Return D and tau - bias from one evaluation."""
         n = q.shape[-1]
         motion = self._value("motion", q, qd, t, u, values)
         D, bias, tau = motion[..., : n * n], motion[..., n * n : -n], motion[..., -n:]
@@ -278,7 +278,7 @@ class SymbolicReference(Reference):
     def _states(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Iterator[tuple[Vector, Vector, float, ArrayLike | None, Values]]:
-        """The rows of arguments that have them, as those of single states."""
+        """Yield the arguments of each state, from arguments with one row for each."""
         rows = len(q)
         times, *each = (by_rows(x, rows) for x in (t, *values))
         us: Any = [None] * rows if u is None else np.asarray(u, float)
@@ -288,7 +288,7 @@ class SymbolicReference(Reference):
     def _value_at_state(
         self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: Values
     ) -> Any:
-        """The value at one state."""
+        """Return the value at one state."""
         if name == "signals" or not self.system.inputs:
             u = np.zeros(len(self.system.inputs))
         elif u is None:
@@ -314,7 +314,7 @@ class SymbolicReference(Reference):
 
 
 def _magnitude(e: Expr) -> Expr:
-    """The sum of the sizes of the terms that `e` has, multiplied out as far as + and * go."""
+    """Return the sum of |terms| of `e`, with sums and products expanded."""
     if e.is_Add or e.is_Mul:
         return e.func(*map(_magnitude, e.args))
     if e.is_Pow and e.exp.is_Integer and e.exp > 0:

@@ -1,4 +1,4 @@
-"""The independent answer for large systems: Taylor arithmetic along the definitions, in numbers.
+"""Independent reference for large systems, by numerical Taylor arithmetic along the definitions.
 
 Nothing is expanded and nothing is differentiated as a formula. Every quantity carries its value
 and those of its derivatives that are needed, as arrays, and the rules for sums, products and
@@ -63,7 +63,7 @@ _REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
 
 
 class TaylorReference(Reference):
-    """The equations of `system`, worked out at each state; the fields of `symbolic.derive`.
+    """Equations of motion evaluated numerically at each state; quantities as in `symbolic.derive`.
 
     D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) + c(0))/2 with c = T_vvs + N: that is
     Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part
@@ -108,7 +108,7 @@ class TaylorReference(Reference):
     def _rows(
         self, name: str, q: Vector, qd: Vector, t: Any, u: Any, values: Sequence[Any]
     ) -> Vector:
-        """One row a state: q, qd (b, nq), u (b, nu) or None."""
+        """Return the arguments with one row for each state: q, qd (b, nq), u (b, nu) or None."""
         if name == "signals" or not self.system.inputs:
             u = np.zeros((1, len(self.system.inputs)))
         elif u is None:
@@ -131,7 +131,7 @@ class TaylorReference(Reference):
         return both[..., :-1], both[..., -1]
 
     def _outputs(self, name: str, state: Point) -> Vector:
-        """The values of `name`, a row a state."""
+        """Return the values of `name`, one row for each state."""
         jets = self._run(name, state)
         roots, (b, nq) = self._list.roots, state.q.shape
 
@@ -216,12 +216,12 @@ class TaylorReference(Reference):
 
 
 def _twice(z: Any) -> Any:
-    """The rows once more behind themselves; one number, or one row, which serves all, as it is."""
+    """Return the rows repeated once; a number, or a single row, is unchanged."""
     return np.concatenate([z, z]) if np.ndim(z) and len(z) > 1 else z
 
 
 def _column(z: Any) -> Any:
-    """A number as it is, one number a state as a column."""
+    """Return a number unchanged, and one number for each state as a column."""
     return np.asarray(z, float)[:, None] if np.ndim(z) else np.float64(z)
 
 
@@ -230,7 +230,7 @@ def _column(z: Any) -> Any:
 
 @dataclass
 class _List:
-    """The operations of all of a system's expressions, each written once, in order."""
+    """List of the distinct operations in all expressions of a system, in order of evaluation."""
 
     system: System
     ops: list[Op] = field(default_factory=list)
@@ -263,7 +263,7 @@ class _List:
         return len(self.ops) - 1
 
     def make(self, kind: str, args: Iterable[int], data: Any = None, degree: float = 0) -> int:
-        """An operation on others."""
+        """Append an operation, or return the index of an equal one."""
         args = tuple(args)
         of = [self.ops[i] for i in args]
         moves, rate, given = (
@@ -272,7 +272,7 @@ class _List:
         return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", given))
 
     def node(self, e: Any) -> int:
-        """The operation that gives `e`."""
+        """Return the index of the operation that evaluates `e`."""
         e = sympy.sympify(e)
         if e not in self.known:
             self.known[e] = self.build(e)
@@ -308,7 +308,7 @@ class _List:
         raise EomcError(f"{self.system.name}: the derivatives of {e} are not known")
 
     def product(self, e: Expr) -> int:
-        """Factors in the order of the time they are known, so that few products are large."""
+        """Return a product with factors in order of dependency, so that few products are large."""
         factors: list[int] = []
         for factor in e.args if e.is_Mul else (e,):
             square = factor.is_Pow and factor.exp == 2
@@ -329,7 +329,7 @@ class _List:
         return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
 
     def plan(self, fields_by_root: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
-        """The operations that the wanted derivatives need, in order, and what of each."""
+        """Return the operations that the wanted derivatives need, in order, with their fields."""
         need: dict[int, set[str]] = {}
         for root, fields in fields_by_root.items():
             for index in self.roots[root]:
@@ -346,7 +346,7 @@ class _List:
         return ((i, op, frozenset(need[i])) for i, op in enumerate(self.ops) if need.get(i))
 
     def _demand(self, need: dict[int, set[str]], index: int, fields: Iterable[str]) -> None:
-        """Note that `fields` are needed, as far as they aren't zero."""
+        """Record that `fields` are needed, except those that are zero."""
         op, here = self.ops[index], need.setdefault(index, set())
         for name in fields:
             if name in _VELOCITY_FIELDS:

@@ -1,4 +1,4 @@
-"""The rules of Taylor arithmetic: of each operation, value and derivatives from its arguments'.
+"""Rules of Taylor arithmetic: value and derivatives of each operation from its arguments'.
 
 What a derivative is called, see `taylor`, whose lists of operations these rules carry out.
 """
@@ -41,7 +41,7 @@ FEEDS: Mapping[str, Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Op:
-    """One operation on those before it: what it is, of which, and a number, place or function.
+    """One operation on earlier ones: its kind, arguments, and a number, index or function.
 
     degree: in the velocities, inf where it is no polynomial in them; moves: 2 where it hangs on
     q, 1 where on t alone; rate: hangs on a dot(...); has_inputs: hangs on an input.
@@ -58,7 +58,7 @@ class Op:
 
 @dataclass(frozen=True)
 class Point:
-    """Where the operations are carried out: q, qd (b, nq); t, u, values: numbers or columns."""
+    """Point of evaluation: q, qd (b, nq); t, u, values: numbers or columns."""
 
     q: Vector
     qd: Vector
@@ -79,7 +79,7 @@ class Point:
 
 
 def _weighted(*terms: tuple[Any, Any]) -> Any:
-    """sum w z over pairs; what is None is zero."""
+    """Return the sum of w z over pairs (w, z); None counts as zero."""
     total = None
     for w, z in terms:
         if w is None or z is None:
@@ -144,7 +144,7 @@ def _product(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
 
 
 def _times(a: Jet, b: Jet, fields: Fields) -> Jet:
-    """Leibniz's rule."""
+    """Return the derivatives of a product (Leibniz's rule)."""
     x, y, g, h = a["value"], b["value"], a.get, b.get
     if len(a) == 1:  # a number, or what hangs on parameters alone
         large = x[..., None] if isinstance(x, np.ndarray) else x
@@ -175,12 +175,12 @@ def _times(a: Jet, b: Jet, fields: Fields) -> Jet:
 
 
 def _without_time(x: Any) -> Any:
-    """dt left out."""
+    """Return a row without its entry for t."""
     return None if x is None else x[:, :-1]
 
 
 def _chain(f: tuple[Any, Any, Any], a: Jet, fields: Fields) -> Jet:
-    """A function's value and two derivatives, f, f' and f'', at a."""
+    """Return the value and derivatives of f(a) by the chain rule, from f, f' and f'' at a."""
     value, slope, bend = f
     g = a.get
     out: Jet = {}
@@ -202,7 +202,7 @@ def _function(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
 
 
 def _power(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
-    """a^b; where b changes, exp(b log a)."""
+    """Return a^b, as exp(b log a) if b is not constant."""
     a, b = args
     x, y = np.asarray(a["value"]), b["value"]
     value = x**y
@@ -215,12 +215,12 @@ def _power(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
 
 
 def _falling(factor: Any, x: Any, y: Any) -> Any:
-    """factor x^y, 0 where the factor is."""
+    """Return factor x^y, or 0 where the factor is 0."""
     return np.where(np.asarray(factor) == 0, 0.0, factor * x**y)
 
 
 def _atan2(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
-    """The angle of (x, y), as atan in a frame turned so that y is 0 there."""
+    """Return the angle of (x, y), by atan in a frame rotated so that y is 0 at this point."""
     inside = frozenset(f for name in fields for f in FEEDS["product"][name].split())
     y, x = args
     r = np.hypot(x["value"], y["value"])
@@ -237,7 +237,7 @@ def _atan2(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
 
 
 def _extreme(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
-    """The larger of two, or the smaller; half of each where they are equal."""
+    """Return the larger or smaller of two; their mean where they are equal."""
     a, b = args
     larger, x, y = op.data, np.asarray(a["value"]), b["value"]
     first = np.heaviside(x - y if larger else y - x, 0.5)
@@ -251,7 +251,7 @@ def _extreme(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
 
 
 def _rate(op: Op, args: list[Jet], fields: Fields, at: Point) -> Jet:
-    """d/dt, from the derivatives along d = (qd, 1)."""
+    """Return d/dt, from the derivatives along d = (qd, 1)."""
     (e,) = args
     xs = e.get("xs")
     out: Jet = {
@@ -283,7 +283,7 @@ Three = tuple[Any, Any, Any]
 
 
 def _corner(x: Any) -> Any:
-    """nan where a derivative doesn't exist, at 0."""
+    """Return nan at 0, where the derivative does not exist."""
     return np.where(np.asarray(x) == 0, math.nan, 0.0)
 
 
@@ -293,7 +293,7 @@ def _asin(x: Any) -> Three:
 
 
 def step_at(at_zero: float) -> Callable[[Any], Three]:
-    """The step function with this value at 0."""
+    """Return the step function with this value at 0."""
     return lambda x: (np.heaviside(x, at_zero), _corner(x), _corner(x))
 
 

@@ -31,7 +31,7 @@ def simplify_trig(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
 
 
 def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
-    """A sum of products of rates, each with the shortest coefficient that was found."""
+    """Return a sum of products of rates, each with the shortest coefficient found."""
     terms = coefficients(e, rates)
     if terms is None:
         return _coefficient(e)
@@ -39,7 +39,7 @@ def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
 
 
 def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
-    """Pairs (product of rates, coefficient): `e` is their sum. None: no polynomial in the rates."""
+    """Return pairs (product of rates, coefficient) whose sum is `e`; None if not polynomial."""
     if not rates or not e.has(*rates):
         coefficient = _coefficient(e)
         return [(sympy.S.One, coefficient)] if coefficient != 0 else []
@@ -57,7 +57,7 @@ def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | 
 
 @lru_cache(maxsize=10_000)
 def _coefficient(e: Expr) -> Expr:
-    """The shortest of some forms of a polynomial in sines and cosines, without common factors."""
+    """Return the shortest of several forms of a polynomial in sines and cosines, factored."""
     e = _inside(e)
     try:
         ring, polynomial = sring(e)
@@ -81,7 +81,7 @@ def _coefficient(e: Expr) -> Expr:
 
 
 def _ranked(forms: Sequence[Expr]) -> list[Expr]:
-    """The shortest first, of forms as long as each other those without double angles.
+    """Return forms in order of length; of equally long ones, those without double angles first.
 
     By their texts, which take long to write, only where nothing else tells them apart.
     """
@@ -95,7 +95,7 @@ def _ranked(forms: Sequence[Expr]) -> list[Expr]:
 
 @lru_cache(maxsize=10_000)
 def _factored(e: Expr) -> Expr:
-    """Without common factors. The same forms come again and again: of energies, D and bias."""
+    """Factor out common factors. Cached, since energies, D and bias share many forms."""
     return sympy.factor_terms(e)
 
 
@@ -106,7 +106,7 @@ def _length(e: Expr) -> tuple[int, int]:
 
 
 def _inside(e: Expr) -> Expr:
-    """`e` with what is no polynomial, such as roots and quotients, short inside."""
+    """Return `e` with the arguments of non-polynomial parts, such as roots, simplified."""
     outer = [a for a in e.atoms(sympy.Function, sympy.Pow) if _opaque(a)]
     if not outer:
         return e
@@ -124,7 +124,7 @@ def _maximal(parts: list[Expr]) -> list[Expr]:
 
 
 def _reduced(polynomial: PolyElement, angles: _Angles) -> list[PolyElement]:
-    """By sin^2 + cos^2 = 1: without squares of cosines, and without squares of sines."""
+    """Return the forms without squared cosines and without squared sines, by sin^2 + cos^2 = 1."""
     ring = polynomial.ring
     named = dict(zip(ring.symbols, ring.gens, strict=True))
     forms = []
@@ -152,7 +152,7 @@ def _grouped(polynomial: PolyElement) -> Expr:
 
 
 def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElement) -> PolyElement:
-    """1 - other^2 for this^2, both generators."""
+    """Substitute 1 - other^2 for this^2; both are generators."""
     ring = polynomial.ring
     k = ring.gens.index(this)
     result = ring.zero
@@ -164,7 +164,7 @@ def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElem
 
 
 def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
-    """Products of sines and cosines as sums: cos a cos b = (cos(a - b) + cos(a + b))/2.
+    """Expand products of sines and cosines: cos a cos b = (cos(a - b) + cos(a + b))/2.
 
     crossed: only where two angles meet; squares of one stay.
     """
@@ -190,7 +190,7 @@ def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
 
 
 def _waves(trig: list[Expr]) -> dict[Expr, Expr]:
-    """A product of sines and cosines as a sum of single ones, by their sizes."""
+    """Return a product of sines and cosines as a sum of single ones, with their amplitudes."""
     waves: dict[Expr, Expr] = {sympy.S.One: sympy.S.One}
     for f in trig:
         products: dict[Expr, Expr] = {}
@@ -204,7 +204,7 @@ def _waves(trig: list[Expr]) -> dict[Expr, Expr]:
 
 
 def _times(wave: Expr, f: Expr) -> list[tuple[Expr, Expr]]:
-    """A single wave, or 1, times another."""
+    """Return the product of a single sine or cosine, or 1, with another, as a sum."""
     half = sympy.S.Half
     if wave is sympy.S.One:
         return [(f, sympy.S.One)]
