@@ -89,10 +89,8 @@ class Timeline:
             for o in system.outputs
         ]
         u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
-        is_held_constant = getattr(run, "_u", None) is not None
-        lines += [
-            (i.unit, Line(i.name, u[:, k], is_held_constant)) for k, i in enumerate(system.inputs)
-        ]
+        has_stairs = getattr(run, "_u", None) is not None
+        lines += [(i.unit, Line(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)]
         units = dict.fromkeys(unit for unit, _ in lines)
         separate = len(lines) <= MAX_PANELS - 1 and len(lines) <= MAX_CURVES_PER_PANEL
         for unit in units:

@@ -34,18 +34,16 @@ class Stop:
 
 def joint_stops(robot: Robot) -> list[Stop]:
     """Return the stops of all coordinates that have finite limits."""
-    carried_loads: dict[
-        str, tuple[float, float]
-    ] = {}  # by body: mass, and largest mass times distance
+    loads: dict[str, tuple[float, float]] = {}  # by body: mass, and largest mass times distance
     holding_effort: dict[str, float] = {}  # by coordinate: against gravity, N or N m
     g = math.hypot(*robot.gravity)
     for body in reversed(robot.bodies):  # children come before parents
-        mass, moment = carried_loads.get(body.name, (0.0, 0.0))
+        mass, moment = loads.get(body.name, (0.0, 0.0))
         mass, moment = mass + body.mass, moment + body.mass * math.hypot(*body.center)
         holding_effort |= {m.name: g * (moment if m.unit == "rad" else mass) for m in body.motions}
         more = mass, moment + mass * math.hypot(*body.offset)
-        one, other = carried_loads.get(body.parent, (0.0, 0.0)), more
-        carried_loads[body.parent] = one[0] + other[0], one[1] + other[1]
+        one, other = loads.get(body.parent, (0.0, 0.0)), more
+        loads[body.parent] = one[0] + other[0], one[1] + other[1]
     drive_force: dict[str, float] = {}  # by coordinate: the sum over its drives
     for d in robot.drives:
         for factor, q in robot.coordinate_terms(d.coordinate):

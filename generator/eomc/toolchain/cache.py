@@ -111,7 +111,7 @@ def _digest_of_parts(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
 
 
-def is_built(folder: Path, wanted: str) -> bool:
+def is_built(folder: Path, build_key: str) -> bool:
     """Return whether `folder` contains the complete build with this key.
 
     The digests of all files are compared: loading a corrupt extension may crash the process.
@@ -120,7 +120,7 @@ def is_built(folder: Path, wanted: str) -> bool:
         manifest = _manifest(folder)
         files = manifest["files"]
         return (
-            manifest["key"] == wanted
+            manifest["key"] == build_key
             and manifest["files_digest"] == _digest_of_files(files)
             and all(_digest(folder / name) == digest for name, digest in files.items())
         )
@@ -155,7 +155,7 @@ def _digest(file: Path) -> str:
 
 def build(
     name: str,
-    wanted: str,
+    build_key: str,
     sources: Callable[[str], Sources],
     root: Path,
     form: str = "fast",
@@ -163,30 +163,30 @@ def build(
 ) -> Built:
     """Return the module of one scene under `root`; build it if it is not there yet.
 
-    wanted: the key. sources: returns the files, given the name of the extension; called only if
+    build_key: the key. sources: returns the files, given the name of the extension; called only if
     the module must be built. form: of the C that it is compiled from. scene_digest: of the scene;
     a build with another digest is archived, for values pickled by it.
     Raises EomcError with the compiler's message if it fails, or if the folder can't be written.
     """
     folder = place(name, root, form)
     root = folder.parent
-    if is_built(folder, wanted):
-        return Built(name, folder, False, wanted)
+    if is_built(folder, build_key):
+        return Built(name, folder, False, build_key)
     try:
         root.mkdir(parents=True, exist_ok=True)
         with locked(root / f".{folder.name}.lock"):
-            if is_built(folder, wanted):  # by another process, meanwhile
-                return Built(name, folder, False, wanted)
+            if is_built(folder, build_key):  # by another process, meanwhile
+                return Built(name, folder, False, build_key)
             _check_folder_is_free(folder)
             for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
             with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}.build-") as new:
-                _build(name, wanted, sources, folder, Path(new), form, scene_digest)
+                _build(name, build_key, sources, folder, Path(new), form, scene_digest)
     except OSError as fault:
         raise FolderError(
             f"{fault.filename or folder}: can't be written ({fault.strerror})"
         ) from None
-    return Built(name, folder, True, wanted)
+    return Built(name, folder, True, build_key)
 
 
 def place(name: str, root: Path, form: str = "fast") -> Path:
@@ -209,7 +209,7 @@ def _check_folder_is_free(folder: Path) -> None:
 
 def _build(
     name: str,
-    wanted: str,
+    build_key: str,
     sources: Callable[[str], Sources],
     folder: Path,
     new: Path,
@@ -219,7 +219,7 @@ def _build(
     from eomc.toolchain import extension
     from eomc.toolchain.subprocesses import write_files
 
-    extension_name = f"_{name}_{wanted[:12]}"
+    extension_name = f"_{name}_{build_key[:12]}"
     rendered = sources(extension_name)
     write_files(rendered.files, new)
     library = extension_name + str(sysconfig.get_config_var("EXT_SUFFIX"))
@@ -228,7 +228,7 @@ def _build(
     shipped = [library, *(f for f in rendered.files if form == "fast" or f.endswith(".py"))]
     files = {file: _digest(new / file) for file in shipped}
     manifest = {
-        "key": wanted,
+        "key": build_key,
         "name": name,
         "scene": scene_digest,
         "eomc": __version__,

@@ -38,7 +38,9 @@ NOISE_FACTOR = 30.0  # times what rounding does to a run: differences above are 
 ORDER_TOLERANCE = 0.3  # orders that differ by less are the same
 COUNTS = (6, 12, 24, 48, 96)  # steps of a span
 FIRST_SPANS = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
-LOWER, MOST = (-2, -4, -7, -10, -14, -20), 8  # then down to where all is rounding, and up
+# log2 of spans over 48 h, down to where all differences are rounding error
+START_POWERS = (-2, -4, -7, -10, -14, -20)
+MAX_POWER = 8  # log2 of the longest span over 48 h
 BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
 NEARBY_FACTORS = (
     1 - 1e-3,
@@ -178,9 +180,9 @@ class Convergence:
         for power in FIRST_SPANS:
             if (one := ladder(power)) and not math.isnan(best := one.best(least)):
                 return best
-        low = next((k for k in LOWER if (one := ladder(k)) and one.exact), LOWER[-1])
+        low = next((k for k in START_POWERS if (one := ladder(k)) and one.exact), START_POWERS[-1])
         before, moved, nonsmooth = math.nan, False, False
-        for power in range(low, MOST + 1):
+        for power in range(low, MAX_POWER + 1):
             if not (one := ladder(power)):
                 continue
             if not math.isnan(best := one.best(least)):

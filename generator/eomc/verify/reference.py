@@ -114,16 +114,16 @@ class Reference(ABC):
         qd: ArrayLike,
         t: ArrayLike = 0.0,
         params: Params = None,
-        held: tuple[int, ...] = (),
+        fixed: tuple[int, ...] = (),
         nearest: bool = True,
     ) -> tuple[Vector, Vector]:
-        """q and qd put onto the constraints, by Newton's method in the metric of D, to rounding.
+        """Project q and qd onto the constraints, by Newton's method in the metric of D.
 
-        held: coordinates that stay, with their rates. nearest: q is the nearest one in that metric;
-        otherwise each correction is the least. nan where none is found.
+        fixed: coordinates that do not change, nor their velocities. nearest: return the nearest q in
+        that metric; otherwise each correction is minimal. nan without convergence.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        project_one = partial(self._project_state, fixed=held, nearest=nearest)
+        project_one = partial(self._project_state, fixed=fixed, nearest=nearest)
         return self._map_states(project_one, q, qd, np.asarray(t, float), self._values(params))
 
     def corrected(

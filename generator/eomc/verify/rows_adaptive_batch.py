@@ -23,7 +23,7 @@ from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State, simulate
 
 COUNT = 19  # instances: more than twice what any register holds
-FEW = 4  # singular states
+SINGULAR_STATE_COUNT = 4  # singular states
 STEPS = 4  # of a run that is compared with that of one alone
 TOLERANCE, MAX_STEP_FRACTION = {8: 1e-12, 4: 1e-6}, 0.3  # by bytes of a number; h_most, of a run
 LIMIT, UNIT = 1.0, "tolerances a step"
@@ -192,7 +192,7 @@ class BatchRows:
         """Return the number of instances that do not refuse, or that disturb others."""
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
-        known = self.singular[:: max(1, len(self.singular) // FEW)]
+        known = self.singular[:: max(1, len(self.singular) // SINGULAR_STATE_COUNT)]
         odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]
         result, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
         wrong = sum(_differ(result[k + len(odd)], expected[k]) for k in range(len(rest)))

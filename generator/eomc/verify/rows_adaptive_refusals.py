@@ -17,7 +17,7 @@ from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals, with_nonf
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State
 
-FEW, MAX_STEPS = 8, 40  # states; steps of a run
+SINGULAR_STATE_COUNT, MAX_STEPS = 8, 40  # states; steps of a run
 PARTS = 7  # steps of a span in which one would do
 COARSE_TOLERANCE = 1e-3  # tolerance
 TURNS = 1e7  # rad: sines of several angles at once come to their limit before
@@ -80,7 +80,9 @@ class _Adaptive:
         """From where D is singular, or numbers are none, or too large for a step."""
         h, tol = self.check.system.run.h, COARSE_TOLERANCE
         wrong = 0
-        for s in self.refusals.singular[:: max(1, len(self.refusals.singular) // FEW)]:
+        for s in self.refusals.singular[
+            :: max(1, len(self.refusals.singular) // SINGULAR_STATE_COUNT)
+        ]:
             for stiff in (False, True):
                 run = self.drive(s, 10 * h, tol, stiff=stiff)
                 wrong += not (run.refuses_cleanly and run.status == SINGULAR)

@@ -22,7 +22,7 @@ from eomc.verify.rows_runs import EVERY, LONG, TURNS, RunResult, Runs, run_in_c
 from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
-FEW = (1, 3, 9)  # the first so many of them, alone
+SUBSET_SIZES = (1, 3, 9)  # the first so many of them, alone
 STEPS = 7
 ALIKE = 1e3  # units between a batch and single runs
 ROUNDED = 10.0  # times what roundings of the start make of a row that has no digits
@@ -146,7 +146,7 @@ class Batches:
         for u in self.tables():
             whole = self.simulate(method, self.instances, u)
             order = self.random.permutation(COUNT)
-            parts = [order, *(order[:n] for n in FEW)]
+            parts = [order, *(order[:n] for n in SUBSET_SIZES)]
             for part in parts:
                 other = self.simulate(
                     method, [self.instances[k] for k in part], None if u is None else u[part]

@@ -28,7 +28,10 @@ FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
 MIXED = 60  # changes of all parameters at random
 SINGLE_SIGN_CHANGES = 8  # changes of all at random, of which one alone is negative
 SPREAD = 3.0  # of their logarithms
-MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
+MAX_STATES, MAX_STATES_IF_LARGE = (
+    1200,
+    240,
+)  # states that the reference is asked for; where it takes long
 PRECISION_LOSS = (
     1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
 )
@@ -177,7 +180,7 @@ class Refusals:
             })  # fmt: skip
         for change in changes:
             suspects_ += [replace(s, params={**self.defaults, **change}) for s in states]
-        most = FEWER if self.check.large else MOST
+        most = MAX_STATES_IF_LARGE if self.check.large else MAX_STATES
         order = self.random.permutation(len(suspects_))[:most]
         return [suspects_[k] for k in sorted(order)]
 

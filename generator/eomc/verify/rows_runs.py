@@ -33,14 +33,17 @@ EVERY = 3  # no divisor of STEPS
 LONG = (0.02, 0.2, 0.7)
 TURNED = 0.3  # radians: where a polynomial for rotations by 2^-6 is off by millions of roundings
 # radians: nearly the most that sines are rotated by, at half of a step and from there on
-ROTATED, ON = 0.11, 0.012
+ANGLE_PER_STEP, VELOCITY_PER_STEP = 0.11, 0.012
 SHORT = 2.0**-14  # radians: of steps whose angles are predicted
 SPEEDS = (0.1, 1.0, 4.0)  # times a state's own: at which the one or the other is what bounds a step
 LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
 ANGLES = 48  # around the circle, at which sines are looked at
 SHORT_LIMIT = 20.0  # units; wrong terms of predicted sines make hundreds
 SINES = 20.0  # units; their last terms make hundreds
-FEW, FEWER = 6, 3  # long steps, or steps with a row of u each; where the reference takes long
+LONG_STEP_COUNT, LONG_STEP_COUNT_IF_LARGE = (
+    6,
+    3,
+)  # long steps, or steps with a row of u each; where the reference takes long
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FARTHEST_ANGLE = 2.0**26  # radians: beyond it roundings of an angle hide all else
@@ -128,7 +131,7 @@ class Runs:
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
         self.starts = check.few(2)
         self.states = [e.state for e in self.starts]
-        self.few = FEWER if check.large else FEW
+        self.few = LONG_STEP_COUNT_IF_LARGE if check.large else LONG_STEP_COUNT
         faster = [
             self.sampler.project(replace(s, qd=k * s.qd)) for s in self.states for k in SPEEDS
         ]
@@ -200,7 +203,9 @@ class Runs:
                 *(self.large_step(e.state, part) for part in some),
             )
         ]
-        pairs += [(e, self.turning_step(e.state, ON, ROTATED)) for e in self.turning]
+        pairs += [
+            (e, self.turning_step(e.state, VELOCITY_PER_STEP, ANGLE_PER_STEP)) for e in self.turning
+        ]
         errors = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
         return largest(errors, "a difference grows too much in one long step")
 
@@ -335,17 +340,17 @@ class Runs:
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
             scale = np.where(signals > 0, signals, 1)
-            u = self.random.normal(size=(FEW, self.model.nu)) * scale
+            u = self.random.normal(size=(LONG_STEP_COUNT, self.model.nu)) * scale
             at = replace(s, u=u)
             n, x, growth = self.driven(s, u, spread)
-            run = run_in_c(self.model, self.check.methods[0], at, self.h, FEW)
+            run = run_in_c(self.model, self.check.methods[0], at, self.h, LONG_STEP_COUNT)
             size = np.abs(np.array([s.q, s.qd])) + np.abs(x)
-            size = FEW * (size + growth * spread)
+            size = LONG_STEP_COUNT * (size + growth * spread)
             errors.append(self.check.units(run.rows[:, n], x, size) if n else None)
             if np.all(np.isfinite(run.rows)):
                 again = self.check.module.simulate(
-                    s.q, s.qd, self.h, steps=FEW, u=u.astype(self.model.dtype), params=s.params,
-                    t0=s.t,
+                    s.q, s.qd, self.h, steps=LONG_STEP_COUNT, u=u.astype(self.model.dtype),
+                    params=s.params, t0=s.t,
                 )  # fmt: skip
                 same = np.array_equal([again.q, again.qd], run.rows)
                 errors += [] if same else [math.inf]

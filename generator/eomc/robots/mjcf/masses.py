@@ -221,10 +221,10 @@ MASSLESS = ("plane", "hfield")
 FORMLESS = ("mesh", "sdf")  # their shape is in a separate file
 
 
-def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
+def _geom_mass(placed: Placed, reader: Reader, is_static: bool) -> Mass | None:
     """Return the mass of a geom in its body's frame; None if it has none, or after a fault.
 
-    still: the body doesn't move, so that its mass has no effect.
+    is_static: the body doesn't move, so that its mass has no effect.
     """
     a = reader.attributes_with_defaults(placed, "geom")
     kind = a.choice("type", (*SHAPES, *MASSLESS, *FORMLESS))
@@ -240,7 +240,7 @@ def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
         return None
     shell = a.is_true("shellinertia")
     if kind in FORMLESS or "mesh" in a:
-        if still and reader.settings.totalmass <= 0:
+        if is_static and reader.settings.totalmass <= 0:
             reader.report.leave(
                 "masses of meshes (not opened) on bodies that stand still, taken as zero",
                 placed.body,
@@ -340,10 +340,10 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
     return Mass(mass, ORIGIN, inertia).in_frame(placed.pose.compose(pose))
 
 
-def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) -> Mass:
+def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, is_static: bool) -> Mass:
     """Return the mass of a body in its frame, from <inertial> or from its geoms.
 
-    still: the body doesn't move.
+    is_static: the body doesn't move.
     """
     how = reader.settings.inertia
     inertials = [p for p in inner if p.tag.kind == "inertial"]
@@ -352,7 +352,7 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) ->
         reader.own_attributes(placed.tag).fault(f"{placed.body} has a second <inertial>; leave one")
     mass = Mass()
     if how == "true" or (how == "auto" and not inertials):
-        mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, still)) is not None])
+        mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, is_static)) is not None])
     if inertials and mass.mass < LEAST_MASS:  # of geoms, which then leave <inertial> as it is
         mass, tag = _inertial(inertials[0], reader) or Mass(), inertials[0].tag
     return _bounded(mass, reader.own_attributes(tag), reader.settings)

@@ -165,7 +165,7 @@ def _bodies(
 
     count = 0
     while waiting:
-        placed, still = waiting.pop()
+        placed, is_static = waiting.pop()
         tag, parent, a = placed.tag, placed.body, reader.own_attributes(placed.tag)
         count += 1
         name = called(tag, "body", f"body{count}")
@@ -187,9 +187,9 @@ def _bodies(
         for p in inner:
             if p.tag.kind == "geom":
                 _geom_left_out(p, reader)
-        mass = masses.body_mass(tag, inner, reader, still and not own)
-        chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
-        if own or not still:
+        mass = masses.body_mass(tag, inner, reader, is_static and not own)
+        chain, own, anchor = _chain(name, parent, is_static, pose, own, mass, names["body"], report)
+        if own or not is_static:
             passive = not {"spring", "damper"} <= settings.disabled  # as MuJoCo has it
             lifted = a.number("gravcomp")
             chain[-1] = replace(chain[-1], lifted=lifted if passive else 0.0)
@@ -199,7 +199,7 @@ def _bodies(
         joints += own
         back = Pose(scaled(anchor, -1.0), IDENTITY)
         waiting += [
-            (p._replace(pose=back.compose(p.pose)), still and not own)
+            (p._replace(pose=back.compose(p.pose)), is_static and not own)
             for p in reversed(inner)
             if p.tag.kind == "body"
         ]
@@ -237,7 +237,7 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
 def _chain(
     name: str,
     parent: str,
-    still: bool,
+    is_static: bool,
     pose: Pose,
     joints: Sequence[MjcfJoint],
     mass: Mass,
@@ -246,8 +246,8 @@ def _chain(
 ) -> tuple[list[RobotBody], list[MjcfJoint], Vector]:
     """Return the chain of bodies for one <body>, one for each joint; the last has the mass.
 
-    still: the parent doesn't move. pose: of the body in the parent. The third value is the origin
-    of the last body's frame, the anchor of the last joint, in the frame of <body>.
+    is_static: the parent doesn't move. pose: of the body in the parent. The third value is the
+    origin of the last body's frame, the anchor of the last joint, in the frame of <body>.
     """
     if not joints:
         only = RobotBody(name, parent, offset=pose.place, rotation=pose.turn)
@@ -275,7 +275,7 @@ def _chain(
         )
         anchor = joint.anchor
         # as an inertia of the body it is exact where what carries the joint does not turn
-        if joint.armature and not (still and all(j.type == "slide" for j in joints[:i])):
+        if joint.armature and not (is_static and all(j.type == "slide" for j in joints[:i])):
             report.leave(
                 "exact armature of ball joints: here it acts on each of the three angles, "
                 "which is the same near zero angles only",
