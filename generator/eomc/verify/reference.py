@@ -119,7 +119,7 @@ class Reference(ABC):
     ) -> tuple[Vector, Vector]:
         """Project q and qd onto the constraints, by Newton's method in the metric of D.
 
-        fixed: coordinates that do not change, nor their velocities. nearest: return the nearest q in
+        fixed: coordinates that keep position and velocity. nearest: return the nearest q in
         that metric; otherwise each correction is minimal. nan without convergence.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
