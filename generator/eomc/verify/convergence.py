@@ -40,7 +40,6 @@ COUNTS = (6, 12, 24, 48, 96)  # steps of a span
 FIRST_SPANS = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
 # log2 of spans over 48 h, down to where all differences are rounding error
 START_POWERS = (-2, -4, -7, -10, -14, -20)
-MAX_POWER = 8  # log2 of the longest span over 48 h
 BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
 NEARBY_FACTORS = (
     1 - 1e-3,
@@ -182,7 +181,7 @@ class Convergence:
                 return best
         low = next((k for k in START_POWERS if (one := ladder(k)) and one.exact), START_POWERS[-1])
         before, moved, nonsmooth = math.nan, False, False
-        for power in range(low, MAX_POWER + 1):
+        for power in range(low, 9):  # spans up to 2^8 times 48 h
             if not (one := ladder(power)):
                 continue
             if not math.isnan(best := one.best(least)):
