@@ -252,7 +252,7 @@ def test_a_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -
     )
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.decode().split(">")[0] == "<Run of cartpole: 5 steps of 0.005 s"
-    assert "cartpole.status 4.0 (6,)" in done.stdout.decode()
+    assert "cartpole._runtime.status 4.0 (6,)" in done.stdout.decode()
 
 
 @pytest.mark.slow
