@@ -1,6 +1,6 @@
 /*
  * What FMI 2.0 and 3.0 say alike, for both: FMI(name) is fmi2name or fmi3name, FMI_STATE(a, b) the
- * name of a function of states. Included behind Instance and said(). Written by hand.
+ * name of a function of states. Included after Instance and log_message(). Written by hand.
  */
 
 static FMI(Status) outcome(Instance *a, UnitResult result)
@@ -8,10 +8,10 @@ static FMI(Status) outcome(Instance *a, UnitResult result)
     if (result == unitOk)
         return FMI(OK);
     if (result == unitImpossible) {
-        said(a, FMI(Discard), "logStatusDiscard", a->unit.said);
+        log_message(a, FMI(Discard), "logStatusDiscard", a->unit.message);
         return FMI(Discard);
     }
-    said(a, FMI(Error), "logStatusError", a->unit.said);
+    log_message(a, FMI(Error), "logStatusError", a->unit.message);
     return FMI(Error);
 }
 
@@ -20,18 +20,19 @@ static FMI(Status) refused(Instance *a, const char *text)
     return outcome(a, unitSay(&a->unit, unitRefused, text));
 }
 
-static void happened(void *instance, const char *text)
+static void log_event(void *instance, const char *text)
 {
     const Instance *const a = instance;
 
-    said(a, FMI(OK), "logEvents", text);
+    log_message(a, FMI(OK), "logEvents", text);
 }
 
 static FMI(Status) enter(Instance *a, UnitMode from, UnitMode to, const char *call)
 {
     if (a->unit.x.mode != from) {
         snprintf(
-            a->unit.said, sizeof a->unit.said, "%s is not for the mode that the unit is in", call);
+            a->unit.message, sizeof a->unit.message, "%s is not for the mode that the unit is in",
+            call);
         return outcome(a, unitRefused);
     }
     a->unit.x.mode = to;
@@ -69,14 +70,14 @@ FMI(Status) FMI(ExitInitializationMode)(FMI_INSTANCE instance)
 
     if (status == FMI(OK)) {
         Unit *const x = &a->unit.x;
-        int found = 0;
+        int status = 0;
 
-        for (int i = 0; i < unitNQ && !found; i++)
-            found = x->q[i] - x->q[i] == 0 && x->qd[i] - x->qd[i] == 0 ? 0 : 2;
-        if (!found)
-            found = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
-        if (found)
-            return outcome(a, unitFailed(&a->unit, found));
+        for (int i = 0; i < unitNQ && !status; i++)
+            status = x->q[i] - x->q[i] == 0 && x->qd[i] - x->qd[i] == 0 ? 0 : 2;
+        if (!status)
+            status = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
+        if (status)
+            return outcome(a, unitFailed(&a->unit, status));
         (void)unitCrossed(x);
     }
     return status;

@@ -19,7 +19,7 @@ typedef struct {
 } Instance;
 
 /* text: without a '%', since loggers take it for a format. */
-static void said(const Instance *a, fmi2Status status, const char *category, const char *text)
+static void log_message(const Instance *a, fmi2Status status, const char *category, const char *text)
 {
     if (a->callbacks.logger && (status == fmi2OK ? a->events : a->errors))
         a->callbacks.logger(a->callbacks.componentEnvironment, a->name, status, category, text);
@@ -27,7 +27,7 @@ static void said(const Instance *a, fmi2Status status, const char *category, con
 
 #define FMI(name) fmi2##name
 #define FMI_TEXT(name) "fmi2" #name
-#define FMI_STATE(before, behind) fmi2##before##FMUstate##behind
+#define FMI_STATE(prefix, suffix) fmi2##prefix##FMUstate##suffix
 #define FMI_DESERIALIZE fmi2DeSerializeFMUstate
 #define FMI_INSTANCE fmi2Component
 #include "both.h"
@@ -187,7 +187,7 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *fmi2eventInfo)
 {
     Instance *const a = c;
     int jumped = 0;
-    const UnitResult result = unitHappen(&a->unit, &jumped, happened, a);
+    const UnitResult result = unitHappen(&a->unit, &jumped, log_event, a);
 
     memset(fmi2eventInfo, 0, sizeof *fmi2eventInfo);
     fmi2eventInfo->terminateSimulation = a->unit.x.stopped != 0;
@@ -223,7 +223,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint,
 {
     Instance *const a = c;
     const UnitResult result =
-        unitCommunicate(&a->unit, currentCommunicationPoint, communicationStepSize, happened, a);
+        unitCommunicate(&a->unit, currentCommunicationPoint, communicationStepSize, log_event, a);
 
     (void)noSetFMUStatePriorToCurrentPoint;
     return result == unitOk && a->unit.x.stopped ? fmi2Discard : outcome(a, result);

@@ -10,7 +10,7 @@ typedef struct {
     bool errors, events; /* which messages are wanted */
 } Instance;
 
-static void said(const Instance *a, fmi3Status status, const char *category, const char *text)
+static void log_message(const Instance *a, fmi3Status status, const char *category, const char *text)
 {
     if (a->log && (status == fmi3OK ? a->events : a->errors))
         a->log(a->environment, status, category, text);
@@ -18,7 +18,7 @@ static void said(const Instance *a, fmi3Status status, const char *category, con
 
 #define FMI(name) fmi3##name
 #define FMI_TEXT(name) "fmi3" #name
-#define FMI_STATE(before, behind) fmi3##before##FMUState##behind
+#define FMI_STATE(prefix, suffix) fmi3##prefix##FMUState##suffix
 #define FMI_DESERIALIZE fmi3DeserializeFMUState
 #define FMI_INSTANCE fmi3Instance
 #include "both.h"
@@ -30,7 +30,7 @@ const char *fmi3GetVersion(void)
     return fmi3Version;
 }
 
-static fmi3Instance made(fmi3String token, fmi3Boolean loggingOn,
+static fmi3Instance instantiate(fmi3String token, fmi3Boolean loggingOn,
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, int exchange)
 {
     Instance *a;
@@ -67,7 +67,7 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String in
     fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage)
 {
     (void)instanceName, (void)resourcePath, (void)visible;
-    return made(instantiationToken, loggingOn, instanceEnvironment, logMessage, 1);
+    return instantiate(instantiationToken, loggingOn, instanceEnvironment, logMessage, 1);
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken,
@@ -85,7 +85,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
                 "there are no intermediate variables");
         return NULL;
     }
-    return made(instantiationToken, loggingOn, instanceEnvironment, logMessage, 0);
+    return instantiate(instantiationToken, loggingOn, instanceEnvironment, logMessage, 0);
 }
 
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName,
@@ -297,7 +297,7 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discrete
 {
     Instance *const a = instance;
     int jumped = 0;
-    const UnitResult result = unitHappen(&a->unit, &jumped, happened, a);
+    const UnitResult result = unitHappen(&a->unit, &jumped, log_event, a);
 
     *discreteStatesNeedUpdate = *nominalsOfContinuousStatesChanged = *nextEventTimeDefined = false;
     *nextEventTime = 0;
@@ -391,7 +391,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
 {
     Instance *const a = instance;
     const UnitResult result =
-        unitCommunicate(&a->unit, currentCommunicationPoint, communicationStepSize, happened, a);
+        unitCommunicate(&a->unit, currentCommunicationPoint, communicationStepSize, log_event, a);
 
     (void)noSetFMUStatePriorToCurrentPoint;
     *eventHandlingNeeded = false;

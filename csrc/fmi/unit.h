@@ -62,10 +62,10 @@ typedef struct {
 
 typedef struct {
     Unit x;
-    char said[240]; /* the last message */
+    char message[240]; /* the last message */
 } UnitInstance;
 
-typedef void (*UnitTold)(void *who, const char *text); /* is called with each event */
+typedef void (*UnitEventCallback)(void *who, const char *text); /* is called with each event */
 
 /* The state of a unit that has just been made. */
 static void unitReset(Unit *x, int exchange)
@@ -82,7 +82,7 @@ static void unitReset(Unit *x, int exchange)
 
 static UnitResult unitSay(UnitInstance *a, UnitResult result, const char *text)
 {
-    snprintf(a->said, sizeof a->said, "at t = %.9g s: %s", a->x.t, text);
+    snprintf(a->message, sizeof a->message, "at t = %.9g s: %s", a->x.t, text);
     return result;
 }
 
@@ -181,7 +181,7 @@ static UnitResult unitGet(UnitInstance *a, unsigned reference, UnitValues *v, do
         v->indicators = 1;
         *value = (double)v->z[r - unitZ];
     } else {
-        snprintf(a->said, sizeof a->said, "there is no real variable of the value reference %u",
+        snprintf(a->message, sizeof a->message, "there is no real variable of the value reference %u",
             reference);
         return unitRefused;
     }
@@ -199,7 +199,7 @@ static UnitResult unitSet(UnitInstance *a, unsigned reference, double value)
     const int free = x->exchange || x->mode == unitNew || x->mode == unitStarting;
 
     if (!(number - number == 0)) {
-        snprintf(a->said, sizeof a->said,
+        snprintf(a->message, sizeof a->message,
             "the variable of the value reference %u can't be set to %g", reference, value);
         return unitRefused;
     }
@@ -216,7 +216,7 @@ static UnitResult unitSet(UnitInstance *a, unsigned reference, double value)
         *(r < unitQd ? &x->q[r - unitQ] : &x->qd[r - unitQd]) = number;
         x->own[r - unitQ] = 1;
     } else {
-        snprintf(a->said, sizeof a->said,
+        snprintf(a->message, sizeof a->message,
             "the variable of the value reference %u is calculated and can't be set", reference);
         return unitRefused;
     }
@@ -299,11 +299,11 @@ static int unitCrossed(Unit *x)
  * What a jump changes counts for those after it; where it carries an indicator over zero that is none.
  * jumped: whether the state has changed.
  */
-static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitTold told, void *who)
+static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitEventCallback report, void *who)
 {
     Unit *const x = &a->x;
     char text[160];
-    unitReal z[unitNE + 1], after[unitNE*unitNX + 1], behind[unitNE + 1];
+    unitReal z[unitNE + 1], after[unitNE*unitNX + 1], indicators[unitNE + 1];
 
     *jumped = 0;
     unitIndicate(x, z);
@@ -316,7 +316,7 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitTold told, void *
         if (unitDirection(k)*side > 0) /* the other way */
             continue;
         snprintf(text, sizeof text, "event '%s' at t = %.12g s", unitEventName(k), x->t);
-        told(who, text);
+        report(who, text);
         if (unitAction(k) == 1)
             x->stopped = k + 1;
         if (unitAction(k) != 2)
@@ -324,7 +324,7 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitTold told, void *
         unitJumps(after, x->q, x->qd, (unitReal)x->t, unitInputs(x), &x->p);
         for (int i = 0; i < unitNX; i++)
             if (!(after[unitNX*k + i] - after[unitNX*k + i] == 0)) {
-                snprintf(a->said, sizeof a->said,
+                snprintf(a->message, sizeof a->message,
                     "at t = %.9g s: event '%s' jumps to no finite state", x->t, unitEventName(k));
                 return unitImpossible;
             }
@@ -333,17 +333,17 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitTold told, void *
             x->qd[i] = after[unitNX*k + unitNQ + i];
         }
         *jumped = 1;
-        unitIndicate(x, behind);
+        unitIndicate(x, indicators);
         for (int i = 0; i < unitNE; i++) {
-            const double change = fabs((double)(behind[i] - z[i]));
-            const double size = fabs((double)behind[i]) + fabs((double)z[i]);
+            const double change = fabs((double)(indicators[i] - z[i]));
+            const double size = fabs((double)indicators[i]) + fabs((double)z[i]);
 
             if (change > 1e-10*size) {
-                x->side[i] = unitSign(behind[i] + x->zero[i]);
+                x->side[i] = unitSign(indicators[i] + x->zero[i]);
                 x->zero[i] = 0;
             } else if (i == k) { /* at its zero, which it leaves */
                 x->side[k] = 0;
-                x->zero[k] += behind[k];
+                x->zero[k] += indicators[k];
             }
         }
         unitIndicate(x, z);
@@ -356,24 +356,24 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitTold told, void *
 #if unitAdaptive
 
 /* To t_end, or to where an event stops the motion. */
-static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitTold told, void *who)
+static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback report, void *who)
 {
     Unit *const x = &a->x;
 
     for (int calls = 0; x->t < t_end && !x->stopped; calls++) {
         unitReal t = (unitReal)x->t, when[unitRoom];
         int which[unitRoom];
-        long found = 0;
+        long count = 0;
         const int status = unitAdapt(x->q, x->qd, &t, (unitReal)t_end, (unitReal)x->tolerance,
-            unitInputs(x), &found, which, when, &x->p, &x->memory);
+            unitInputs(x), &count, which, when, &x->p, &x->memory);
 
         x->t = t < (unitReal)t_end ? (double)t : t_end;
-        for (long n = 0; n < found; n++) {
+        for (long n = 0; n < count; n++) {
             char text[160];
 
             snprintf(text, sizeof text, "event '%s' at t = %.12g s", unitEventName(which[n]),
                 (double)when[n]);
-            told(who, text);
+            report(who, text);
         }
         if (status)
             return unitFailed(a, status);
@@ -391,7 +391,7 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitTold told, void
  * To t_end: by whole steps of the scene's size from origin on, as a run of the scene makes them, and by
  * a shorter one where t_end lies between two of these; the next steps then begin there.
  */
-static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitTold told, void *who)
+static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback report, void *who)
 {
     Unit *const x = &a->x;
     const double h = unitStep, slack = 1e-9*h + 4*2.3e-16*(fabs(t_end) + fabs(x->origin));
@@ -399,15 +399,15 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitTold told, void
     double rest;
     int status = 0;
 
-    (void)told, (void)who;
+    (void)report, (void)who;
     if (whole > 1e9)
         return unitSay(
             a, unitRefused, "a communication step has more than 1e9 steps of the scene's size");
     if (whole > 0) {
-        const long done = unitRun(x->q, x->qd, (unitReal)x->origin, x->steps, (long)whole,
+        const long completed = unitRun(x->q, x->qd, (unitReal)x->origin, x->steps, (long)whole,
             unitInputs(x), &x->p, &x->memory, &status);
 
-        x->steps += done;
+        x->steps += completed;
         x->t = x->origin + (double)x->steps*h;
         if (status)
             return unitFailed(a, status);
@@ -429,7 +429,7 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitTold told, void
 #endif
 
 /* A communication step. */
-static UnitResult unitCommunicate(UnitInstance *a, double t, double size, UnitTold told, void *who)
+static UnitResult unitCommunicate(UnitInstance *a, double t, double size, UnitEventCallback report, void *who)
 {
     const Unit *const x = &a->x;
 
@@ -439,7 +439,7 @@ static UnitResult unitCommunicate(UnitInstance *a, double t, double size, UnitTo
         return unitSay(a, unitRefused, "a communication step has a size of zero or more");
     if (!(fabs(t - x->t) <= 1e-9*(fabs(t) + size)) && !x->stopped)
         return unitSay(a, unitRefused, "a communication step begins where the last one ended");
-    return unitAdvance(a, t + size, told, who);
+    return unitAdvance(a, t + size, report, who);
 }
 
 /* --- derivatives -------------------------------------------------------------------------------- */

@@ -86,7 +86,7 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     # steps towards a singular place, and too long for sweeps: tests/runtime/test_adaptive*.py
     ends = ("if (!cut && 16*h <=", "fifth*fifth*change >", "if (memory->max_evaluations &&")
     # the nearest position, at a position where the same matrix has been regular before
-    ends += (f"if (!{name}_least_change(d, D, A, residual, held, HOLONOMIC))\n",)
+    ends += (f"if (!{name}_least_change(d, D, A, residual, fixed, HOLONOMIC))\n",)
     # the iteration for it diverges, and the projection stands: tests/emit/test_projection.py
     ends += ("if (64*part < 1)",)
     text = source.splitlines(keepends=True)

@@ -346,7 +346,7 @@ def run(
     )
 
     def projected(**state: str) -> str:
-        return functions.public.project.call(held="0", **state) if form.project else ""
+        return functions.public.project.call(fixed="0", **state) if form.project else ""
 
     return AdaptiveRun(
         **functions.names,
@@ -401,7 +401,8 @@ def call_for_instance(functions: Functions) -> str:
     rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
     return functions.public.adaptive(METHOD.name).call(
         q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", t="t + k", u="u ? u + u_instance*k : 0",
-        times="times ? times + kept[k] : 0", count="row_count - kept[k]", t_rows="0", **rows,
+        times="times ? times + row_counts[k] : 0", count="row_count - row_counts[k]",
+        t_rows="0", **rows,
         events="events ? events + k : 0", which="which ? which + room*k : 0",
         event_rows=f"which ? event_rows + (1 + 2*{NQ})*room*k : 0", p="p + p_instance*k",
         memory="memory + k", status="&result",

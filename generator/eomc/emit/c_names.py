@@ -21,7 +21,7 @@ from eomc.program.program import TIME, Program
 # Names that templates use inside functions; a scene's name among them gets a trailing "_".
 RESERVED_NAMES = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
-    "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
+    "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed fixed at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
     "accelerations jacobians forces wrenches momentum events after phi rates lambda reactions "
     "d far total singular A".split()

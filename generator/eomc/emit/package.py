@@ -140,14 +140,14 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
             public.run(name).call(
                 u="u ? u + first*u_stride : u", q_rows=f"q_rows + {NQ}*(row + 1)",
                 qd_rows=f"qd_rows + {NQ}*(row + 1)", p=p, memory=memory,
-                status="&found",
+                status="&result",
             ),
             public.batch(name).call(
                 count="many", q=f"q + {NQ}*base", qd=f"qd + {NQ}*base", t0="t[t_instance*base]",
                 u="u ? u + u_instance*base : u",
                 q_rows=f"q_rows ? q_rows + {NQ}*row_count*base : q_rows",
                 qd_rows=f"qd_rows ? qd_rows + {NQ}*row_count*base : qd_rows",
-                p=f"{p} + p_instance*base", done="done + base", status="status + base",
+                p=f"{p} + p_instance*base", completed="completed + base", status="status + base",
             ),
             *(_derivative(target, name) if target.system.run.discretize else ("", "", "")),
         )
@@ -161,7 +161,7 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
         return None
     run = Public(target).adaptive(adaptive.METHOD.name)
     call = run.call(
-        q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target), status="&found",
+        q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target), status="&result",
         memory=f"&{member('work', 'memory')}", events=f"&{member('work', 'events')}",
     )  # fmt: skip
     many = Public(target).adaptive_batch(adaptive.METHOD.name).call(p=_parameters(target))

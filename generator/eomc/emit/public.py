@@ -85,8 +85,8 @@ class Public:
         """The function that projects a state onto the constraints, which returns a status."""
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
         t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
-        held = given("int", "held")
-        return self._status("project", *self._state, *t, held, *self.arguments("p"))
+        fixed = given("int", "fixed")
+        return self._status("project", *self._state, *t, fixed, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
         """Return the function for one step, which overwrites the state."""
@@ -138,7 +138,7 @@ class Public:
                 *self.arguments("u"), *(strides[:2] if target.system.inputs else []),
                 *self._row_output, CArgument("long", "row_count"), *self.arguments("p"),
                 *(strides[2:] if target.needs_p else []),
-                CArgument("long *", "done"), CArgument("int *", "status"),
+                CArgument("long *", "completed"), CArgument("int *", "status"),
             ),
         )  # fmt: skip
 
@@ -175,7 +175,7 @@ class Public:
                 *(filled(real, f"{n}_rows") for n in STATE),
                 *(self.adaptive_events if target.system.events else ()), *self.arguments("p"),
                 *(strides[1:] if target.needs_p else []),
-                CArgument(f"{name}_memory *", "memory"), CArgument("long *", "kept"),
+                CArgument(f"{name}_memory *", "memory"), CArgument("long *", "row_counts"),
                 CArgument("int *", "status"),
             ),
         )  # fmt: skip

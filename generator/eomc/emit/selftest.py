@@ -465,7 +465,7 @@ class _Made:
         run = self.system.run
         if self.system.constraints:
             f = self.public.project
-            call = self.call(f, q="out", qd="out + NQ", held="NULL")
+            call = self.call(f, q="out", qd="out + NQ", fixed="NULL")
             cases = [self.case(p, self.projection, ITERATED[self.double]) for p in self.starts]
             yield self.written("project", "moved", call, cases)
         short = self.is_short
@@ -559,7 +559,7 @@ class _Made:
         return self.call(
             self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
             steps=str(STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
-            qd_rows="NULL", row_count="0", p_instance="0", done="done", status="status",
+            qd_rows="NULL", row_count="0", p_instance="0", completed="completed", status="status",
         )  # fmt: skip
 
     def adaptive_call(self) -> str:

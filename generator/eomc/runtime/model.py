@@ -264,7 +264,7 @@ class Model(Stepping):
                 if not law:
                     chunk = next_chunk(count, perf_counter() - start_time)
         except KeyboardInterrupt:
-            done, status = work.done if work else done, "interrupted"
+            done, status = work.completed if work else done, "interrupted"
             if not done:
                 q_rows[0], qd_rows[0] = q, qd
         if done < steps:

@@ -199,7 +199,7 @@ class _IntervalStepper:
 
     @property
     def completed(self) -> int:
-        return int(self.work.done)
+        return int(self.work.completed)
 
     @property
     def evaluations(self) -> int:

@@ -99,7 +99,7 @@ def run_in_c(
             row[0] += moved * (1 + abs(row[0]))  # also where it has been thrown far out
         if fresh_memory and steps_done:
             work = model._ffi.new(work_type)
-            work.done = steps_done
+            work.completed = steps_done
         code = run(
             model._pointer(rows[0]), model._pointer(rows[1]), model._pointer(q),
             model._pointer(qd), s.t, h, end - steps_done, model._pointer(u), stride, every,

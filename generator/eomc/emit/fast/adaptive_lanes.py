@@ -36,6 +36,6 @@ def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
         store_row=adaptive.row_storage(stepping).call(q="s.q", qd="s.qd"),
         look=stepping.interpolate.call(
             q_at="q_row", qd_at="qd_row", x="&s", u="input", memory="memory + k",
-            z="(times[kept[k]] - s.from - s.from_rest)/s.size",
+            z="(times[row_counts[k]] - s.from - s.from_rest)/s.size",
         ),
     )  # fmt: skip

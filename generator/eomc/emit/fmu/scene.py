@@ -26,7 +26,7 @@ def view(target: Target, token: str) -> SceneCalls:
     s, public = target.system, Public(target)
     by_tolerance = s.run.tolerance is not None
     method, rows = s.run.methods[0], s.coordinates if s.constraints else ()
-    asked = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
+    calls = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
     start_lines, starts = _starts(target)
     kept = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
     return SceneCalls(
@@ -46,15 +46,17 @@ def view(target: Target, token: str) -> SceneCalls:
             SceneEvent(e.name, DIRECTIONS[e.direction], ACTIONS.index(e.action)) for e in s.events
         ),
         feedback=target.signal_state,
-        solved=bool(asked["outputs"]) and takes_qdd(target, "outputs"),
+        solved=bool(calls["outputs"]) and takes_qdd(target, "outputs"),
         acceleration=public.acceleration.call(),
         signal=_called(target, "signal"),
-        outputs=asked["outputs"],
-        energies=tuple(asked[name] for name in ENERGIES),
-        values=asked["events"],
-        jumps=asked["jumps"],
+        outputs=calls["outputs"],
+        energies=tuple(calls[name] for name in ENERGIES),
+        values=calls["events"],
+        jumps=calls["jumps"],
         project=public.project.call() if s.constraints else "",
-        held=tuple(int(x) for x in (*(c.start_fixed for c in rows), *(c.rate_fixed for c in rows))),
+        fixed=tuple(
+            int(x) for x in (*(c.start_fixed for c in rows), *(c.rate_fixed for c in rows))
+        ),
         run="" if by_tolerance else public.run(method).call(
             h="(unitReal)unitStep", u_stride="0", every="0", q_rows="NULL", qd_rows="NULL",
             status="&status",

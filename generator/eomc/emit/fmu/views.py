@@ -35,7 +35,7 @@ class Start:
 class SceneCalls:
     """fmu/scene.h.jinja. inputs: their starts; from acceleration on calls, "" for none.
 
-    project: onto constraints; held: whether each of q and qd stays there as it is. run, step: of
+    project: onto constraints; fixed: whether each of q and qd stays there as it is. run, step: of
     steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved,
     slopes_solved: whether outputs, and their derivatives, read accelerations. feedback,
     signals_of_parameters: whether signals depend on the state, on parameters. starts: of states
@@ -65,7 +65,7 @@ class SceneCalls:
     values: str
     jumps: str
     project: str
-    held: tuple[int, ...]
+    fixed: tuple[int, ...]
     run: str
     step: str
     adaptive: str

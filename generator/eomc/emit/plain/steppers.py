@@ -124,7 +124,7 @@ def header(
             adaptive.steps_in_parallel(target),
             plain.public.fixed_type if s.events else None,
         ) if s.run.tolerance else None,
-        busy=adaptive.max_events_per_step(s),
+        max_events=adaptive.max_events_per_step(s),
     )  # fmt: skip
 
 

@@ -38,12 +38,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """A method in the header: step, run, batch and derivative. kept: the size of its workspace."""
+    """A method in the header: step, run, batch and derivative. workspace: its length."""
 
     name: str
     title: str
     implicit: bool
-    kept: int
+    workspace: int
     step: CFunction
     run: CFunction
     batch: CFunction | None
@@ -54,14 +54,14 @@ class Declared:
 class AdaptiveDeclared:
     """Adaptive steps in the header.
 
-    memory, kept: C type of the workspace and its length. together: whether optimised C steps many
-    instances in parallel. fixed: the function type of fixed steps with event detection, for scenes
-    with events.
+    memory, workspace: C type of the workspace and its length. together: whether optimised C steps
+    many instances in parallel. fixed: the function type of fixed steps with event detection, for
+    scenes with events.
     """
 
     title: str
     memory: str
-    kept: int
+    workspace: int
     run: CFunction
     batch: CFunction | None
     together: bool
@@ -93,7 +93,7 @@ class Header(Named):
     project: CFunction | None
     methods: tuple[Declared, ...]
     adaptive: AdaptiveDeclared | None
-    busy: int
+    max_events: int
 
 
 @dataclass(frozen=True)
