@@ -70,14 +70,14 @@ FMI(Status) FMI(ExitInitializationMode)(FMI_INSTANCE instance)
 
     if (status == FMI(OK)) {
         Unit *const x = &a->unit.x;
-        int status = 0;
+        int failure = 0;
 
-        for (int i = 0; i < unitNQ && !status; i++)
-            status = x->q[i] - x->q[i] == 0 && x->qd[i] - x->qd[i] == 0 ? 0 : 2;
-        if (!status)
-            status = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
-        if (status)
-            return outcome(a, unitFailed(&a->unit, status));
+        for (int i = 0; i < unitNQ && !failure; i++)
+            failure = x->q[i] - x->q[i] == 0 && x->qd[i] - x->qd[i] == 0 ? 0 : 2;
+        if (!failure)
+            failure = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
+        if (failure)
+            return outcome(a, unitFailed(&a->unit, failure));
         (void)unitCrossed(x);
     }
     return status;
