@@ -15,7 +15,7 @@ from compilers import compiled
 from conftest import needs, tiers
 
 import eomc
-from eomc.emit.selftest import _lost
+from eomc.emit.selftest import _rounding_error
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
 from eomc.toolchain.subprocesses import write_files
@@ -26,12 +26,12 @@ def test_what_a_multiple_of_half_pi_loses(real: type) -> None:
     """Powers of two nothing, others up to half a unit in the last place of n pi/2."""
     double, half_pi = real is np.float64, real(math.pi / 2)
     for n in (1, 2, 64, 4096):
-        assert _lost(n * math.pi / 2 + 0.3, double) == 0
+        assert _rounding_error(n * math.pi / 2 + 0.3, double) == 0
     found = []
     for n in range(1000, 1100):
         product = real(n) * half_pi
         lost = abs(Fraction(float(product)) - n * Fraction(float(half_pi)))
-        assert _lost(n * math.pi / 2 - 0.3, double) == float(lost)
+        assert _rounding_error(n * math.pi / 2 - 0.3, double) == float(lost)
         found.append(lost / Fraction(float(np.spacing(product))))
     assert 0.4 < max(found) <= 0.5
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import EVERYTHING
 from states import QD, Q, same
 
-from eomc.emit.package import ASKED, FUNCTIONS
+from eomc.emit.package import FUNCTIONS, OPTIONAL
 from eomc.model.system import System
 from eomc.runtime.batch import BatchModel
 from eomc.runtime.package import CONSTRAINED
@@ -42,7 +42,7 @@ def test_values_are_those_of_the_textbook(cartpole: ModuleType) -> None:
 def test_time_inputs_and_parameters_are_positional_in_this_order() -> None:
     """After the state and whatever else the function is of, in all functions of a state."""
     told = []
-    for name in [*FUNCTIONS, *CONSTRAINED, "reactions", *(n for x in ASKED.values() for n in x)]:
+    for name in [*FUNCTIONS, *CONSTRAINED, "reactions", *(n for x in OPTIONAL.values() for n in x)]:
         found = list(signature(getattr(BatchModel, name)).parameters.values())
         names = [p.name for p in found if p.kind is p.POSITIONAL_OR_KEYWORD]
         if "t" in [p.name for p in found] and name not in ("rhs", "step_batch"):

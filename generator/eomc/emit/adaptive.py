@@ -52,7 +52,7 @@ def workspace_size(system: System, width: int) -> int:
 
 @dataclass(frozen=True)
 class SweepInterface:
-    """What portable and optimised C supply to the shared code of adaptive steps.
+    """Code that portable and optimised C supply to the shared code of adaptive steps.
 
     Attributes
     ----------

@@ -212,7 +212,7 @@ class Functions:
         return blocks if len(lines) > MAX_UNCOMMENTED_LINES else (Block("", lines),)
 
     def outlined(
-        self, function: Function, name: str, out: str, given: Sequence[str]
+        self, function: Function, name: str, out: str, arguments: Sequence[str]
     ) -> tuple[str, tuple[CFunction, ...], tuple[Block, ...]]:
         """Outline a long function. Returns the struct of values, the pieces, and the calling
         blocks.
@@ -241,7 +241,7 @@ class Functions:
                 (
                     *([c.filled(type, "s")] if part.reads or part.keeps else []),
                     *([c.filled(self.real, out)] if part.outputs else []),
-                    *self.pointers(f, *given),
+                    *self.pointers(f, *arguments),
                 ),
                 (self.loads(f), *body.early, *body.blocks, Block("", ends)),
                 self.read(f, follows=False) | {"s", out},
@@ -379,7 +379,7 @@ class Functions:
 
     @cached_property
     def rotated(self) -> CFunction | None:
-        """What puts rotation vectors in the place of rows of axes; static."""
+        """The static C function that replaces the residuals of axis rows by rotation vectors."""
         if self.rotation_errors is None:
             return None
         read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]

@@ -36,7 +36,7 @@ FUNCTIONS = (
     "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
-ASKED = {  # functions by the option that brings them
+OPTIONAL = {  # functions by the option that brings them
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics", "drive_forces"),
     "momentum": ("momentum",),
@@ -225,7 +225,7 @@ def _functions(target: Target) -> tuple[str, ...]:
     functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
     functions += CONSTRAINED if s.constraints else ()
     functions += ["reactions"] if s.reactions else ()
-    functions += [n for key, names in ASKED.items() if getattr(run, key) for n in names]
+    functions += [n for key, names in OPTIONAL.items() if getattr(run, key) for n in names]
     return tuple(sorted(functions))
 
 
@@ -281,7 +281,7 @@ def face(target: Target, extension: str) -> Face:
         tolerance=s.run.tolerance,
         events=tuple(e.name for e in s.events),
         constraints=tuple(c.name for c in s.constraints),
-        held=(*(c.start_fixed for c in s.coordinates), *(c.rate_fixed for c in s.coordinates)),
+        fixed=(*(c.start_fixed for c in s.coordinates), *(c.rate_fixed for c in s.coordinates)),
         holonomic=sum(c.holonomic for c in s.constraints),
         redundant=tuple(k for k, c in enumerate(s.constraints) if c.redundant),
         modes=tuple((m.at, m.of) for m in s.modes),
@@ -290,6 +290,6 @@ def face(target: Target, extension: str) -> Face:
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
         functions=_functions(target),
-        asked=tuple(x for x in ASKED.items() if not getattr(s.run, x[0])),
-        made_in_python=s.scene is None,
+        optional=tuple(x for x in OPTIONAL.items() if not getattr(s.run, x[0])),
+        from_python=s.scene is None,
     )

@@ -33,13 +33,13 @@ from eomc.program.trig import separate_angles
 
 # by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
 LIMIT = {True: 2.0**20, False: 2.0**13}
-# what is allowed beside what nudges of the arguments by an ulp bring, of the largest entry: some
-# thousand units of rounding, for libraries and orders of summation
+# error limit besides the effect of perturbing the arguments by one ulp, relative to the largest
+# entry: some thousand rounding errors, for libraries and orders of summation
 ROUNDING = {True: 1e-12, False: 1e-4}
-UNITS = 1000  # of a nudge by one ulp, as `eomc check` allows
-# a case that allows more than this says too little
+UNITS = 1000  # times the effect of a perturbation by one ulp, as in `eomc check`
+# largest error limit of a case
 LOOSEST = {True: 1e-6, False: 1e-2}
-# where angles are large: sines are off by more where a multiply-add rounds twice
+# error limits at large angles, where sines are less accurate if a multiply-add rounds twice
 LARGE = {True: 1e-12, False: 1e-5}
 USUAL = {True: 1e-9, False: 1e-3}  # of accelerations where angles are large
 # what projections, differences and sums over steps may leave
@@ -77,30 +77,33 @@ class Point:
 
 
 def view(target: Target) -> SelfTest:
-    """The view of selftest.c."""
-    made = _Made(target)
+    """Return the view of selftest.c."""
+    cases = _Cases(target)
+    other = cases.other_parameters if cases.uses_other else ()
     double = target.real is DOUBLE
-    tested = tuple(t for t in made.tested() if t.cases)
+    tested = tuple(t for t in cases.tested() if t.cases)
     return SelfTest(
         title=FreeText(target.system.title),
         stamp=tuple(stamp(target)),
         prefix=target.prefix,
         PREFIX=target.PREFIX,
         real=target.real.name,
-        states=tuple(made.state(p) for p in made.points),
-        other=tuple(target.literal(p.value) for p in made.other) if made.uses_other else (),
+        states=tuple(cases.state(p) for p in cases.points),
+        other=tuple(target.literal(p.value) for p in cases.other_parameters)
+        if cases.uses_other
+        else (),
         has_p=target.needs_p,
-        arrays=made.arrays,
+        arrays=cases.arrays,
         tested=tested,
         events=bool(target.system.events),
         inputs=bool(target.system.inputs),
         most=max(len(case.expected) for t in tested for case in t.cases),
         large_limit="2^20" if double else "2^13",
-        large=made.has_large,
+        large=cases.has_large,
     )
 
 
-class _Made:
+class _Cases:
     """The cases of one program; states are numbered as cases need them."""
 
     def __init__(self, target: Target) -> None:
@@ -114,7 +117,7 @@ class _Made:
     # values in Python
 
     def evaluate(self, name: str, values: Mapping[str, float]) -> Vector:
-        """A function of the program. Raises NoCaseError where it has no finite, regular value."""
+        """Return the value of a function. Raises NoCaseError if it is not finite or not regular."""
         try:
             found, regular = self.evaluator(name)(values)
         except (ArithmeticError, ValueError):
@@ -124,14 +127,14 @@ class _Made:
         return found
 
     def evaluator(self, name: str) -> Callable[[Mapping[str, float]], tuple[Vector, bool]]:
-        """One of them, its numbers converted once."""
+        """Return the evaluator of a function; its constants are converted once."""
         if name not in self.known:
             unit = 2.0**-52 if self.double else 2.0**-20  # eight times a float's
             self.known[name] = evaluator(self.program[name], unit=unit)
         return self.known[name]
 
     def value(self, name: str, point: Point) -> Vector:
-        """What a function of the header writes; inputs are the signals where these act."""
+        """Return the results of a function of the header; signals may supply the inputs."""
         values = self.complete(point)
         if name in self.program:
             return self.ordered(name, self.evaluate(name, values))
@@ -143,7 +146,7 @@ class _Made:
         raise NoCaseError
 
     def ordered(self, name: str, found: Vector) -> Vector:
-        """The matrices of the linearization one behind the other, as the header has them."""
+        """Return results in the header's order: the matrices of the linearization one by one."""
         if name != "linearization":
             return found
         return self.split([found[k : k + self.width] for k in range(0, len(found), self.width)])
@@ -186,11 +189,11 @@ class _Made:
     # steps in Python
 
     def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
-        """qdd at a state x = [q; qd] and a time; what else it reads is that of a point."""
-        return self.evaluate("acceleration", self.complete(self.at(point, x, t)))
+        """Return qdd at a state x = [q; qd] and a time, with the other arguments of a point."""
+        return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
 
-    def at(self, point: Point, x: Vector, t: float) -> Point:
-        """A point with another state and time."""
+    def shifted(self, point: Point, x: Vector, t: float) -> Point:
+        """Return the point with another state and time."""
         names = (s.name for s in (*self.system.q, *self.system.qd))
         values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
         return Point(values, point.signals, point.other, point.span)
@@ -246,7 +249,7 @@ class _Made:
         if not self.system.constraints:
             return x
         for _ in range(12):
-            d = self.evaluate("projection", self.complete(self.at(point, x, t)))
+            d = self.evaluate("projection", self.complete(self.shifted(point, x, t)))
             x = [a + b for a, b in zip(x, d, strict=False)]
             if max(map(abs, d[: self.nq])) <= 1e-12 * max(1e-3, *map(abs, x)):
                 return x
@@ -261,26 +264,26 @@ class _Made:
     # states
 
     @cached_property
-    def other(self) -> tuple[Any, ...]:
-        """The parameters of the second set: a percent and more off, so that each is seen."""
+    def other_parameters(self) -> tuple[Any, ...]:
+        """The second set of parameters: each differs by one percent or more."""
         return tuple(
             replace(p, value=self.short(p.value * (1 + 0.01 * (k % 7 + 1))))
             for k, p in enumerate(self.system.parameters)
         )
 
     def short(self, x: float) -> float:
-        """A number as the element type has it, printed short."""
+        """Return a number rounded to six digits, in the element type."""
         x = float(f"{x:.6g}")
         return x if self.double else _single(x)
 
     @cached_property
     def near(self) -> tuple[Point, ...]:
-        """States near the start, by signals and by given inputs, one with other parameters."""
+        """States near the start: with signals, with inputs, and one with other parameters."""
         found = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
-        if self.other:
+        if self.other_parameters:
             found[1] = replace(
                 found[1], other=True,
-                values={**found[1].values, **{p.name: p.value for p in self.other}},
+                values={**found[1].values, **{p.name: p.value for p in self.other_parameters}},
             )  # fmt: skip
         if self.system.inputs:
             found[2] = self.driven(found[2], 0.0)
@@ -335,7 +338,7 @@ class _Made:
 
     @property
     def arrays(self) -> tuple[tuple[str, str], ...]:
-        """What a state has besides q and qd, and how many numbers that is."""
+        """Arrays of a state besides q and qd, with their sizes."""
         found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
         return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
 
@@ -350,12 +353,12 @@ class _Made:
             arrays=tuple(tuple(literal(point.values[n]) for n in row) for row in arrays),
             t=literal(point.values[TIME]),
             span=literal(point.span),
-            u=tuple(literal(point.values[n]) for n in self.given(point)),
+            u=tuple(literal(point.values[n]) for n in self.input_names(point)),
             other=point.other,
         )
 
-    def given(self, point: Point) -> list[str]:
-        """The inputs that a point gives: all, or none where the signals act."""
+    def input_names(self, point: Point) -> list[str]:
+        """Return the names of the inputs of a point; none if the signals supply them."""
         return [] if point.signals else self.target.input_names
 
     # cases
@@ -364,10 +367,10 @@ class _Made:
         self, point: Point, compute: Callable[[Point], Vector], allowed: float = 0.0,
         sharp: bool = False,
     ) -> Case | None:  # fmt: skip
-        """What a computation gives at a point and how far C may be off, None where it says nothing.
+        """Return the expected results at a point and their error limit; None if it is too large.
 
-        The limit: what nudges of the state by an ulp bring, a thousandfold, at least rounding and
-        what is `allowed`; where that is `sharp`, no more.
+        The limit is a thousand times the effect of perturbations of the state by one ulp, at least
+        a rounding error and `allowed`; if `sharp`, it is `allowed`.
         """
         try:
             expected = compute(point)
@@ -428,7 +431,7 @@ class _Made:
         return f.call(**at | passed)
 
     def far(self, name: str) -> list[Case | None]:
-        """Cases where angles are large, and numbers long enough to judge sines by there."""
+        """Return cases with large angles at which double precision resolves the sines."""
         found: list[Case | None] = []
         for values in islice(self.large, FAR):
             allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
@@ -445,7 +448,7 @@ class _Made:
         return [x for x in _large(self.target) if self.is_sharp(x)]
 
     def is_sharp(self, x: Mapping[str, float]) -> bool:
-        """Whether doubles, or floats, have D, bias and accelerations as 40 digits have them."""
+        """Return True if bias and accelerations agree with those computed with 40 digits."""
         known = self.complete(Point({n: v if self.double else _single(v) for n, v in x.items()}))
         room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
         for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
@@ -461,7 +464,7 @@ class _Made:
     # steps, runs, events
 
     def moves(self) -> Iterator[Tested]:
-        """Steps, their derivatives and runs of each method, projections, adaptive runs, events."""
+        """Yield the tests of steps, derivatives, runs, projections, adaptive runs and events."""
         run = self.system.run
         if self.system.constraints:
             f = self.public.project
@@ -531,23 +534,23 @@ class _Made:
         return found
 
     def rows(self, m: Method, point: Point) -> Vector:
-        """What a run writes: its end, and the rows of q and of qd."""
+        """Return the results of a run: its end, and the rows of q and of qd."""
         n, found = self.nq, self.stepped(m, STEPS, point)
         states = [found[k : k + 2 * n] for k in range(0, len(found), 2 * n)]
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
 
     def twice(self, m: Method, point: Point) -> Vector:
-        """The ends of two instances that begin alike."""
+        """Return the end states of two instances with equal initial states."""
         end = self.stepped(m, STEPS, point)[-2 * self.nq :]
         return [*end[: self.nq] * 2, *end[self.nq :] * 2]
 
     def projection(self, point: Point) -> Vector:
-        """[q; qd] moved onto the constraints; where that is the state itself, from beside it."""
+        """Return [q; qd] projected onto the constraints."""
         return self.projected(point, self.states(point), point.values[TIME])
 
     def run_call(self, name: str) -> str:
-        """A run of some steps: its end, and the rows of q and of qd."""
+        """Return the call of a run of a few steps: its end, and the rows of q and of qd."""
         return self.call(
             self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(STEPS),
             u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + STEPS}*NQ",
@@ -555,7 +558,7 @@ class _Made:
         )  # fmt: skip
 
     def batch_call(self, name: str) -> str:
-        """The same of two instances that begin alike: their ends."""
+        """Return the call of a batch of two instances with equal initial states."""
         return self.call(
             self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
             steps=str(STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
@@ -563,7 +566,7 @@ class _Made:
         )  # fmt: skip
 
     def adaptive_call(self) -> str:
-        """A run by a tolerance, to t + span."""
+        """Return the call of an adaptive run to t + span."""
         return self.call(
             self.public.adaptive(adaptive.METHOD.name), q="out", qd="out + NQ", t="&t",
             t_end=f"t + {member('s', 'span')}", h_most="0",
@@ -576,9 +579,9 @@ class _Made:
     def derivative(self, m: Method, point: Point) -> Case | None:
         """The derivative of a step along 1, 2, 3, 1, 2, ..., by differences of steps."""
         names = [x.name for x in (*self.system.q, *self.system.qd)]
-        names += self.given(point)
+        names += self.input_names(point)
 
-        def along(x: Point, width: float) -> Vector:
+        def difference(x: Point, width: float) -> Vector:
             found = [0.0] * (2 * self.nq)
             for k, w in STENCIL:
                 for sign in (-1, 1):
@@ -589,7 +592,7 @@ class _Made:
             return found
 
         try:
-            wide, close = along(point, 0.01), along(point, 0.0025)
+            wide, close = difference(point, 0.01), difference(point, 0.0025)
         except NoCaseError:
             return None
         allowed = 10 * _off(wide, close) + ITERATED[self.double]
@@ -628,7 +631,7 @@ class _Made:
 
     @property
     def of_runs(self) -> float:
-        """What adaptive runs may be off."""
+        """Error limit of adaptive runs."""
         return 1e-8 if self.double else 2e-3
 
     def ended(self, event: Happening | None, point: Point) -> Vector:
@@ -644,23 +647,23 @@ class _Made:
         if e.action == "stop":
             return [*x, at, *found]
         if e.action == "jump":
-            after = self.value("jumps", self.at(point, x, at))
+            after = self.value("jumps", self.shifted(point, x, at))
             x = after[2 * self.nq * first : 2 * self.nq * (first + 1)]
         return [*self.sure(point, x, at, t + span - at), t + span, *found]
 
     def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
-        """`flow`, as far as shorter steps agree."""
+        """Return `flow`; raise NoCaseError if shorter steps do not agree."""
         found, finer = (self.flow(point, x, t, span, n) for n in (4, 6))
         if _off(found, finer) > self.of_runs / 10:
             raise NoCaseError
         return finer
 
     def events(self, point: Point, x: Vector, t: float) -> Vector:
-        """What is zero at events."""
-        return self.value("events", self.at(point, x, t))
+        """Return the event functions."""
+        return self.value("events", self.shifted(point, x, t))
 
     def refuse_events(self, point: Point, x: Vector, t: float, span: float) -> None:
-        """Raise NoCaseError where an event changes its sign on the way, or comes near to that."""
+        """Raise NoCaseError if an event function changes its sign on the way, or nearly does."""
         first = self.events(point, x, t) if self.system.events else []
         for k in range(8) if first else ():
             x = self.flow(point, x, t + span * k / 8, span / 8, 1)
@@ -670,7 +673,7 @@ class _Made:
                     raise NoCaseError
 
     def crossings(self, k: int) -> list[Case | None]:
-        """Runs over event k, upwards and downwards, where such are found."""
+        """Return runs across event k, rising and falling, if there are any."""
         found: dict[bool, Case] = {}
         for point in self.candidates(k):
             for span in self.spans():
@@ -736,7 +739,7 @@ class _Made:
             raise NoCaseError
         e = self.system.own_events[k]
         seen = e.direction in ("both", "rising" if rising else "falling")
-        start = self.at(on, [self.short(v) if not self.double else v for v in begin], t - half)
+        start = self.shifted(on, [self.short(v) if not self.double else v for v in begin], t - half)
         start = replace(start, span=span)
         if seen and e.action == "jump":
             after = self.value("jumps", on)[2 * self.nq * k : 2 * self.nq * (k + 1)]
@@ -756,7 +759,7 @@ def _single(x: float) -> float:
 
 
 def _off(found: list[float], exact: list[float]) -> float:
-    """The largest difference, of the largest entry."""
+    """Return the largest difference, relative to the largest entry."""
     worst = max(abs(a - b) for a, b in zip(found, exact, strict=True))
     return worst / max(map(abs, exact)) if worst else 0.0
 
@@ -779,13 +782,13 @@ def _large(target: Target) -> Iterator[dict[str, float]]:
             inward = -1.3 if part > 0 else 1.3
             some = (part * most + inward * (coordinates[name] + k + j) for j in range(12))
             on_grid = (round(GRID * angle) / GRID for angle in some)
-            x[name] = max(on_grid, key=lambda angle: _lost(angle, target.real is DOUBLE))
+            x[name] = max(on_grid, key=lambda angle: _rounding_error(angle, target.real is DOUBLE))
         # faster than nearby, so that gravity does not cover what the angles bring
         yield x | {v.name: 8 * x[v.name] for v in program.system.qd}
 
 
-def _lost(angle: float, double: bool) -> float:
-    """What n pi/2, the multiple next to an angle, loses where it is rounded."""
+def _rounding_error(angle: float, double: bool) -> float:
+    """Return the rounding error of n pi/2, the multiple nearest to an angle."""
     n, rounded = round(angle / (math.pi / 2)), (lambda x: x) if double else _single
     half_pi = rounded(math.pi / 2)
     return float(abs(Fraction(rounded(n * half_pi)) - n * Fraction(half_pi)))

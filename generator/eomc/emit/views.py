@@ -245,7 +245,7 @@ class Named:
 class Face:
     """python/face.py.jinja. start: coordinates and velocities; functions: public, of the model.
 
-    asked: which others there would be by which key of [run].
+    optional: further functions by the key of [run] that adds them.
     """
 
     TEMPLATE: ClassVar[str] = "python/face.py"
@@ -273,7 +273,7 @@ class Face:
     tolerance: float | None
     events: tuple[str, ...]
     constraints: tuple[str, ...]
-    held: tuple[bool, ...]
+    fixed: tuple[bool, ...]
     holonomic: int
     redundant: tuple[int, ...]
     modes: tuple[tuple[int, int], ...]
@@ -282,8 +282,8 @@ class Face:
     batch: bool
     methods: tuple[Method, ...]
     functions: tuple[str, ...]
-    asked: tuple[tuple[str, tuple[str, ...]], ...]
-    made_in_python: bool
+    optional: tuple[tuple[str, tuple[str, ...]], ...]
+    from_python: bool
 
 
 @dataclass(frozen=True)

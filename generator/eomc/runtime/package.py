@@ -180,7 +180,7 @@ def named_outputs() -> str:
 def is_built_from_system() -> bool:
     """Return True if this package is built from a System that `System.make` returned."""
     package = import_module(_BUILT)
-    return bool(getattr(package, "_made_in_python", False))
+    return bool(getattr(package, "_from_python", False))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -40,7 +40,7 @@ class Source(AnySource):
 
 @dataclass(frozen=True)
 class Laned:
-    """What is printed over a lane: its type, that of failures, the end of C names."""
+    """Common fields of code over a lane: its type, the type of failures, the suffix of C names."""
 
     inline: str
     lane: str

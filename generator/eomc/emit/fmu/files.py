@@ -52,7 +52,7 @@ def unit(
     name = target.prefix
     sources = (f"{name}.c", f"fmi/fmi{version}.c")
 
-    def made(token: str) -> dict[str, str]:
+    def render(token: str) -> dict[str, str]:
         files = {
             "modelDescription.xml": show(description.view(target, version, token, sources)),
             "sources/fmi/scene.h": c_function.laid_out(show(scene.view(target, token))),
@@ -67,8 +67,8 @@ def unit(
         for file in (*_HEADERS[version], f"fmi{version}.c", "both.h", "unit.h")
     }
     texts["documentation/licenses/fmi-headers.txt"] = resources.text("csrc", "fmi/LICENSE.txt")
-    whole = "\0".join(f"{file}\0{text}" for file, text in sorted(made("").items()))
+    whole = "\0".join(f"{file}\0{text}" for file, text in sorted(render("").items()))
     digest = hashlib.sha256(whole.encode(errors="surrogateescape")).hexdigest()
     token = "-".join((digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]))
     operations = sum(map(weight, safe.functions.values()))
-    return Unit(name, version, made(token), sources, operations)
+    return Unit(name, version, render(token), sources, operations)

@@ -28,7 +28,7 @@ def view(target: Target, token: str) -> SceneCalls:
     method, rows = s.run.methods[0], s.coordinates if s.constraints else ()
     calls = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
     start_lines, starts = _starts(target)
-    kept = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
+    workspace = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
     return SceneCalls(
         title=FreeText(s.title),
         stamp=heading.stamp(target)[0],
@@ -38,7 +38,7 @@ def view(target: Target, token: str) -> SceneCalls:
         real=target.real.name,
         h=repr(s.run.h),
         tolerance=repr(s.run.tolerance or 0.0),
-        memory=f"{target.prefix}_{kept}_memory",
+        memory=f"{target.prefix}_{workspace}_memory",
         inputs=tuple(map(target.literal, input_starts(target))),
         parameters=tuple(p.name for p in s.parameters),
         output_count=len(s.outputs),

@@ -92,7 +92,7 @@ class Described:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What is computed, and what it depends on, by value references; in FMI 2 also their indices.
+    """A computed variable and its dependencies, as value references; in FMI 2 also their indices.
 
     Indices count from 1, and so do references, since 0 is the time, which FMI 2 is not told of.
     """
@@ -103,7 +103,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Description:
-    """What both versions' descriptions of a model ask for, but for the events.
+    """Fields of the model descriptions of both FMI versions, except for the events.
 
     exchange: whether importers may integrate it.
     """
