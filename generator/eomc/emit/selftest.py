@@ -89,9 +89,7 @@ def view(target: Target) -> SelfTest:
         PREFIX=target.PREFIX,
         real=target.real.name,
         states=tuple(cases.state(p) for p in cases.points),
-        other=tuple(target.literal(p.value) for p in cases.other_parameters)
-        if cases.uses_other
-        else (),
+        other=tuple(target.literal(p.value) for p in other),
         has_p=target.needs_p,
         arrays=cases.arrays,
         tested=tested,
