@@ -79,9 +79,9 @@ class Point:
 def view(target: Target) -> SelfTest:
     """Return the view of selftest.c."""
     cases = _Cases(target)
-    other = cases.other_parameters if cases.uses_other else ()
     double = target.real is DOUBLE
     tested = tuple(t for t in cases.tested() if t.cases)
+    other = cases.other_parameters if cases.uses_other else ()
     return SelfTest(
         title=FreeText(target.system.title),
         stamp=tuple(stamp(target)),
