@@ -50,9 +50,9 @@ def _without_garbage_collection() -> Iterator[None]:
 
 @_without_garbage_collection()
 def read(scene: ScenePath) -> System:
-    """The checked scene as a SymPy system, its start assembled where there are constraints.
+    """Read and check a scene; return a SymPy system with consistent initial values.
 
-    Raises SceneError with every fault.
+    Raises SceneError with all problems.
     """
     from eomc.model.from_scene import from_scene
     from eomc.scene import read as scenes
@@ -79,7 +79,7 @@ def sources(
     *,
     warn: Callable[[Problem], None] | None = None,
 ) -> Sources:
-    """The generated files of a system, as text. warn is called with each warning."""
+    """Return the generated files of a system as text. warn is called with each warning."""
     from eomc.emit import render
 
     return render.render(_program(system, warn), extension)
@@ -105,7 +105,7 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
 
 @_without_garbage_collection()
 def unit(system: System, fmi: int = 2, *, warn: Callable[[Problem], None] | None = None) -> Unit:
-    """The files of a unit of FMI 2 or 3, as text. warn is called with each warning."""
+    """Return the files of an FMU (FMI 2 or 3) as text. warn is called with each warning."""
     from eomc.emit import render
 
     if fmi not in (2, 3):
@@ -121,10 +121,10 @@ def export_fmu(
     binary: bool = True,
     warn: Callable[[Problem], None] | None = None,
 ) -> Exported:
-    """A unit of FMI 2 or 3 of a scene file or a System, in the file `out`, by default NAME.fmu.
+    """Export a scene file or a System as an FMU (FMI 2 or 3) to `out`, by default NAME.fmu.
 
-    It has sources and, where there is a compiler and unless `binary` is false, a binary for this
-    machine; an older file is replaced. warn is called with each warning.
+    The FMU contains sources and, unless `binary` is false or there is no compiler, a binary for
+    this machine. An existing file is replaced. warn is called with each warning.
     Raises SceneError for a faulty scene, EomcError for what else fails.
     """
     from eomc.toolchain import fmu
@@ -143,11 +143,11 @@ def build(
     form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> Built:
-    """The compiled module of a scene file or a System, in `root`/<name>/.
+    """Build the compiled module of a scene file or a System in `root`/<name>/.
 
-    Nothing is derived or compiled where nothing has changed; then no compiler is needed. form: of
-    the C that it is compiled from; that from "plain" is for comparison and lies in
-    `root`/<name>/.plain/. warn is called with each warning.
+    If nothing has changed, nothing is derived or compiled, and no compiler is needed. form: of the
+    generated C; "plain" is for comparison, in `root`/<name>/.plain/.
+    warn is called with each warning.
     Raises SceneError for a faulty scene, EomcError for what else fails.
     """
     from eomc.toolchain import cache
@@ -252,7 +252,7 @@ def load(
     form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> ModuleType:
-    """The compiled module of a scene, built where it is not there yet, imported. As `build`.
+    """Import the compiled module of a scene, built first if necessary. Arguments as in `build`.
 
     >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
     >>> cartpole.simulate(duration=1.0).q[-1]       # doctest: +SKIP
@@ -273,10 +273,10 @@ def load(
 
 
 def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleType:
-    """The module of a model's scene or System with events besides its own; built once, in `folder`.
+    """Return the module of a model's scene or System with additional events, built in `folder`.
 
-    events: by name a formula, or a dict as [[event]] has it; of a System also as System.make.
-    Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
+    events: formulas by name, or dicts as in [[event]]; for a System also as in System.make.
+    Raises SceneError for invalid events, EomcError if the scene is missing or has changed.
     """
     from eomc.base.errors import SceneError, writing
     from eomc.runtime.atomic_write import atomic_write

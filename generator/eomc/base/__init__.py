@@ -1,1 +1,1 @@
-"""What every storey stands on: errors, names, texts, resources."""
+"""Base layer: errors, names, texts, resources."""

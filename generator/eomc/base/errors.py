@@ -42,7 +42,7 @@ class NoCompilerError(EomcError):
 
 @contextmanager
 def writing(where: object) -> Iterator[None]:
-    """An EomcError that names `where` in place of an OSError."""
+    """Raise an EomcError that names `where` in place of an OSError."""
     try:
         yield
     except OSError as fault:
@@ -91,12 +91,12 @@ def _cut(text: str, most: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """`text` in one line, as wide on the screen as it is long."""
+    """Return `text` in one line, with one printable character for each of its own."""
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
 class SceneError(EomcError):
-    """A scene that can't be used; `problems` holds every fault found, in the file's order."""
+    """An invalid scene; `problems` are all problems found, in the order of the file."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda p: (p.line, p.column)))

@@ -1,4 +1,4 @@
-"""Names that C, C++ and Python can bear, and what to use where they can't."""
+"""Valid names in C, C++ and Python, and replacements for invalid ones."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ GREEK = {
 
 
 def plain(name: str) -> str:
-    """`name` made of what C can bear: Greek written out, LaTeX stripped, keywords marked.
+    """Return a valid C name: Greek written out, LaTeX removed, keywords extended.
 
     >>> plain("θ₁"), plain(r"\\theta_{1}"), plain("lambda")
     ('theta_1', 'theta_1', 'lambda_1')
@@ -76,7 +76,7 @@ def plain(name: str) -> str:
 
 
 def fault(name: str) -> str | None:
-    """Why `name` can't be used in a scene, with a remedy; None where it can."""
+    """Return the reason why `name` is not allowed in a scene, with a remedy; None if it is."""
     if len(name) > 10 * MAX_LENGTH:
         shown = f"{name[:MAX_LENGTH]}..."
         return f"'{shown}' has {len(name)} characters: {MAX_LENGTH} are the most, for readable C"
@@ -93,7 +93,7 @@ def fault(name: str) -> str | None:
 
 
 def module_fault(name: str) -> str | None:
-    """Why a scene can't bear `name`, which becomes a Python module and a prefix in C."""
+    """Return the reason why a scene cannot have `name`, also a Python module and a C prefix."""
     if why := fault(name):
         return why
     if name in sys.stdlib_module_names or name in ("numpy", "cffi", "eomc", "sympy", "test"):

@@ -9,18 +9,18 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def folder(kind: str) -> Path:
-    """The folder `templates`, `csrc` or `scenes`."""
+    """Return the folder `templates`, `csrc` or `scenes`."""
     installed = PACKAGE / kind
     return installed if installed.is_dir() else PACKAGE.parent.parent / kind
 
 
 def text(kind: str, name: str) -> str:
-    """The text of one of its files."""
+    """Return the text of a file of such a folder."""
     return (folder(kind) / name).read_text(encoding="utf-8")
 
 
 def scenes() -> dict[str, Path]:
-    """The scenes that come with eomc: their files by name."""
+    """Return the files of the scenes that come with eomc, by name."""
     return {file.stem: file for file in sorted(folder("scenes").glob("*.toml"))}
 
 
@@ -38,7 +38,7 @@ def runtime(batch: bool) -> dict[str, str]:
 
 
 def parts() -> Iterator[tuple[str, Path]]:
-    """Every file that a build depends on: a name that is the same wherever eomc lies, its place."""
+    """Yield all files on which a build depends: name relative to the installation, path."""
     for kind, root, suffix in (
         ("eomc", PACKAGE, ".py"),
         ("templates", folder("templates"), ".jinja"),

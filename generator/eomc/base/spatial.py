@@ -50,7 +50,7 @@ def apply(R: Matrix[T], v: Sequence[T]) -> Vector[T]:
 
 
 def transposed(R: Matrix[T]) -> Matrix[T]:
-    """The transposed matrix: of a rotation, its inverse."""
+    """Return the transposed matrix."""
     one, two, three = zip(*R, strict=True)
     return one, two, three
 
@@ -61,13 +61,13 @@ def product(A: Matrix[T], B: Matrix[T]) -> Matrix[T]:
 
 
 def matrix(rows: Any) -> Matrix[Any]:
-    """Three rows, whatever holds them, as a matrix."""
+    """Return an iterable of three rows as a matrix."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     return (a, b, c), (d, e, f), (g, h, i)
 
 
 def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
-    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
+    """Return the rotation about a coordinate axis, from the rotated frame to the original one."""
     zero = 0 * cosine
     i, j = (k + 1) % 3, (k + 2) % 3
     rows = [[zero] * 3 for _ in range(3)]
@@ -77,7 +77,7 @@ def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
 
 
 def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
-    """The rotation about an axis of length one (Rodrigues)."""
+    """Return the rotation about a unit axis (Rodrigues)."""
     x, y, z = axis
     c, s = cosine, sine
     r = 1 - c
@@ -89,19 +89,19 @@ def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
 
 
 def tensor(inertia: Sequence[T]) -> Matrix[T]:
-    """The symmetric matrix of an inertia."""
+    """Return the symmetric matrix of an inertia."""
     xx, yy, zz, xy, xz, yz = inertia
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
 def rotated_inertia(R: Matrix[T], inertia: Sequence[T]) -> Inertia[T]:
-    """R I R^T: an inertia along axes that stand in the new ones as R says, along the new ones."""
+    """Return R I R^T: an inertia in the axes to which R rotates its own."""
     rotated = product(product(R, tensor(inertia)), transposed(R))
     return six(rotated[i][j] for i, j in ENTRIES)
 
 
 def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
-    """The inertia of a point mass about the origin."""
+    """Return the inertia of a point mass about the origin."""
     x, y, z = at
     return (
         mass * (y * y + z * z), mass * (x * x + z * z), mass * (x * x + y * y),
@@ -110,12 +110,12 @@ def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
 
 
 def moved_inertia(inertia: Sequence[Any], mass: Any, center: Sequence[Any]) -> Inertia[Any]:
-    """An inertia about the centre of mass, about the origin instead (Steiner's parallel axes)."""
+    """Return an inertia about the origin from that about the centre of mass (parallel axes)."""
     return six(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
 
 
 def six(values: Any) -> Inertia[Any]:
-    """Six values, whatever holds them, as an inertia."""
+    """Return an iterable of six values as an inertia."""
     xx, yy, zz, xy, xz, yz = values
     return xx, yy, zz, xy, xz, yz
 

@@ -28,14 +28,14 @@ _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\
 
 
 def checked_line(text: str) -> str:
-    """The text, of a title or unit. Raises ValueError with the remedy for a hidden character."""
+    """Return the text of a title or unit. Raises ValueError for hidden characters."""
     if match := _HIDDEN.search(text):
         raise ValueError(_fault(text, match))
     return text
 
 
 def checked_lines(text: str) -> str:
-    """The text of a note, which may have several lines, and tabs. Raises ValueError likewise."""
+    """Return the text of a note, with line breaks and tabs allowed. Raises ValueError likewise."""
     if match := _HIDDEN_IN_LINES.search(text):
         raise ValueError(_fault(text, match))
     return text
@@ -69,7 +69,7 @@ def line(text: str) -> str:
 
 
 def lines(text: str) -> str:
-    """Text of several lines, such as all that a command prints; its hidden characters escaped."""
+    """Return a text of several lines with hidden characters escaped."""
     return _HIDDEN_IN_LINES.sub(_escaped, text)
 
 
@@ -78,23 +78,23 @@ def _escaped(match: re.Match[str]) -> str:
 
 
 def flat(text: str) -> str:
-    """A note of several lines as one, blanks and line breaks together one blank."""
+    """Return a note in one line, with white space collapsed."""
     return line(" ".join(re.split(r"[ \t\r\n]+", text.strip(" \t\r\n"))))
 
 
 def listed(names: Collection[str], most: int = 12) -> str:
-    """Names in a line, the first of many."""
+    """Return names as a list in one line, abbreviated if there are many."""
     shown = ", ".join([*names][:most]) or "none"
     return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def plural(word: str, n: int) -> str:
-    """The word for n things."""
+    """Return the singular or plural of a word for n things."""
     return word if n == 1 else word + ("es" if word.endswith(("x", "sh")) else "s")
 
 
 def comment(text: str) -> str:
-    r"""A text inside a C comment, in one line.
+    r"""Return a text for the inside of a C comment, in one line.
 
     It neither ends the comment nor begins another, and no line ends in a backslash or in the
     trigraph of one, which would join it to the next.
@@ -108,38 +108,38 @@ def comment(text: str) -> str:
 
 
 def python(value: str | Mapping[str, str]) -> str:
-    """A text, or texts by name, as a Python literal. Raises TypeError for anything else."""
+    """Return a text, or texts by name, as a Python literal. Raises TypeError for other types."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{python(k)}: {python(v)}" for k, v in value.items()) + "}"
     return str.__repr__(value)
 
 
 def docstring(text: str) -> str:
-    """Text of several lines as it stands between the quotes of a docstring."""
+    """Return a text escaped for a docstring."""
     return re.sub(r'"(?="|\Z)', r"\"", lines(text).replace("\\", "\\\\"))
 
 
 def html(text: str) -> str:
-    """A text in a page, as Markup, which is not escaped again."""
+    """Return a text escaped for HTML, as Markup, which is not escaped again."""
     from markupsafe import escape
 
     return escape(line(text))
 
 
 def xml(text: str) -> str:
-    """A text in an attribute of XML."""
+    """Return a text escaped for an attribute of XML."""
     from markupsafe import escape
 
     return str(escape(line(text)))
 
 
 def toml(text: str) -> str:
-    """A text as TOML writes it, in quotes, such as the reader accepts."""
+    """Return a text as a quoted TOML string."""
     return json.dumps(line(text), ensure_ascii=False)
 
 
 def figure(text: str) -> str:
-    """A text in a figure, where a dollar would begin mathematics."""
+    """Return a text for a figure, with dollar signs escaped."""
     return line(text).replace("$", r"\$")
 
 
@@ -151,7 +151,7 @@ def name(text: str) -> str:
 
 
 def command(file: str) -> str:
-    """The name of a file as a word of a command that can be typed."""
+    """Return a file name quoted for the shell."""
     return shlex.quote(line(file))
 
 

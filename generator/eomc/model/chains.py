@@ -39,7 +39,7 @@ class Chains:
     steps: dict[str, Step] = field(default_factory=dict)
 
     def path(self, name: str) -> list[str]:
-        """The body, its parent and so on, as far as they are held by joints, and the world."""
+        """Return the body and its ancestors connected by joints, then the world."""
         path = [name]
         while path[-1] in self.steps:
             path.append(self.steps[path[-1]].parent)
@@ -78,5 +78,5 @@ class Chains:
 
 
 def rotation_about(axis: int, angle: Expr) -> Matrix:
-    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
+    """Return the rotation about a coordinate axis, from the rotated frame to the original one."""
     return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))

@@ -98,14 +98,14 @@ class _Formulas:
             return whole, sympy.S.Zero
 
     def inputs(self) -> Iterator[Input]:
-        """The inputs with their signals and limits."""
+        """Yield the inputs with their signals and limits."""
         for i in self.scene.inputs:
             signal = self.value(f"inputs.{i.name}.signal", i.signal)
             ends = (f and self.value(f"inputs.{i.name}.limits", f) for f in i.limits)
             yield Input(i.name, i.unit, signal, i.note, tuple(ends))
 
     def frictions(self, more: Terms) -> tuple[dict[str, Expr], list[Friction]]:
-        """Friction along coordinates and in joints: smooth forces, or what sticks."""
+        """Return friction along coordinates and in joints: smooth forces or stick-slip."""
         smooth, sticks = dict[str, Expr](), list[Friction]()
         for c in self.scene.coordinates:
             if c.friction is not None and c.friction_width is not None:
@@ -128,7 +128,7 @@ class _Formulas:
         return smooth, sticks
 
     def events(self) -> Iterator[Event]:
-        """The events, with what their jumps set."""
+        """Yield the events with their jump maps."""
         for k, e in enumerate(self.scene.events):
             when = self.value(f"event.{k}.when", e.when)
             jump = ((name, self.value(f"event.{k}.{name}", formula)) for name, formula in e.jump)
@@ -140,7 +140,7 @@ class _Formulas:
         definitions: Sequence[tuple[Symbol, Expr]],
         closed: Iterable[Closed],
     ) -> tuple[tuple[Constraint, ...], tuple[Reaction, ...]]:
-        """The rows of [constraints] and of loops, holonomic ones first, and the reactions."""
+        """Return all constraints, holonomic ones first, and the reactions of loops."""
         written = {c.name: c.formula for c in self.scene.constraints}
 
         def problem(row: Constraint, message: str, severity: str) -> Problem:
@@ -172,7 +172,7 @@ class _Formulas:
     def outputs(
         self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
     ) -> Iterator[Output]:
-        """The outputs, which may use accelerations, energies and `forces` of constraints."""
+        """Yield the outputs, which may use accelerations, energies and `forces` of constraints."""
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
         energies = (kinetic, potential, kinetic + potential)
         self.known = {

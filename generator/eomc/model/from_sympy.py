@@ -46,7 +46,7 @@ Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
 
 
 def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]) -> str:
-    """The first input by name that an expression depends on, through definitions too, or ""."""
+    """Return the first input by name on which an expression depends, also by definitions, or ""."""
     uses = expr.free_symbols.union(*(e.free_symbols for _, e in needed(definitions, [expr])))
     return min((i for i in inputs if symbol(i) in uses), default="")
 

@@ -64,7 +64,7 @@ def split(
 
 
 def _eliminate_variables(slope: Expr, variables: Sequence[Expr]) -> Expr:
-    """A slope in a form without the variables. Raises NotLinearError where there is none."""
+    """Return a derivative in a form without the variables. Raises NotLinearError if impossible."""
     for attempt in (lambda e: e, sympy.expand, sympy.simplify):
         slope = attempt(slope)
         if not slope.has(*variables):

@@ -1,21 +1,21 @@
-"""Joints that close loops: their rows over the bodies' frames, and what they do to a body.
+"""Loop joints: constraint equations over the bodies' frames, and reactions.
 
-With p from the first body's point to the second's, a and u axes of the first and b of the second,
-a row is one of
-  p.e, along an axis of the body that both hang from, or of the world: both points meet;
-  p.u, across an axis of the first body: the second's point stays on a line;
-  a.b = 0: axes at right angles; such rows are regular where the joint is closed, and of a second
-  frame that is out by a small rotation d they are d along the axis that the row is named after;
-  (p.p - l^2)/2 = 0: the points stay l apart.
-Where the second body's point moves by dp and its frame rotates by dr, these change by dp.e, dp.u,
-dr.(b x a) and dp.p: each multiplier times what stands beside dp is a force on the second body at
-its point, beside dr a moment. The first body feels the opposite, at the same place.
+Let p be the vector from the first body's point to the second's, a and u axes of the first body and
+b an axis of the second. A constraint equation is one of
+  p.e = 0 for an axis e of the common ancestor, or of the world: the points coincide;
+  p.u = 0 for an axis u across a joint axis: the second point stays on a line;
+  a.b = 0: perpendicular axes. These equations are regular where the joint is closed. For a small
+  rotation error d they equal the component of d along the axis after which they are named;
+  (p.p - l^2)/2 = 0: the points keep the distance l.
+If the second point moves by dp and its frame rotates by dr, these change by dp.e, dp.u,
+dr.(b x a) and dp.p. The multiplier times the coefficient of dp is a force on the second body at its
+point; times the coefficient of dr it is a moment. The opposite acts on the first body there.
 
-Rows a.b = 0 hold after some other rotations too, and have no slope a quarter turn off. So each row
-of axes has its component of 2 tan(a/2) n besides, where the second frame is out by an angle a about
-n: of rotation matrices R, 2 (R_zy - R_yz, ...)/(1 + tr R). It has one zero and a slope everywhere
-but at half a turn. A reaction's branches are 1 where the joint is closed as is meant, and one of
-them is 0 or -1 elsewhere.
+Equations a.b = 0 have other solutions too, and gradients that vanish at a quarter turn. Each axis
+equation therefore also has a component of 2 tan(a/2) n, for a rotation error a about n:
+2 (R_zy - R_yz, ...)/(1 + tr R) for rotation matrices R. This has one zero, and a gradient
+everywhere except at half a turn. The branches of a reaction are 1 where the joint is closed; at
+other solutions one of them is 0 or -1.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def close(
 
 
 def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
-    """Rows of what is between two points."""
+    """Return the equations of the vector between two points."""
     along = {kind: _Pull(p[k], force=rational.ONE[k]) for k, kind in enumerate("xyz")}
     return {**along, "length": _Pull((dot(p, p) - length**2) / 2, force=p)}
 
@@ -107,7 +107,7 @@ def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
 def _of_axes(
     axes: Sequence[Sequence[float]], plane: bool, R: tuple[Matrix, Matrix], p: Vector
 ) -> dict[str, _Pull]:
-    """Rows of an axis of each body."""
+    """Return the equations of an axis of each body."""
     u, v, a = (apply(R[0], axis) for axis in perpendicular_axes(axes[0], plane))
     b = apply(R[1], _unit(axes[1]))
     half = (1 + dot(a, b)) / 2
@@ -121,7 +121,7 @@ def _of_axes(
 
 
 def _of_frames(first: Matrix, second: Matrix, plane: bool) -> Iterator[tuple[str, _Pull]]:
-    """Rows of frames that stand alike."""
+    """Yield the equations of equal orientation of two frames."""
     mine, other = transposed(first), transposed(second)
     if plane:
         half = (1 + dot(mine[0], other[0])) / 2
@@ -136,12 +136,12 @@ def _of_frames(first: Matrix, second: Matrix, plane: bool) -> Iterator[tuple[str
 def _at_right_angles(
     a: Vector, b: Vector, rotation_error: tuple[Expr, Expr] | None = None
 ) -> _Pull:
-    """a.b of an axis of the first body and one of the second."""
+    """Return the equation a.b = 0 of an axis of the first body and one of the second."""
     return _Pull(dot(a, b), moment=cross(b, a), rotation_error=rotation_error)
 
 
 def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterator[Expr]:
-    """Cosines that are 1 where frames stand as they are meant, and elsewhere -1 or 0."""
+    """Yield cosines that are 1 if frames are aligned, -1 or 0 at other solutions."""
     cosines = [dot(a, b) for a, b in zip(transposed(first), transposed(second), strict=True)]
     if "rx" in kinds:
         yield from cosines
@@ -174,9 +174,9 @@ def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
 def find_wrong_rotations(
     system: Mechanics,
 ) -> Callable[[Sequence[float], float, Mapping[str, float]], list[str]]:
-    """A function of q, t and parameters by name: the loops that are closed by another rotation.
+    """Return a function of q, t and parameters: names of loops with a wrong relative rotation.
 
-    Their rows of axes may hold all the same.
+    The axis equations of such loops may be satisfied.
     """
     cosines = [(r.name, branch) for r in system.reactions for branch in r.branches]
     if not cosines:

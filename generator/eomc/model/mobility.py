@@ -81,7 +81,7 @@ class Mobility:
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result as a dict that can be written as JSON."""
         return {
             "scene": self.scene, "d": self.d, "N": self.bodies + 1, "joints": dict(self.joints),
             "loops": dict(self.loops), "M": self.M, "coordinates": self.coordinates,
@@ -90,7 +90,7 @@ class Mobility:
 
 
 def count(scene: Scene) -> Mobility:
-    """The mobility of a scene. Raises EomcError for one without bodies."""
+    """Compute the mobility of a scene. Raises EomcError for one without bodies."""
     assembly = scene.assembly
     if not assembly or not assembly.bodies:
         names = [c.name for c in scene.coordinates]
@@ -220,7 +220,7 @@ def _formulas_fix(placed: Sequence[Body], d: int, rank: int, M: int) -> Iterator
 
 
 def _moves_nothing(at: Null, names: Sequence[str], scene: Scene) -> Iterator[str]:
-    """Coordinates that no body depends on, or that move bodies only in combinations."""
+    """Report coordinates that move no body, or that move bodies only in combinations."""
     ways = ["[energy] gives it inertia"] if any(scene.kinetic.names()) else []
     ways += ["a constraint decides it"] if scene.constrained else []
     result = f"D is singular unless {' or '.join(ways)}" if ways else "D is singular"
@@ -236,7 +236,7 @@ def _moves_nothing(at: Null, names: Sequence[str], scene: Scene) -> Iterator[str
 
 
 def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
-    """Joints one behind the other about the same line, or along the same direction."""
+    """Report consecutive joints about the same line or along the same direction."""
     by_name = {body.name: body for body in assembly.bodies}
     for body in assembly.bodies:
         if body.joint not in ("revolute", "prismatic"):
@@ -286,7 +286,7 @@ def _singular_start(kinematics: Kinematics, generic: Null) -> Iterator[str]:
 
 
 def _combination(row: Array, names: Sequence[str]) -> str:
-    """A motion in words: one coordinate, or rates in a fixed proportion."""
+    """Return a motion as text: one coordinate, or velocities in a fixed ratio."""
     those = _named(row, names)
     if len(those) == 1:
         return f"'{those[0]}'"

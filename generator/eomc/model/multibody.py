@@ -107,7 +107,7 @@ class Builder:
     # --- the tree --------------------------------------------------------------------------------
 
     def build_tree(self) -> None:
-        """Every body that is held by a joint."""
+        """Build all bodies with joints."""
         for body in self.assembly.bodies:
             if body.joint:
                 self._join(body)
@@ -156,7 +156,7 @@ class Builder:
         self, name: str, place: _Place, motion: str, axis: Sequence[float], moved: Expr,
         armature: Expr,
     ) -> _Place:  # fmt: skip
-        """The place behind one more elementary joint, which becomes a link."""
+        """Return the pose after one more elementary joint, which becomes a link."""
         terms = self.terms
         q = self._named(f"{name}_q", moved)
         self.moved.setdefault(name, []).append(q)
@@ -183,7 +183,7 @@ class Builder:
         return _Place(len(terms.links) - 1, ZERO, back, place.at, R)
 
     def _load(self, body: Body, place: _Place) -> None:
-        """The body's mass, on its link and in the energies."""
+        """Add the body's mass to its link and to the energies."""
         key, terms = f"body.{body.name}", self.terms
         mass = self.value(f"{key}.mass", body.mass)
         inertia = [self.value(f"{key}.inertia", entry) for entry in body.inertia]
@@ -209,7 +209,7 @@ class Builder:
         terms.tree_potential.append(self._weight(mass, position))
 
     def add_forces(self) -> None:
-        """Damping, friction and actuators of the joints."""
+        """Add damping, friction and actuators of the joints."""
         terms = self.terms
         for body in self.assembly.bodies:
             key, width = f"body.{body.name}", S.One
@@ -257,7 +257,7 @@ class Builder:
         return Frame(name, place.link, place.offset, place.rotation, place.angle)
 
     def _apply(self, key: str, force: Force) -> None:
-        """A force at a point of a body, a torque on it; virtual work is F.dp + tau.(dR R^T)."""
+        """Add a force at a point of a body, or a torque; virtual work is F.dp + tau.(dR R^T)."""
         place, applied = self.places[force.body], self.terms.applied
         F, torque = (
             self._vector(f"{key}.{name}", getattr(force, name)) for name in ("force", "torque")
@@ -275,7 +275,7 @@ class Builder:
         applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
 
     def _close(self, key: str, loop: Loop) -> Closed:
-        """A joint that closes a loop, or a gear."""
+        """Add a joint that closes a loop, or a gear."""
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
             return loops.gear(loop, ratio, self.value(f"{key}.offset", loop.offset))
@@ -406,7 +406,7 @@ class Builder:
         )
 
     def _named(self, wish: str, e: Expr, later: bool = False) -> Expr:
-        """A definition for `e`, unless it is a number, a name or its negative already."""
+        """Return a definition of `e`, unless it is a number, a symbol or its negative."""
         if e.is_number or e.is_Symbol or (-e).is_Symbol:
             return e
         name = wish

@@ -48,7 +48,7 @@ __all__ = [
 
 
 class System(Mechanics):
-    """d/dt dL/dqd - dL/dq + dR/dqd = Q, made of a scene or, by `make`, of expressions.
+    """d/dt dL/dqd - dL/dq + dR/dqd = Q, from a scene or, by `make`, from expressions.
 
     Its fields are those of `Mechanics`.
     """
@@ -58,7 +58,7 @@ class System(Mechanics):
 
     @property
     def size(self) -> str:
-        """The numbers of coordinates, inputs and parameters, in words."""
+        """The numbers of coordinates, inputs and parameters, as text."""
         counts = {
             "coordinate": self.coordinates, "input": self.inputs, "parameter": self.parameters,
         }  # fmt: skip
@@ -97,26 +97,26 @@ class System(Mechanics):
         friction: Mapping[Any, Any] | None = None,
         **unknown: Never,
     ) -> System:
-        r"""A system from SymPy expressions.
+        r"""Make a system from SymPy expressions.
 
-        coordinates: symbols, names or dynamicsymbols, or a mapping to their start (or (start,
-        rate)), numbers or formulas of parameters. Names stand for symbols, and formulas as scenes
-        have them for expressions. With plain symbols the velocity of `theta` is the symbol
-        `theta_dot`; with dynamicsymbols it is `theta.diff()`. parameters, inputs (to their default
-        signal) and definitions are mappings from symbols, outputs from names; `theta_ddot`, or the
-        second derivative of a dynamicsymbol, is an acceleration there. potential: P, or a
-        generalized potential with terms linear in the velocities, such as e*B*(y*x_dot - x*y_dot)/2
-        of a charge in a magnetic field, which are no part of the energy. constraints: mapping from
-        names to what is zero, over coordinates and t, or linear in the velocities; assembling the
-        start moves coordinates without a start (None, or a list of coordinates alone) and those in
-        `guess`. limits: mapping from inputs to pairs, the least and largest value that acts, None
-        for no such. events: mapping from names to what crosses zero, or to a dict as [[event]] has
-        it, {"when": y, "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of
-        adaptive steps; events have 1e-9 where none is given. picture: what it looks like, a dict as
-        [picture] of a scene has it, with expressions or formulas: {"lines": [[[0, 0], [x, -l]]]}.
-        Names that C can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. friction:
-        mapping from coordinates to Coulomb's, N or N m, which sticks and slides exactly, as [run]
-        friction = "stick". Raises EomcError where something is undeclared.
+        coordinates: symbols, names or dynamicsymbols, or a mapping from these to initial values or
+        pairs (value, velocity), as numbers or formulas of parameters. Names may replace symbols,
+        and formulas as in scenes may replace expressions. With plain symbols the velocity of
+        `theta` is the symbol `theta_dot`; with dynamicsymbols it is `theta.diff()`. parameters,
+        inputs (to their default signal) and definitions are mappings from symbols, outputs from
+        names; `theta_ddot`, or the second derivative of a dynamicsymbol, is an acceleration there.
+        potential: P, or a generalized potential with terms linear in the velocities, such as
+        e*B*(y*x_dot - x*y_dot)/2 of a charge in a magnetic field, which are no part of the energy.
+        constraints: mapping from names to expressions that are zero, over coordinates and t, or
+        linear in the velocities. Assembly changes coordinates without an initial value (None, or a
+        plain list of coordinates) and those in `guess`. limits: mapping from inputs to saturation
+        limits (lower, upper), None for no limit. events: mapping from names to event functions, or
+        to dicts as in [[event]], {"when": y, "direction": "falling", "action": "jump", y_dot:
+        -e*y_dot}. tolerance: of adaptive steps, 1e-9 by default if there are events. picture: a
+        dict as in [picture] of a scene, with expressions or formulas: {"lines": [[[0, 0], [x,
+        -l]]]}. Names that are invalid in C (`\theta`, `lambda`) are replaced, as listed in
+        `renamed`. friction: mapping from coordinates to Coulomb friction (N or N m) with stick-slip
+        transitions, as [run] friction = "stick". Raises EomcError for undeclared names.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
