@@ -1,4 +1,4 @@
-"""Rows of `check` about bodies: their energies and forces once more, from the scene's own tables.
+"""Checks of bodies: energies and forces recomputed from the scene's own tables.
 
 The reference starts from K and P, which multibody.py makes of a scene. Here every body becomes
 point masses that have its mass, its centre and its inertia, frames are composed joint by joint with
@@ -49,7 +49,7 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
 
 
 def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[float]:
-    """Yield widths of lines for such velocities, s. The best of them counts.
+    """Yield widths of lines for these velocities, s; the smallest error counts.
 
     First come fractions of the time in which a coordinate moves as far as in a motion. If that is
     short, as with a stiff spring, differences are rounding, so wider lines follow, up to one that
@@ -68,14 +68,14 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
 
 
 class Bodies:
-    """Rows on bodies."""
+    """Checks of bodies."""
 
     def __init__(self, check: Comparison, scene: Scene) -> None:
         self.check, self.scene = check, scene
         self.lines: dict[tuple[int, float], Line] = {}
 
     def report(self) -> None:
-        """Append the rows on bodies."""
+        """Append the checks of bodies."""
         limit = max(LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
@@ -83,11 +83,11 @@ class Bodies:
                            partial(self.compare, name))  # fmt: skip
 
     def compare(self, name: str) -> float:
-        """The largest difference over the states, of each with the line that suits it best."""
+        """Return the largest difference over the states, for each with the best line."""
         return self.check.largest(partial(self.off, name), STATES)
 
     def off(self, name: str, e: Expected) -> float:
-        """The difference at one state, in parts of its size; nan where nothing can be compared."""
+        """Return the relative difference at one state; nan if nothing can be compared."""
         s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
         if name == "power":  # that of forces alone
@@ -119,15 +119,15 @@ class Frame:
     angle: Vector
 
     def point(self, x: Vector) -> Vector:
-        """A point of the frame, (3,) or (n, 3), in the world."""
+        """Return a point of the frame, (3,) or (n, 3), in the world."""
         return self.at + rotate(self.turn, x)
 
     def slid(self, by: Vector, axis: Vector) -> Frame:
-        """The frame moved along its own axis."""
+        """Return the frame translated along its own axis."""
         return replace(self, at=self.point(by[:, None] * axis))
 
     def turned(self, by: Vector, axis: Vector) -> Frame:
-        """The frame turned about its own axis."""
+        """Return the frame rotated about its own axis."""
         half = by[:, None] / 2
         turn = np.hstack([np.cos(half), np.sin(half) * axis])
         return Frame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
@@ -184,11 +184,11 @@ class Line:
         return self.scene.assembly
 
     def evaluate(self, formula: Formula) -> Any:
-        """The value of a formula along the line."""
+        """Return the value of a formula along the line."""
         return formulas.evaluate(formula, self.algebra, self.value_of_name)
 
     def at_rest(self, formula: Formula) -> Any:
-        """The value of a formula where all velocities are zero: of a potential, the energy."""
+        """Return the value of a formula with all velocities zero: of a potential, the energy."""
         known, algebra = self.known, self.algebra
         self.known = {name: x for name, x in known.items() if name not in self.formulas}
         self.known |= {f"{c.name}_dot": 0 * self.nodes for c in self.scene.coordinates}
@@ -204,7 +204,7 @@ class Line:
         return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
 
     def value_of_name(self, name: str) -> Any:
-        """The value of a name along the line."""
+        """Return the value of a name along the line."""
         if name not in self.known:
             self.known[name] = self.limited(name, self.evaluate(self.formulas[name]))
         return self.known[name]
@@ -221,14 +221,14 @@ class Line:
         return np.array([float(self.evaluate(x)) for x in entries])
 
     def oriented(self, frame: Frame, body: Body) -> Frame:
-        """The frame turned as the body's tables say."""
+        """Return the frame with the rotation of the body's table."""
         for turn in body.rotation:
             axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
             frame = frame.turned(self.evaluate(turn.angle) + 0 * self.nodes, axis)
         return frame
 
     def attach(self, body: Body) -> None:
-        """The frame of a body on its joint, and the names of its centre."""
+        """Add the frame of a body after its joint, and the names of its centre."""
         frame = self.frames[body.parent]
         if body.offset:
             frame = replace(frame, at=frame.point(self.vector(body.offset)))
@@ -265,7 +265,7 @@ class Line:
         return [b for b in self.assembly.bodies if b.name not in self.immovable_bodies()]
 
     def immovable_bodies(self) -> set[str]:
-        """The bodies that nothing moves."""
+        """Return the names of the bodies that are fixed to the world."""
         immovable = {WORLD}
         for body in self.assembly.bodies:
             if body.joint == "fixed" and body.parent in immovable:
@@ -273,11 +273,11 @@ class Line:
         return immovable
 
     def at_middle(self, values: Any) -> float:
-        """The value in the middle of the line."""
+        """Return the value in the middle of the line."""
         return float((values + 0 * self.nodes)[self.middle])
 
     def points(self, body: Body) -> list[tuple[float, Vector]]:
-        """Point masses with the body's mass, centre and inertia, some of them negative.
+        """Return point masses with the body's mass, centre and inertia; some are negative.
 
         With J = tr(I)/2 - I, the second moments of the mass: two for each eigenvector of J at a
         unit's distance from the centre, the rest in the centre.
@@ -327,7 +327,7 @@ class Line:
         return np.asarray(np.linalg.norm(b - a, axis=1))
 
     def spring(self, spring: Spring) -> Vector:
-        """k/2 times the square of what it is longer than at rest."""
+        """Return the energy of a spring, k/2 times its squared extension."""
         longer = self.length(spring) - self.evaluate(spring.length)
         energy: Vector = self.evaluate(spring.stiffness) / 2 * longer**2
         return energy
@@ -335,7 +335,7 @@ class Line:
     # --- forces ----------------------------------------------------------------------------------
 
     def forces(self) -> Vector:
-        """The power of forces, friction and drives at joints, without that of dissipation."""
+        """Return the power of forces, friction and drives, without that of dissipation."""
         power = 0 * self.nodes
         for name, formula in self.scene.forces.items():
             power = power + self.evaluate(formula) * self.known[f"{name}_dot"]
@@ -379,7 +379,7 @@ class Line:
         return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
 
     def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
-        """The velocity of a point of a frame, and the frame's angular velocity, 2 dq/dt q*."""
+        """Return the velocity of a point of a frame, and the angular velocity 2 dq/dt q*."""
         turning = quaternion_product(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
         return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
@@ -396,12 +396,12 @@ class Line:
         return total
 
     def loses(self) -> bool:
-        """Whether there is any R."""
+        """Return whether the scene has dissipation R."""
         joints = any(body.damping for body in self.assembly.bodies)
         return bool(joints or self.assembly.dampers or self.scene.dissipation.text != "0")
 
     def dissipation(self) -> Vector:
-        """R of the scene, of joints and of dampers."""
+        """Return R of the scene, of joints and of dampers."""
         R: Vector = self.evaluate(self.scene.dissipation) + 0 * self.nodes
         for body in self.assembly.bodies:
             for damping, rate in zip(body.damping, self.rates(body), strict=False):
@@ -413,20 +413,20 @@ class Line:
 
 @cache
 def _interpolation(n: int) -> tuple[Vector, Vector]:
-    """n + 1 nodes on [-1, 1], and the matrix from values there to slopes there."""
+    """Return n + 1 nodes on [-1, 1], and the matrix from values to derivatives at them."""
     nodes = chebyshev.chebpts2(n + 1)
     slopes = chebyshev.chebval(nodes, chebyshev.chebder(np.eye(n + 1))).T
     return nodes, slopes @ np.linalg.inv(chebyshev.chebvander(nodes, n))
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    """a x b row by row; numpy.cross takes four times as long for so few."""
+    """Return a x b row by row, four times as fast as numpy.cross for few rows."""
     (a0, a1, a2), (b0, b1, b2) = a.T, b.T
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)
 
 
 def quaternion_product(a: Vector, b: Vector) -> Vector:
-    """The product of quaternions (n, 4), the real part first: b, then a."""
+    """Return the product a b of quaternions (n, 4), real part first."""
     w, x = a[:, :1], a[:, 1:]
     v, y = b[:, :1], b[:, 1:]
     real = w * v - np.sum(x * y, axis=1, keepdims=True)
@@ -434,7 +434,7 @@ def quaternion_product(a: Vector, b: Vector) -> Vector:
 
 
 def rotate(turn: Vector, x: Vector) -> Vector:
-    """A vector turned by a unit quaternion: x + 2 w (a x) + 2 a (a x), a its vector part."""
+    """Return vectors rotated by unit quaternions (w, a): x + 2 w a x x + 2 a x (a x x)."""
     w, a = turn[:, :1], turn[:, 1:]
     across = 2 * _cross(a, np.broadcast_to(x, a.shape))
     return np.asarray(x + w * across + _cross(a, across))

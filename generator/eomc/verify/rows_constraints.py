@@ -46,7 +46,7 @@ UNITS = "units of rounding"
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene with constraints."""
+    """Append the checks of a scene with constraints."""
     rows = FormRows(check, check.module)
     for name in VALUES:
         check.row(name, LIMIT, UNITS, partial(check.value, name))
@@ -70,7 +70,7 @@ def report(check: Comparison) -> None:
 
 
 def _values(check: Comparison, module: Any) -> float:
-    """All values of another form at all states."""
+    """Return the largest error of all values of another form at all states."""
 
     def error(e: Expected) -> float:
         entries = ((evaluate_module(module, n, e.state), e.value[n], e.size[n]) for n in VALUES)
@@ -80,7 +80,7 @@ def _values(check: Comparison, module: Any) -> float:
 
 
 class FormRows:
-    """Measurements on the module of one form of C."""
+    """Checks of the module of one form of C."""
 
     def __init__(self, check: Comparison, module: Any) -> None:
         self.check, self.module, self.system = check, module, check.system
@@ -202,7 +202,7 @@ class FormRows:
     def _reaction_power(
         self, loop: Loop, s: State, moving: Vector, width: float, force: Vector
     ) -> float:
-        """The power of a reaction at velocities `moving`, less that at rest, per their sum."""
+        """Return the power of a reaction at velocities `moving`, less that at rest, per their sum."""
         total, scene = 0.0, self.system.scene
         assert scene is not None
         for sign, qd in ((1, moving), (-1, 0 * moving)):

@@ -1,4 +1,4 @@
-"""Rows of `check` about frames, inverse dynamics and momenta: by the bodies' own tables once more.
+"""Checks of frames, inverse dynamics and momenta, recomputed from the scene's own tables.
 
 As in rows_bodies.py frames are composed of quaternions along a line through the state, here bent by
 accelerations, and everything else is a derivative of the interpolating polynomial.
@@ -25,7 +25,7 @@ TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 
 
 def report(check: Comparison, scene: Scene) -> None:
-    """Add the rows of what the scene asks for."""
+    """Append the checks of those functions that the scene has."""
     run, eps = check.system.run, check.eps
     for module, form in check.forms:
         frames = _Frames(check, module, scene)
@@ -45,7 +45,7 @@ def report(check: Comparison, scene: Scene) -> None:
 
 
 def inverse_dynamics(check: Comparison) -> None:
-    """Add the rows of D qdd + bias, against the reference."""
+    """Append the checks of D qdd + bias against the reference."""
     for module, form in check.forms:
         measure = partial(check.largest, partial(_inverse, check, module), STATES)
         check.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
@@ -80,7 +80,7 @@ class _Frames:
     def off(
         self, values: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
     ) -> float:
-        """The difference in parts of the largest number, which is `least` at rest."""
+        """Return the difference relative to the largest number, at least `least`."""
         best = np.inf
         for line in self.lines(*state):
             with np.errstate(all="ignore"):

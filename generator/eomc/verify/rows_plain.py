@@ -1,4 +1,4 @@
-"""The plain form of C compared with the reference, and with the fast form.
+"""Comparison of the plain form of C with the reference and with the fast form.
 
 Values, one step and a run against the reference, as the fast form is; then all that both forms
 compute, one against the other. In units of rounding, as in `check`, whose rows these are.
@@ -40,7 +40,7 @@ COMPARED_VALUES = (*VALUES, "acceleration")
 
 
 def rows(check: Comparison) -> None:
-    """Add the rows of the plain form, where there is one."""
+    """Append the checks of the plain form, if there is one."""
     if check.plain is None:
         return
     unit, plain = "units of rounding", check.plain
@@ -100,7 +100,7 @@ def _slopes(module: Any, s: State) -> Vector | None:
 
 
 def _linearization(check: Comparison, plain: Any) -> float:
-    """The derivatives at a few states, against what a rounding of the inputs makes of them."""
+    """Compare derivatives at a few states, in units of the effect of rounded inputs."""
 
     def error(e: Expected) -> float:
         one, other = (_slopes(module, e.state) for module in (check.module, plain))
@@ -119,7 +119,7 @@ def _linearization(check: Comparison, plain: Any) -> float:
 
 
 def _inputs(check: Comparison, s: State) -> Vector:
-    """How far coordinates, rates, inputs and parameters go, in the order of `_slopes`."""
+    """Return the scales of q, qd, inputs and parameters, in the order of `_slopes`."""
     params = list((s.params or check.sampler.defaults).values())
     sizes = np.abs([*(np.zeros(len(check.system.inputs)) if s.u is None else s.u), *params])
     return np.array([*check.sampler.spread, *check.sampler.speed, *np.where(sizes > 0, sizes, 1.0)])

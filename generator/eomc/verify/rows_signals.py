@@ -1,4 +1,4 @@
-"""A row of `check` about closed loops: A of signals that answer the state, in eighty digits."""
+"""Check of closed loops: A with feedback signals, in eighty digits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eomc.verify.sampling import Expected
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene with a smooth feedback."""
+    """Append the checks of a scene with smooth feedback."""
     if not check.system.run.needs_derivatives or not _is_feedback(check.system):
         return
     signals = tuple(Output(i.name, i.signal) for i in check.system.inputs)
@@ -29,7 +29,7 @@ def report(check: Comparison) -> None:
 
 
 def _is_feedback(system: System) -> bool:
-    """Whether a signal answers the state, and none jumps."""
+    """Return whether a signal depends on the state, and none has discontinuities."""
     known = resolved(system.definitions)
     signals = sympy.Tuple(*(i.signal.xreplace(known) for i in system.inputs))
     moves = signals.free_symbols & {*system.q, *system.qd}
@@ -37,7 +37,7 @@ def _is_feedback(system: System) -> bool:
 
 
 def _loop(check: Comparison, module: Any, formulas: Formulas) -> float:
-    """A of the closed loop beside A + B du/dx, by the module's own A and B."""
+    """Compare A of the closed loop with A + B du/dx, from the module's own A and B."""
 
     def error(e: Expected) -> float:
         s = replace(e.state, u=None)

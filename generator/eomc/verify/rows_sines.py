@@ -1,4 +1,4 @@
-"""A row of `check` about sines and cosines where they all but vanish, up to where they are inlined.
+"""Check of sines and cosines near their zeros, as far as they are inlined.
 
 Beside a multiple of a quarter turn an error of the reduction by 1e-17 is lost in most sums, but not
 in an entry of D or g that is one sine times something else. The reference says which are: at
@@ -38,7 +38,7 @@ def report(check: Comparison) -> None:
 
 
 def vanishing(check: Comparison) -> float | Measurement:
-    """The largest error of an entry that is one sine times something, in roundings of itself.
+    """Return the largest relative error of entries proportional to one sine, in roundings.
 
     It is so at all quarter turns where that sine vanishes: what is so at some may be a sum that
     cancels there, as 1 - tanh(x)**2 does far out.
@@ -74,7 +74,7 @@ def _moved(e: Expected) -> Iterator[Expected]:
 def _entry_errors(
     check: Comparison, i: int, quarters: int, e: Expected
 ) -> Iterator[tuple[tuple[str, int], float]]:
-    """The errors of entries with coordinate i at so many quarter turns."""
+    """Return the errors of entries with coordinate i near this number of quarter turns."""
     s, angle = e.state, quarters * (math.pi / 2)
     angles = angle + np.array(NEIGHBOURS) * math.ulp(angle)
     sines = np.array([math.cos(x) if quarters % 2 else math.sin(x) for x in angles.tolist()])
