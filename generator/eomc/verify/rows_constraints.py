@@ -202,7 +202,7 @@ class FormRows:
     def _reaction_power(
         self, loop: Loop, s: State, moving: Vector, width: float, force: Vector
     ) -> float:
-        """Return the power of a reaction at velocities `moving`, less that at rest, per their sum."""
+        """Return a reaction's power at velocities `moving`, less that at rest, per their sum."""
         total, scene = 0.0, self.system.scene
         assert scene is not None
         for sign, qd in ((1, moving), (-1, 0 * moving)):
