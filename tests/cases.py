@@ -70,7 +70,7 @@ FEW_ALIKE = (
 
 def fast_kit(made: Sources) -> dict[str, str]:
     """The generated files, the fast form's header and source in the place of the plain ones."""
-    flat = {f: t for f, t in made.files.items() if "/" not in f or f.startswith("_runtime/")}
+    flat = {f: text for f, text in made.files.items() if "/" not in f}
     fast = {f[5:]: text for f, text in made.files.items() if f.startswith("fast/")}
     return flat | fast
 

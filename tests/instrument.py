@@ -33,7 +33,8 @@ class Shipped:
         self.compiler = compiling.find_compiler().command
         made = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
-        files = fast_kit(made)
+        runtime = {f: text for f, text in made.files.items() if f.startswith("_runtime/")}
+        files = fast_kit(made) | runtime
         write_files(files, folder)
         self.source = files[f"{self.name}.c"]
         ffi = cffi.FFI()
