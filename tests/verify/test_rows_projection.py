@@ -26,13 +26,13 @@ class Projecting:
     wrong: tuple[int, ...] = ()
     asked: list[Sequence[str]] = field(default_factory=list)
 
-    def project(self, q: Any, qd: Any, *, t: float, params: Any, held: Sequence[str]) -> Any:
+    def project(self, q: Any, qd: Any, *, t: float, params: Any, fixed: Sequence[str]) -> Any:
         names = [c.name for c in SYSTEM.coordinates]
-        of = tuple(k for k, name in enumerate(names) if name in held)
+        of = tuple(k for k, name in enumerate(names) if name in fixed)
         found = np.array(symbolic.reference_for(SYSTEM).project(q, qd, t, params, of))
-        self.asked.append(held)
+        self.asked.append(fixed)
         free = [k for k in range(len(names)) if k not in of]
-        found[:, free] *= 1 + 1e-9 * (len(held) in self.wrong)
+        found[:, free] *= 1 + 1e-9 * (len(fixed) in self.wrong)
         return found
 
 
@@ -61,7 +61,7 @@ def test_what_is_held_and_moves_all_the_same_fails(monkeypatch: pytest.MonkeyPat
     class Loose(Projecting):
         def project(self, q: Any, qd: Any, **how: Any) -> Any:
             found = super().project(q, qd, **how)
-            return found * (1 + 4e-16) if how["held"] else found
+            return found * (1 + 4e-16) if how["fixed"] else found
 
     found = rows(monkeypatch, Loose())
     assert [name for name, row in found.items() if not row.passed] == ["project, held"]
