@@ -133,7 +133,7 @@ MAX_INHERITANCE_DEPTH = 10
 MAX_LONG_SIGNATURES = 47  # functions with more than seven parameters
 MAX_PRIVATE_ACCESSES = 440  # of attributes of objects other than self
 MAX_NUMERIC_CONSTANTS = 421  # at module level
-MAX_REPEATED_CLASS_NAMES = 43
+MAX_REPEATED_CLASS_NAMES = 34
 MAX_MODULES = 317
 
 

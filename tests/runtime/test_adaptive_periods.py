@@ -134,7 +134,7 @@ def test_a_batch_by_tables_is_each_alone_with_its_events(sampled: ModuleType) ->
         assert (run.q[k, -1] == alone.q[-1]).all() and (run.u[k] == alone.u[[0, -1]]).all()
         assert (run.saturated[k] == alone.saturated[[0, -1]]).all()
         for name in ("upright", "noon"):
-            assert run.events[name].of(k).t.tolist() == alone.events[name].t.tolist()
+            assert run.events[name].for_instance(k).t.tolist() == alone.events[name].t.tolist()
 
 
 def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> None:

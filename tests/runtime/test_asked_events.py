@@ -102,7 +102,9 @@ def test_they_stop_and_jump(oscillator: ModuleType) -> None:
     both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **stop)
     assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
     assert both.stopped.tolist() == ["wall", ""] and both.events["wall"].instance.tolist() == [0]
-    assert both.events["turns"].of(1).t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
+    assert both.events["turns"].for_instance(1).t == pytest.approx(
+        (np.arange(3) + 0.5) * math.pi, abs=TOL
+    )
     run = oscillator.simulate(duration=3.0, params=oscillator.Params(at_drop=0), events=BESIDE)
     assert run["m"][-1] == 4 and run["c"][-1] == 4
 

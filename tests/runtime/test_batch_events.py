@@ -37,7 +37,7 @@ def test_each_has_those_of_its_run_alone(balls: ModuleType) -> None:
     for k in range(4):
         alone = balls.simulate(params={"far": FAR[k], "e": E[k]}, duration=2.0)
         for name, found in run.events.items():
-            mine, expected = found.of(k), alone.events[name]
+            mine, expected = found.for_instance(k), alone.events[name]
             for what in ("t", "q", "qd"):
                 assert np.array_equal(getattr(mine, what), getattr(expected, what)), (k, name)
         assert run.stopped[k] == alone.stopped
@@ -54,7 +54,7 @@ def test_impacts_are_where_the_closed_form_has_them(balls: ModuleType) -> None:
     for k in (0, 3):
         flights = 2 * first * E[k] ** np.arange(1, 5)
         exact = first + np.concatenate([[0], np.cumsum(flights)])
-        found = run.events["impact"].of(k).t
+        found = run.events["impact"].for_instance(k).t
         assert found == pytest.approx(exact[: len(found)], rel=1e-13) and len(found) >= 2
     assert run.limit[2] == pytest.approx(first * (1 + 0.5) / (1 - 0.5), rel=1e-10)
     assert np.isnan(run.limit[[0, 1, 3]]).all()
@@ -66,13 +66,13 @@ def test_impacts_are_where_the_closed_form_has_them(balls: ModuleType) -> None:
 def test_an_instance_that_there_is_not_is_refused(balls: ModuleType) -> None:
     """Also by a name, or as an array; -1 is the last, as of a list."""
     impacts = balls.simulate_batch(**HOW).events["impact"]
-    assert np.array_equal(impacts.of(-1).t, impacts.of(np.int64(3)).t)
+    assert np.array_equal(impacts.for_instance(-1).t, impacts.for_instance(np.int64(3)).t)
     for k in (4, -5):
         with pytest.raises(IndexError, match=f"there is no instance {k}: they are 0 to 3"):
-            impacts.of(k)
+            impacts.for_instance(k)
     for k in ("impact", 1.0, None):
         with pytest.raises(TypeError, match=r"of: .* is no number of an instance"):
-            impacts.of(k)
+            impacts.for_instance(k)
 
 
 def test_events_are_told_in_words_and_by_their_names(balls: ModuleType) -> None:

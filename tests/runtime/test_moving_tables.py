@@ -65,7 +65,7 @@ def test_a_ball_does_not_fall_through_a_table_that_moves(tmp_path: Path, e: floa
     runs = eomc.load(file, BUILDS).simulate_batch(params={"A": A, "e": e})
     assert not (runs.q[:, :, 0] < -1.001 * A[:, None]).any()  # NaN behind an end
     assert set(runs.status) <= {"ok", "accumulated"}
-    flights = runs.events["impact"].of(90)
+    flights = runs.events["impact"].for_instance(90)
     assert len(flights) > 10
     # free flight from the first impact to the second, in closed form
     t, v = flights.t[:2], -e * flights.qd[0, 0] + (1 + e) * A[90] * 30 * np.cos(30 * flights.t[0])

@@ -205,7 +205,7 @@ def test_each_of_a_batch_is_its_run_alone(swing: ModuleType) -> None:
     for k, start in enumerate(starts):
         alone = swing.simulate(start, duration=2.0, method="dp8")
         for name in ("below", "wall"):
-            one, own = alone.events[name], runs.events[name].of(k)
+            one, own = alone.events[name], runs.events[name].for_instance(k)
             assert own.t.tolist() == one.t.tolist() and own.q.tolist() == one.q.tolist()
         assert runs.q[k, -1].tolist() == alone.q[-1].tolist()
         assert runs.evaluations[k] >= alone.evaluations > 14 * alone.steps

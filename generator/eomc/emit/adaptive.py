@@ -106,12 +106,12 @@ class Stepping:
     @property
     def workspace(self) -> CArgument:
         """The workspace of a run."""
-        return c.filled(memory(self.functions), "memory")
+        return c.output_array(memory(self.functions), "memory")
 
     @property
     def state(self) -> CArgument:
         """The state of a run."""
-        return c.filled(f"{self.method}_adaptive_state", "x")
+        return c.output_array(f"{self.method}_adaptive_state", "x")
 
     def number(self, name: str) -> CArgument:
         """Return an argument that is a number."""
@@ -121,13 +121,13 @@ class Stepping:
     def solve_stages(self) -> CFunction:
         """The function that solves for the accelerations at the stages of a step."""
         real = self.functions.real
-        out = c.filled(f"{self.method}_stages", "a")
-        measures = (c.filled(real, name) for name in ("scale", "coarse", "rough", "beyond"))
-        newton = c.given(f"{self.method}_newton", "m")
+        out = c.output_array(f"{self.method}_stages", "a")
+        measures = (c.output_array(real, name) for name in ("scale", "coarse", "rough", "beyond"))
+        newton = c.input_array(f"{self.method}_newton", "m")
         limits = (self.number("tol"), self.number("most"))
         arguments = (*self.form.around, *self.functions.moves_stages, *limits, newton)
-        results = (*measures, c.filled("int", "sweeps"))
-        cap = [c.given(real, "cap")] if self.may_rest else []
+        results = (*measures, c.output_array("int", "sweeps"))
+        cap = [c.input_array(real, "cap")] if self.may_rest else []
         return c.static(f"{self.method}_solve_stages", "int", out, *arguments, *cap, *results)
 
     @property
@@ -142,22 +142,22 @@ class Stepping:
     def rounding_cap(self) -> CFunction:
         """The function for the effect of rounding errors on the accelerations of a step."""
         real = self.functions.real
-        values = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
+        values = (c.input_array(f"{self.method}_stages", "a"), c.input_array(real, "scale"))
         others = (*self.form.around, *self.functions.moves_stages)
-        arguments = (c.filled(real, "cap"), *values, *others, self.number("tol"))
+        arguments = (c.output_array(real, "cap"), *values, *others, self.number("tol"))
         return c.static(f"{self.method}_cap_scales", "int", *arguments)
 
     @cached_property
     def forces(self) -> CFunction:
         """The function for the accelerations at a state."""
-        out = c.filled(self.functions.real, "f")
+        out = c.output_array(self.functions.real, "f")
         arguments = (a for a in self.form.around if a.name != "h")
         return c.static(f"{self.method}_forces", "int", out, *arguments)
 
     @cached_property
     def slopes(self) -> CFunction:
         """The function for the derivatives of the accelerations."""
-        out = c.filled(f"{self.method}_newton", "m")
+        out = c.output_array(f"{self.method}_newton", "m")
         return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
@@ -172,8 +172,8 @@ class Stepping:
     @cached_property
     def interpolate(self) -> CFunction:
         """The function for the state within the last step."""
-        out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
-        state = c.given(f"{self.method}_adaptive_state", "x")
+        out = tuple(c.output_array(self.functions.real, name) for name in ("q_at", "qd_at"))
+        state = c.input_array(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
         return c.static(f"{self.method}_interpolate", "void", *out, *arguments, self.workspace)
 
@@ -314,7 +314,7 @@ def max_events_per_step(system: System) -> int:
 
 def row_storage(stepping: Stepping) -> CFunction:
     """Return the function that stores a state in a row."""
-    arguments = (c.filled(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
+    arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 
 

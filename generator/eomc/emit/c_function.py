@@ -30,12 +30,12 @@ class CArgument:
         return f"{self.type}{gap}{self.name}" + (f"[{self.extent}]" if self.extent else "")
 
 
-def given(type: str, name: str, extent: str = "") -> CArgument:
+def input_array(type: str, name: str, extent: str = "") -> CArgument:
     """Return an argument for an array that is read; without a size, a pointer that may be NULL."""
     return CArgument(f"const {type}" if extent else f"const {type} *", name, extent)
 
 
-def filled(type: str, name: str, extent: str = "") -> CArgument:
+def output_array(type: str, name: str, extent: str = "") -> CArgument:
     """Return an argument for an array that is written."""
     return CArgument(type if extent else f"{type} *", name, extent)
 

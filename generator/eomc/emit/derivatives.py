@@ -25,7 +25,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
         return
     inputs, suffix = bool(target.system.inputs), real.function_suffix
     state = plain.arguments("q", "qd", *plain.state[2:], "u", "p")
-    J = c.filled(plain.real, "J")
+    J = c.output_array(plain.real, "J")
     rates = c.static(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
     feedback = ""
     if "signal_slopes" in target.program:
@@ -72,7 +72,7 @@ def _moved(plain: Functions) -> CFunction:
     """Return the static function that projects a step's end and its derivatives onto the
     constraints.
     """
-    state = (c.filled(plain.real, "X"), *(c.filled(plain.real, n) for n in "rv"))
+    state = (c.output_array(plain.real, "X"), *(c.output_array(plain.real, n) for n in "rv"))
     arguments_read = plain.read(plain.target.program["projection_along"])
     other_arguments = (
         plain.argument("q"),

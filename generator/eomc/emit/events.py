@@ -150,20 +150,20 @@ def _events(stepping: Stepping) -> Events:
     evaluated = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
     argument_names = {a.name for f in evaluated for a in f.arguments}
     values, number, k = evaluated[0], stepping.number, CArgument("int", "k")
-    read = c.given(f"{method}_adaptive_state", "x")
+    read = c.input_array(f"{method}_adaptive_state", "x")
     # arguments of the formulas besides the state
     extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
 
-    values_at = (c.filled(real, "g"), read, number("z"), *extra)
+    values_at = (c.output_array(real, "g"), read, number("z"), *extra)
     evaluate_events = c.static(f"{method}_evaluate_events", "void", *values_at)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
     refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
     above = tuple(int(e.above) for e in system.events if "begins" in target.program)
     find_root = c.static(
-        f"{method}_find_root", real, stepping.state, k, number("from"), c.given(real, "g"),
+        f"{method}_find_root", real, stepping.state, k, number("from"), c.input_array(real, "g"),
         *([number("noise")] if above else []), *extra,
     )  # fmt: skip
-    outputs = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
+    outputs = [c.output_array(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
     rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
     event_step = c.static(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
@@ -226,7 +226,7 @@ def _events(stepping: Stepping) -> Events:
 
 def _rounding(stepping: Stepping, extra: Sequence[CArgument]) -> dict[str, Any]:
     """Return the function for rounding errors of an event function, its call and the call in it."""
-    read, k = c.given(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
+    read, k = c.input_array(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
     function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
     state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
     values = stepping.functions.public.evaluation("events").call(events="value", **state)

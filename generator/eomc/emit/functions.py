@@ -115,11 +115,11 @@ class Functions:
     def argument(self, name: str) -> CArgument:
         """Return one of the usual arguments: q, qd, qdd, t, h, u, p."""
         if name in (*STATE, "qdd"):
-            return c.given(self.real, name, self.NQ)
+            return c.input_array(self.real, name, self.NQ)
         if name == "u":
-            return c.given(self.real, name)
+            return c.input_array(self.real, name)
         if name == "p":
-            return c.given(f"{self.prefix}_params", name)
+            return c.input_array(f"{self.prefix}_params", name)
         return CArgument(self.real, name)
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
@@ -151,7 +151,9 @@ class Functions:
         """The arguments that a static function needs, arrays as pointers."""
         needed = [n for n in names if function.uses & self.supplied_names[n]]
         arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
-        return tuple(c.given(self.real, n) if n in arrays else self.argument(n) for n in needed)
+        return tuple(
+            c.input_array(self.real, n) if n in arrays else self.argument(n) for n in needed
+        )
 
     # the scene's signals
 
@@ -162,7 +164,7 @@ class Functions:
             return None
         state = STATE if self.target.signal_state else ()
         names = (*(["t"] if self.target.signal_t else []), *state)
-        out = c.filled(self.real, "u", self.NU)
+        out = c.output_array(self.real, "u", self.NU)
         arguments = (out, *map(self.argument, names), *self.arguments("p"))
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
@@ -239,8 +241,8 @@ class Functions:
                 P,
                 self.status if failures else "void",
                 (
-                    *([c.filled(type, "s")] if part.reads or part.keeps else []),
-                    *([c.filled(self.real, out)] if part.outputs else []),
+                    *([c.output_array(type, "s")] if part.reads or part.keeps else []),
+                    *([c.output_array(self.real, out)] if part.outputs else []),
                     *self.pointers(f, *arguments),
                 ),
                 (self.loads(f), *body.early, *body.blocks, Block("", ends)),
@@ -347,11 +349,11 @@ class Functions:
             failures = c.unless(body.failures, self.singular)
         if fails:
             blocks += (Block("", (*failures, c.result(self.ok))),)
-        along = (c.given(self.real, "along"),) if out == "column" else ()
+        along = (c.input_array(self.real, "along"),) if out == "column" else ()
         function_ = CFunction(
             f"{self.prefix}_{name}",
             self.status if fails else "void",
-            (c.filled(self.real, out), *along, *self.pointers(function, *READ)),
+            (c.output_array(self.real, out), *along, *self.pointers(function, *READ)),
             blocks,
             self.read(function, follows=False) | {out},
             "static",
@@ -383,7 +385,7 @@ class Functions:
         if self.rotation_errors is None:
             return None
         read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]
-        out = (c.filled(self.real, "residual"), c.filled(self.real, "A"))
+        out = (c.output_array(self.real, "residual"), c.output_array(self.real, "A"))
         return c.static(f"{self.prefix}_rotated", "void", *out, *read)
 
     @cached_property
@@ -424,7 +426,7 @@ class Functions:
     def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
         """The arguments of a projection: the state to be changed, and the others."""
         arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
-        state = tuple(c.filled(self.real, n) for n in "rv")
+        state = tuple(c.output_array(self.real, n) for n in "rv")
         return state, self.arguments(*(n for n in ("t", "p") if n in arguments))
 
     @cached_property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from eomc.emit.c_function import CArgument, CFunction, filled, given, member
+from eomc.emit.c_function import CArgument, CFunction, input_array, member, output_array
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, c_array_size, refuses, source, takes_qdd, takes_t
 
@@ -22,15 +22,15 @@ class Public:
         """Return those of the usual arguments q, qd, t, h, u, p that this scene has."""
         target, real = self.target, self.target.real.name
         arguments = {
-            "q": given(real, "q", f"{target.PREFIX}_NQ"),
-            "qd": given(real, "qd", f"{target.PREFIX}_NQ"),
-            "qdd": given(real, "qdd", f"{target.PREFIX}_NQ"),
-            "wrenches": given(real, "wrenches", c_array_size(target, "f*twist")),
-            "lambda": given(real, "lambda", c_array_size(target, "c")),
+            "q": input_array(real, "q", f"{target.PREFIX}_NQ"),
+            "qd": input_array(real, "qd", f"{target.PREFIX}_NQ"),
+            "qdd": input_array(real, "qdd", f"{target.PREFIX}_NQ"),
+            "wrenches": input_array(real, "wrenches", c_array_size(target, "f*twist")),
+            "lambda": input_array(real, "lambda", c_array_size(target, "c")),
             "t": CArgument(real, "t") if target.driven else None,
             "h": CArgument(real, "h"),
-            "u": given(real, "u") if target.system.inputs else None,
-            "p": given(f"{target.prefix}_params", "p") if target.needs_p else None,
+            "u": input_array(real, "u") if target.system.inputs else None,
+            "p": input_array(f"{target.prefix}_params", "p") if target.needs_p else None,
         }
         return tuple(a for name in names if (a := arguments[name]))
 
@@ -49,7 +49,11 @@ class Public:
             f"{target.prefix}_{name}",
             f"{target.prefix}_status" if refuses(target, name) else result_type,
             (
-                *([filled(real, kind.out, c_array_size(target, kind.shape))] if kind.out else []),
+                *(
+                    [output_array(real, kind.out, c_array_size(target, kind.shape))]
+                    if kind.out
+                    else []
+                ),
                 *(t if signal else ()),
                 *(self.arguments(*state) if not signal or target.signal_state else ()),
                 *(self.arguments("qdd") if takes_qdd(target, name) else ()),
@@ -63,7 +67,7 @@ class Public:
     def acceleration(self) -> CFunction:
         """The function for qdd, which returns a status."""
         target = self.target
-        qdd = filled(target.real.name, "qdd", f"{target.PREFIX}_NQ")
+        qdd = output_array(target.real.name, "qdd", f"{target.PREFIX}_NQ")
         return self._status("acceleration", qdd, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
@@ -75,7 +79,7 @@ class Public:
             widths["B"] = f"{target.PREFIX}_NU"
         # C++20 has no product of two enumerations
         out = (
-            filled(target.real.name, name, f"{NQ}*{w}" if w == NQ else f"(int){NQ}*{w}")
+            output_array(target.real.name, name, f"{NQ}*{w}" if w == NQ else f"(int){NQ}*{w}")
             for name, w in widths.items()
         )
         return self._status("linearization", *out, *self.arguments(*STATE, "t", "u", "p"))
@@ -85,7 +89,7 @@ class Public:
         """The function that projects a state onto the constraints, which returns a status."""
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
         t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
-        fixed = given("int", "fixed")
+        fixed = input_array("int", "fixed")
         return self._status("project", *self._state, *t, fixed, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
@@ -105,9 +109,9 @@ class Public:
     def derivative(self, method: str) -> CFunction:
         """Return the function for Phi and Gamma of one step, which returns a status."""
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
-        out = [filled(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
+        out = [output_array(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
         if target.system.inputs:
-            out.append(filled(target.real.name, "Gamma", f"2*{NQ}*{target.PREFIX}_NU"))
+            out.append(output_array(target.real.name, "Gamma", f"2*{NQ}*{target.PREFIX}_NU"))
         return self._status(
             f"{method}_derivative", *out, *self.arguments(*STATE, "t", "h", "u", "p")
         )
@@ -134,8 +138,8 @@ class Public:
             f"{target.prefix}_{method}_batch",
             "void",
             (
-                CArgument("long", "count"), filled(real, "q"), filled(real, "qd"), *self._steps,
-                *self.arguments("u"), *(strides[:2] if target.system.inputs else []),
+                CArgument("long", "count"), output_array(real, "q"), output_array(real, "qd"),
+                *self._steps, *self.arguments("u"), *(strides[:2] if target.system.inputs else []),
                 *self._row_output, CArgument("long", "row_count"), *self.arguments("p"),
                 *(strides[2:] if target.needs_p else []),
                 CArgument("long *", "completed"), CArgument("int *", "status"),
@@ -150,9 +154,10 @@ class Public:
             name,
             "long",
             (
-                *self._state, filled(real, "t"), *(CArgument(real, n) for n in LIMITS),
-                *self.arguments("u"), CArgument("long", "steps"), given(real, "times"),
-                CArgument("long", "count"), *(filled(real, f"{n}_rows") for n in ("t", *STATE)),
+                *self._state, output_array(real, "t"), *(CArgument(real, n) for n in LIMITS),
+                *self.arguments("u"), CArgument("long", "steps"), input_array(real, "times"),
+                CArgument("long", "count"),
+                *(output_array(real, f"{n}_rows") for n in ("t", *STATE)),
                 *(self.adaptive_events if self.target.system.events else ()),
                 *self.arguments("p"), CArgument(f"{name}_memory *", "memory"),
                 CArgument(f"{P}_status *", "status"),
@@ -168,11 +173,11 @@ class Public:
             f"{name}_batch",
             "int",
             (
-                CArgument("long", "count"), *(filled(real, n) for n in (*STATE, "t")),
+                CArgument("long", "count"), *(output_array(real, n) for n in (*STATE, "t")),
                 *(CArgument(real, n) for n in LIMITS),
                 *self.arguments("u"), *(strides[:1] if target.system.inputs else []),
-                CArgument("long", "steps"), given(real, "times"), CArgument("long", "row_count"),
-                *(filled(real, f"{n}_rows") for n in STATE),
+                CArgument("long", "steps"), input_array(real, "times"),
+                CArgument("long", "row_count"), *(output_array(real, f"{n}_rows") for n in STATE),
                 *(self.adaptive_events if target.system.events else ()), *self.arguments("p"),
                 *(strides[1:] if target.needs_p else []),
                 CArgument(f"{name}_memory *", "memory"), CArgument("long *", "row_counts"),
@@ -184,8 +189,8 @@ class Public:
     def adaptive_events(self) -> tuple[CArgument, ...]:
         """Arguments for the events that are detected."""
         return (
-            CArgument("long", "room"), filled("long", "events"), filled("int", "which"),
-            filled(self.target.real.name, "event_rows"),
+            CArgument("long", "room"), output_array("long", "events"), output_array("int", "which"),
+            output_array(self.target.real.name, "event_rows"),
         )  # fmt: skip
 
     def _status(self, name: str, *arguments: CArgument) -> CFunction:
@@ -196,7 +201,7 @@ class Public:
     def _state(self) -> tuple[CArgument, ...]:
         """Arguments for the state that is overwritten."""
         real, NQ = self.target.real.name, f"{self.target.PREFIX}_NQ"
-        return tuple(filled(real, name, NQ) for name in STATE)
+        return tuple(output_array(real, name, NQ) for name in STATE)
 
     @property
     def _steps(self) -> tuple[CArgument, ...]:
@@ -208,5 +213,5 @@ class Public:
     @property
     def _row_output(self) -> tuple[CArgument, ...]:
         """Arguments for the stored rows."""
-        rows = (filled(self.target.real.name, f"{name}_rows") for name in STATE)
+        rows = (output_array(self.target.real.name, f"{name}_rows") for name in STATE)
         return (CArgument("long", "every"), *rows)

@@ -143,11 +143,11 @@ class _Cases:
             return [sum(parts)]
         raise NoCaseError
 
-    def ordered(self, name: str, found: Vector) -> Vector:
+    def ordered(self, name: str, values: Vector) -> Vector:
         """Return results in the header's order: the matrices of the linearization one by one."""
         if name != "linearization":
-            return found
-        return self.split([found[k : k + self.width] for k in range(0, len(found), self.width)])
+            return values
+        return self.split([values[k : k + self.width] for k in range(0, len(values), self.width)])
 
     def split(self, rows: Sequence[Sequence[float]]) -> Vector:
         """Rows of A_q, A_qd and B behind one another."""
@@ -756,9 +756,9 @@ def _single(x: float) -> float:
     return float(struct.unpack("f", struct.pack("f", x))[0])
 
 
-def _off(found: list[float], exact: list[float]) -> float:
+def _off(values: list[float], exact: list[float]) -> float:
     """Return the largest difference, relative to the largest entry."""
-    worst = max(abs(a - b) for a, b in zip(found, exact, strict=True))
+    worst = max(abs(a - b) for a, b in zip(values, exact, strict=True))
     return worst / max(map(abs, exact)) if worst else 0.0
 
 

@@ -48,7 +48,7 @@ class BatchEventLog(EventLog):
     instance: Array
     _batch: int
 
-    def of(self, k: int) -> EventLog:
+    def for_instance(self, k: int) -> EventLog:
         """Return the occurrences in instance k; -1 is the last. Raises IndexError out of range."""
         try:
             at = index(k)

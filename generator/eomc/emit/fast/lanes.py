@@ -164,10 +164,10 @@ class Lane:
         if name == "t":
             return CArgument(self.real.name, "t")
         if name == "s":
-            return c.given(f"{self.prefix}_sines{self.end}", "s")
+            return c.input_array(f"{self.prefix}_sines{self.end}", "s")
         if name == "c":
-            return c.given(self.constants, "c")
-        return c.given(self.real.name, name)
+            return c.input_array(self.constants, "c")
+        return c.input_array(self.real.name, name)
 
     @cached_property
     def argument_names(self) -> tuple[str, ...]:
@@ -281,7 +281,7 @@ class Lane:
                 stored={n: shared[n] for n in part.keeps}, pivots=self.pivots,
                 in_order=in_order,
             )  # fmt: skip
-            head = [c.filled(values, "v")] if part.reads or part.keeps else []
+            head = [c.output_array(values, "v")] if part.reads or part.keeps else []
             head += [out] if out and part.outputs else []
             arguments = (*head, *(a for a, names in supplied_by if names & f.uses))
             fails = self._fails(body)
@@ -347,7 +347,7 @@ class Lane:
     @cached_property
     def out(self) -> CArgument:
         """The argument for the accelerations."""
-        return c.filled(self.real.name, "a")
+        return c.output_array(self.real.name, "a")
 
     @cached_property
     def places(self) -> list[str]:
@@ -370,7 +370,7 @@ class Lane:
         arguments += ["c"] if self.accelerations.constants else []
         parameters = {n: c.member("c", n) for n in self.accelerations.parameter_names}
         return self.computed(
-            self.target.program["signal"], "signals", c.filled(self.real.name, "u"),
+            self.target.program["signal"], "signals", c.output_array(self.real.name, "u"),
             [f"u[{self.target.enum[n]}]" for n in self.target.input_names],
             doc="The scene's signals.", takes=arguments, constants=parameters,
         )  # fmt: skip
@@ -381,8 +381,8 @@ class Lane:
         singular.
         """
         parameters, target = frozenset(self.accelerations.parameter_names), self.target
-        p = c.given(f"{self.prefix}_params", "p")
-        out = c.filled(self.constants, "c") if self.accelerations.constants else None
+        p = c.input_array(f"{self.prefix}_params", "p")
+        out = c.output_array(self.constants, "c") if self.accelerations.constants else None
         return self.computed(
             self.accelerations.staged[0], "compute_constants", out,
             [c.member("c", n) for n in self.accelerations.constants],
@@ -400,7 +400,7 @@ class Lane:
             sums = self._stored("x", values, four(len(values)))
         return CFunction(
             f"{self.prefix}_{what}{self.end}", "void",
-            (c.filled(self.real.name, "x"), c.given(self.real.name, vector)),
+            (c.output_array(self.real.name, "x"), c.input_array(self.real.name, vector)),
             (Block("", sums),), frozenset({"x", vector}), self.qualifiers[INLINE],
         )  # fmt: skip
 
@@ -455,7 +455,7 @@ class Lane:
         """The function for position-dependent terms at two configurations."""
         parts = self.accelerations.parts
         assert parts is not None
-        out = c.filled(f"{self.prefix}_configuration", "k")
+        out = c.output_array(f"{self.prefix}_configuration", "k")
         takes = [n for n in self.argument_names if n in ("q", "s", "c")]
         places = [c.member("k", n) for n in parts.handed]
         return self.computed(
@@ -471,7 +471,7 @@ class Lane:
         parts = self.accelerations.parts
         assert parts is not None
         shared, form = frozenset(parts.handed), f"{c.member('k', '{}')}[point]"
-        argument = c.given(f"{self.prefix}_configuration", "k")
+        argument = c.input_array(f"{self.prefix}_configuration", "k")
         extra = [(argument, shared, form), (CArgument("int", "point"), shared, form)]
         doc = "The accelerations at point 0 or 1 of k."
         return self.computed(

@@ -33,7 +33,7 @@ def projected(lane: Lane) -> CFunction:
     """Return the function that changes the increment of a step so that its end satisfies the
     constraints.
     """
-    out = tuple(c.filled(lane.real.name, n) for n in "rv")
+    out = tuple(c.output_array(lane.real.name, n) for n in "rv")
     singular_flag = () if lane.name else (CArgument("int *", "singular"),)
     return CFunction(
         f"{lane.prefix}_projected{lane.end}",
@@ -50,7 +50,7 @@ def ending(functions: Functions, lane: Lane, **passed: str) -> str:
 
 def onto(lane: Lane) -> CFunction:
     """Return the function that projects a stage onto the constraints to first order."""
-    state = tuple(c.filled(lane.real.name, n) for n in ("at", "moving"))
+    state = tuple(c.output_array(lane.real.name, n) for n in ("at", "moving"))
     others = (n for n in _arguments(lane, sines=False) if n in "tc")
     return CFunction(
         f"{lane.prefix}_onto", "int", (*state, *map(lane.argument, others)),
@@ -63,7 +63,7 @@ def _correction(lane: Lane) -> Computed:
     function = lane.accelerations.correction[0]
     places = [f"d[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
-        function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
+        function, "projection", c.output_array(lane.real.name, "d"), places, doc=sentence(function),
         takes=_arguments(lane),
     )  # fmt: skip
 
@@ -78,7 +78,7 @@ def _rate_terms(lane: Lane) -> Computed | None:
     parameters = {n: c.member("c", n) for n in lane.accelerations.parameter_names}
     places = [f"rates[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
-        function, "rate_terms", c.filled(lane.real.name, "rates"), places, doc=RATE_TERMS,
+        function, "rate_terms", c.output_array(lane.real.name, "rates"), places, doc=RATE_TERMS,
         takes=_arguments(lane, sines=False), constants=parameters, inline=False,
     )  # fmt: skip
 

@@ -62,7 +62,7 @@ def loop(steppers: Steppers, m: Method) -> views.Loop:
     run = public.run(m.name)
     corrected = steppers.corrected(m)
     here = {"q": "x.q", "qd": "x.qd", "u": "input", "m": "&x", "end": "&sines"}
-    end = [c.filled(f"{lane.prefix}_sines", "end")] if corrected else []
+    end = [c.output_array(f"{lane.prefix}_sines", "end")] if corrected else []
     advance = steppers.implicit(m) if m.implicit else steppers.advanced(lane, m.name, *end)
     alone = steppers.advanced(lane, f"{m.name}_alone")
     step_end = {"q": "x.q", "qd": "x.qd", "t": "t + h", "singular": "&singular"}

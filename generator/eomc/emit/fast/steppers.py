@@ -112,7 +112,7 @@ class Steppers:
 
     def advanced(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
         """Return a function that computes the increment of a step."""
-        out = tuple(c.filled(lane.real.name, n) for n in "rv")
+        out = tuple(c.output_array(lane.real.name, n) for n in "rv")
         return CFunction(
             f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *extra)
         )
@@ -229,7 +229,7 @@ class Steppers:
     def implicit(self, m: Method) -> CFunction:
         """Return the function for a step of an implicit method."""
         lane = self.one
-        state = c.filled(f"{lane.prefix}_{m.name}_state", "m")
+        state = c.output_array(f"{lane.prefix}_{m.name}_state", "m")
         extra = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
         prototype = self.advanced(lane, m.name, *extra, state)
         return c.static(prototype.name, f"{lane.prefix}_status", *prototype.arguments)
@@ -258,7 +258,7 @@ class Steppers:
         time_and_inputs = [n for n in ("t", "u") if n in lane.argument_names]
         factor = c.static(
             f"{lane.prefix}_{m.name}_factor", "void",
-            c.filled(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
+            c.output_array(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
             *map(state, ("q", "qd")), *map(state, time_and_inputs),
             *([f.argument("p")] if self.newton_p else []),
         )  # fmt: skip
@@ -307,8 +307,8 @@ class Steppers:
         element.
         """
         P = f"{self.one.prefix}_{m.name}"
-        out = c.filled(f"{P}_stages", "b")
-        arguments = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
+        out = c.output_array(f"{P}_stages", "b")
+        arguments = (c.input_array(f"{P}_stages", "a"), c.input_array(f"{P}_sums", "w"))
         others = (*self.stepping(self.one), *self.functions.moves_stages)
         return c.static(f"{P}_sweep", "int", out, *arguments, *others)
 
@@ -346,8 +346,8 @@ class Steppers:
         """Return the view of a method with a fixed number of iterations."""
         lane, real = self.one, self.one.real
         P = f"{lane.prefix}_{m.name}"
-        state = c.filled(f"{P}_state", "m")
-        values = c.filled(f"{P}_stages", "a")
+        state = c.output_array(f"{P}_state", "m")
+        values = c.output_array(f"{P}_stages", "a")
         arguments = (values, CArgument("int", "fresh"), *self.stepping(lane), state)
         settle = c.static(f"{P}_settle", f"{lane.prefix}_status", *arguments)
         sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"

@@ -168,7 +168,7 @@ def linearization(plain: Functions) -> Slopes | None:
         arguments_ = tuple(a for a in one.function.arguments if a.name not in along)
         loop_function = replace(
             one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
-            arguments=(c.filled(plain.real, "slopes"), *arguments_),
+            arguments=(c.output_array(plain.real, "slopes"), *arguments_),
         )  # fmt: skip
         slopes = Computed(
             loop_function, (*one.parts, one.function), one.values, one.function.call()
@@ -275,7 +275,7 @@ def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
         slopes=c.static(
             f"{plain.prefix}_differences",
             plain.status,
-            c.filled(plain.real, "slopes"),
+            c.output_array(plain.real, "slopes"),
             *plain.arguments(*plain.state, "u", "p"),
         ),
         here=accelerate(qdd="here"),
@@ -290,10 +290,10 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     state_arguments = plain.arguments(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
     onto = plain.moves_stages if m.sweeps else ()
-    out = (c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
-    a = c.given(plain.real, "a")
+    out = (c.output_array(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
+    a = c.input_array(plain.real, "a")
     stages = c.static(f"{method}_evaluated", plain.status, *out, a, *state_arguments, *onto)
-    matrix_out = (c.filled(plain.real, "M"), c.filled("int", "row"))
+    matrix_out = (c.output_array(plain.real, "M"), c.output_array("int", "row"))
     matrix_function = c.static(f"{method}_matrix", plain.status, *matrix_out, *state_arguments)
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
@@ -333,7 +333,7 @@ def _adaptive(plain: Functions) -> list[View]:
         return []
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
     state_arguments = plain.arguments(*plain.state, "h", "u", "p")
-    values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
+    values = (c.output_array(f"{method}_stages", "b"), c.input_array(f"{method}_stages", "a"))
     sweep = c.static(f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages)
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = Nodes(
