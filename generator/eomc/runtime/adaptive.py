@@ -38,25 +38,48 @@ _ROWS_PER_STEP = 8  # equidistant rows for each step
 
 
 class AdaptiveRun(AdaptiveTrajectory):
-    """A run with adaptive step-size control: rows after each step, or at requested times.
+    """Run with adaptive step-size control: one row after each step, or at each requested time.
 
-    In addition to the attributes of a Run:
+    A row consists of a time, the positions q and the velocities qd.
 
-    h : mean step size, s.
-    rejected : number of rejected steps.
-    stiff_steps : number of steps that were solved by Newton's method because the motion is stiff.
-    events : for each event its times and states (t, q, qd), by name.
-    stopped : name of the event that ended the run, or "".
-    limit : the time at which events accumulate (Zeno behaviour), s; nan unless the status is
+    Attributes
+    ----------
+    h : float
+        Mean step size, s.
+    rejected : int
+        Number of rejected steps.
+    stiff_steps : int
+        Number of steps that were solved by Newton's method because the motion is stiff.
+    events : dict of EventLog
+        Times t (n,) and states q, qd (n, nq) of the occurrences of each event, by the event's name.
+    stopped : str
+        Name of the event that ended the run, or "".
+    limit : float
+        Time at which events accumulate (Zeno behaviour), s; nan unless the status is
         "accumulated".
+
+    The other attributes are those of `Run`.
     """
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return (q, qd), each (..., nq), at times t (...,) within the run, s.
+        """Return the positions and velocities at any times within the run.
 
-        At a state jump the state before the jump is returned. The run is repeated with rows at
-        these times, so the states are as accurate as the run. Raises ValueError for times outside
-        of the run.
+        The run is repeated with rows at these times, so the states are as accurate as the run.
+
+        Parameters
+        ----------
+        t : array_like, (...)
+            Times, s.
+
+        Returns
+        -------
+        q, qd : (..., nq) arrays
+            At a state jump, the state before the jump.
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run.
         """
         times = within(self, t)
         sorted_times, place = np.unique(times, return_inverse=True)
@@ -145,16 +168,18 @@ class AdaptiveRun(AdaptiveTrajectory):
 
 
 class SteppedRun(AdaptiveRun):
-    """A run with fixed steps of a scene with events: a row after each step, two at each jump.
+    """Run with fixed steps of a scene that has events.
 
-    A step ends at a state jump; a shorter step then leads to the next multiple of h. The attributes
-    events, stopped and limit are those of an AdaptiveRun. evaluations: number of evaluations of the
-    accelerations; an iteration of an implicit method counts once for each stage.
+    There is one row after each step and two rows at each state jump, before and after it. A step
+    ends at a state jump; a shorter step then leads to the next multiple of the step size h. The
+    attributes `events`, `stopped` and `limit` have the same meaning as in `AdaptiveRun`.
+    `evaluations` is the number of evaluations of the accelerations; an iteration of an implicit
+    method counts once for each stage.
     """
 
     @property
     def description(self) -> str:
-        """Size of the steps in words."""
+        """Return the step size as text for messages, such as "h = 0.01 s"."""
         return f"h = {self.h:g} s"
 
     def __repr__(self) -> str:
@@ -168,7 +193,16 @@ def simulate(
     control_period: float | None, tol: float | None, h_most: float | None, stiff: bool,
     fixed: tuple[Any, ...],
 ) -> AdaptiveRun:  # fmt: skip
-    """Simulate with adaptive steps. fixed: values of the arguments in FIXED_STEP_DEFAULTS."""
+    """Check the arguments of `Model.simulate`, simulate with adaptive steps and return the run.
+
+    Parameters
+    ----------
+    fixed : tuple
+        The caller's values of the arguments that are for fixed steps only, in the order of
+        `FIXED_STEP_DEFAULTS`. They must have their default values.
+
+    The other arguments are those of `Model.simulate`. Raises ValueError if one is invalid.
+    """
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     q, qd = model._start
     if q0 is not None or qd0 is not None:
@@ -195,9 +229,13 @@ def simulate_short_run(
     model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
-    """Simulate in one call of C, with at most `count` rows; None if the run needs more calls.
+    """Simulate a short run with adaptive steps by a single call of the C function.
 
-    Only for scenes without events and constraints.
+    Return the run, or None if it does not reach its end within `count` rows or fails, or if u is
+    neither None, a float nor an array (nu,) of the module's number type; `simulate` then has to
+    repeat it. This function is only for scenes without events and constraints. q0, qd0: initial
+    state (nq,), or None for that of the scene. tol: tolerance, or None for that of the scene.
+    duration in s.
     """
     (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
     inputs, at_u = None, null
@@ -241,11 +279,33 @@ def run(
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
     method: str = "",
 ) -> AdaptiveRun:  # fmt: skip
-    """Simulate from checked arguments and return the run, whatever its status.
+    """Simulate from checked arguments and return the run, even if it failed (see its status).
 
-    times : (n,) times of the rows, later than t0; None: a row after each step.
-    enough : the run ends at the first return from C after this number of steps.
-    method : method of fixed steps of size h_most; "": adaptive steps.
+    Parameters
+    ----------
+    q, qd : (nq,) arrays
+        Initial state.
+    t0, t_end : float
+        Start and end time, s.
+    tol : float
+        Tolerance of adaptive steps.
+    times : (n,) array or None
+        Times of the rows, s, later than t0. None: a row at t0 and after each step.
+    u : (nu,) array, ZeroOrderHold or None
+        Constant inputs, inputs that are held over control periods, or the scene's signals (None).
+    p : (np,) array
+        Parameters.
+    h_most : float
+        Longest adaptive step, s (0: no limit), or the size of fixed steps.
+    progress : callable or None
+        Called with (simulated thousandths of the run, 1000).
+    stiff : bool
+        Whether the run begins with Newton's method.
+    enough : float
+        Number of steps after which the run ends early. It is checked between calls of C, so the
+        run may have more steps.
+    method : str
+        Name of the method of fixed steps of size h_most; "": adaptive steps.
     """
     (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")

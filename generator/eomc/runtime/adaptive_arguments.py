@@ -23,8 +23,11 @@ FIXED_STEP_DEFAULTS = {  # arguments of fixed steps and their default values
 def uses_adaptive_steps(
     model: ModelInfo, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any
 ) -> bool:
-    """True if steps are adaptive: an argument of adaptive steps is given, or the scene has a
-    tolerance and no argument of fixed steps is given."""
+    """Return True if a call of `simulate` with these arguments takes adaptive steps.
+
+    This is the case if tol, h_most, stiff or method="auto" is given, or if the scene has a
+    tolerance and none of h, steps and method is given.
+    """
     if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
     return True
@@ -33,9 +36,30 @@ def uses_adaptive_steps(
 def as_limits(
     model: ModelInfo, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
-    """Return (tolerance, longest step in s or 0 for no limit).
+    """Check arguments of adaptive steps; return the tolerance and the longest step.
 
-    fixed: values of the arguments in FIXED_STEP_DEFAULTS, which must have their defaults.
+    Parameters
+    ----------
+    tol : float or None
+        Tolerance; None: that of the scene.
+    h_most : float or None
+        Longest step, s; None: no limit.
+    stiff : bool
+        Checked only.
+    fixed : tuple
+        The caller's values of the arguments in `FIXED_STEP_DEFAULTS`, which are for fixed steps
+        and must have their default values.
+
+    Returns
+    -------
+    tol : float
+    h_most : float
+        In s; 0 for no limit.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid, or the module was built without adaptive steps.
     """
     as_flag(stiff, "stiff")
     if model.tolerance is None:
@@ -68,14 +92,18 @@ def _why_not(model: ModelInfo, name: str, wants_adaptive: bool) -> str:
 
 
 def as_progress(progress: Any) -> Any:
-    """Return `progress`; raise ValueError if it is neither None nor callable."""
+    """Return the progress callback unchanged; raise ValueError unless it is None or callable."""
     if progress is not None and not callable(progress):
         raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
     return progress
 
 
 def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
-    """Return the end time of a run in s, rounded to the precision of the module."""
+    """Return the end time t0 + duration of a run, s, rounded to the module's number type.
+
+    duration in s; None: that of the scene. Raises ValueError if it is negative, or if
+    floating-point numbers are too coarse for times within it.
+    """
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:
         raise ValueError(f"duration: {span:g} is not a time in s")
@@ -85,7 +113,11 @@ def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
 
 
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
-    """Return the tolerance; raise ValueError unless MIN_TOLERANCE <= tol <= MAX_TOLERANCE."""
+    """Return the tolerance as a float; raise ValueError if it is outside of the allowed range.
+
+    The range is from MIN_TOLERANCE, which depends on the module's number type `dtype`, to
+    MAX_TOLERANCE.
+    """
     least = MIN_TOLERANCE[dtype.itemsize]
     number = as_number(tol, "tol")
     if not least <= number <= MAX_TOLERANCE:
@@ -94,7 +126,10 @@ def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
 
 
 def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
-    """Return a C-contiguous array of any shape; raise ValueError if it is not numeric."""
+    """Convert a value of any shape to a C-contiguous array of type `dtype`.
+
+    Raises ValueError, which begins with the argument's `name`, if the value is not numeric.
+    """
     without_mask(value, name)
     try:
         array = np.asarray(value)
@@ -108,7 +143,11 @@ def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
 def as_times(
     times: ArrayLike, t0: float, dtype: np.dtype[Any], duration: float | None = None
 ) -> Array:
-    """Return ascending times (n,) from t0 on, within the duration if it is given."""
+    """Check the requested times of rows and return them as an array (n,), s.
+
+    Raises ValueError unless the times are finite, ascending and not before t0, nor after
+    t0 + duration if a duration in s is given.
+    """
     array = np.atleast_1d(as_numbers(times, "times", dtype))
     if array.ndim != 1 or not len(array) or not (isfinite(array[0]) and isfinite(array[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")

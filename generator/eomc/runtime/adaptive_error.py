@@ -44,12 +44,27 @@ def error_by_tighter_tolerance(
     own: AdaptiveTrajectory, run: Callable[..., AdaptiveTrajectory],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
-    """The error of a run, beside one of a hundredth of its tolerance in shorter steps, and from a
-    moved start.
+    """Estimate the error of an adaptive run, or of a run with fixed steps and events.
 
-    With events, at least what the motion makes of a rounding; where differences fill the scales,
-    that is seen from a start moved by some roundings, by the least tolerance.
-    Raises MemoryError where its own rows are as many as there is room for.
+    The error is the difference from a reference run with a hundredth of the tolerance and shorter
+    steps. Another run from a perturbed initial state shows how rounding errors grow. For runs with
+    events, or with large errors, the estimate is at least the propagated rounding error; if the
+    first perturbation grows too large for a linear estimate, a run from a start that is perturbed
+    by a few rounding units, with the smallest tolerance, provides it.
+
+    Parameters
+    ----------
+    own : AdaptiveTrajectory
+        The run whose error is estimated.
+    run : callable
+        The function `adaptive.run`, by which the run is repeated.
+    progress : callable or None
+        Called during each repetition with (simulated thousandths, 1000).
+
+    Raises
+    ------
+    MemoryError
+        If the run ended because its rows fill the memory.
     """
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
@@ -113,7 +128,7 @@ def error_by_tighter_tolerance(
 
 
 class _Rerun:
-    """Repeats a run with another tolerance, other steps or another initial state."""
+    """Repeat the run `own` with another tolerance, other steps or another initial state."""
 
     def __init__(
         self,
@@ -124,7 +139,7 @@ class _Rerun:
         self.own, self.run, self.progress = own, run, progress
         self.u: Any = ZeroOrderHold(own._u, own._period, own._periods) if own._period else own._u
         self.x = own.x.astype(float)
-        # rows beside a jump may be on either side of it in another run
+        # a row at a jump may be on either side of the jump in another run
         jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
         self.kept = np.flatnonzero(~jumps & (own.t > own.t0))
         self.beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(self.x))))
@@ -134,7 +149,13 @@ class _Rerun:
         self, tol: float, start: Array, h_most: float, steps: float = np.inf,
         end: float | None = None,
     ) -> tuple[Array, AdaptiveTrajectory | None]:  # fmt: skip
-        """Return the states at the rows of the run, nan where the rerun has none, and the rerun."""
+        """Repeat the run; return the new states at the rows of the original run, and the new run.
+
+        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s, or size of fixed
+        steps. steps: number of steps after which the run ends early. end: end time, s; None: that
+        of the original run. The states have the shape (n, 2 nq) and are nan where the new run has
+        no row. A row at a jump gets the state of the last row before that is not at a jump.
+        """
         own = self.own
         out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
         out[own.t == own.t0] = start
@@ -167,20 +188,28 @@ class _Rerun:
 
     @property
     def times(self) -> Array:
-        """Times of `curve` and `states`: those of the rows, and more if these are few."""
+        """Return the times at which `curve` and `states` compute states, (m,), s.
+
+        They are the times of the rows that are not next to a jump, and additional equidistant times
+        if these rows are few.
+        """
         between = np.linspace(self.own.t0, self.own.t[-1], _MIN_CURVE_ROWS + 1)[1:-1]
         own = self.own.t[self.kept].astype(float)
         few = between if len(own) < _MIN_CURVE_ROWS else between[:0]
         return np.unique(np.concatenate([[self.own.t0], own, few]))
 
     def curve(self) -> Array:
-        """The run's own states at `times`."""
+        """Return the states [q; qd] of the original run at `times`, (m, 2 nq)."""
         if len(self.kept) < _MIN_CURVE_ROWS:
             return np.concatenate(self.own(self.times), axis=1).astype(float)
         return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
 
     def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
-        """Return the states of a rerun at `times`, nan after its end."""
+        """Repeat the run and return the new states [q; qd] at `times`, (m, 2 nq).
+
+        The arguments are those of a call of this object. States after an early end of the new run
+        are nan.
+        """
         own, start, times = self.own, start.astype(self.own._model.dtype), self.times
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
@@ -191,14 +220,22 @@ class _Rerun:
         return out
 
     def at_rows(self, states: Array) -> Array:
-        """Return the states at the rows from those at `times`, nan at rows next to jumps."""
+        """Select from states at `times`, (m, 2 nq), those at the rows of the run, (n, 2 nq).
+
+        A row at a jump gets the state of the last row before that is not at a jump.
+        """
         out = np.full_like(self.x, np.nan)
         out[self.own.t == self.own.t0] = states[0]
         out[self.kept] = states[np.searchsorted(self.times, self.own.t[self.kept].astype(float))]
         return np.asarray(out[self.beside])
 
     def finer(self, begin: Array, least: float) -> tuple[Array, AdaptiveTrajectory | None]:
-        """Return the states at the rows of a run with a tighter tolerance, and that run."""
+        """Repeat the run with a tighter tolerance and shorter steps, as the reference run.
+
+        begin: initial state [q; qd]. least: smallest tolerance of the module. The result is that
+        of a call of this object: the states at the rows of the original run, (n, 2 nq), and the
+        new run.
+        """
         own, end = self.own, None
         if own.stopped:  # shorter steps may detect that event later, or not at all
             end = min(
@@ -287,7 +324,10 @@ class _Events:
         )
 
     def words(self, own: AdaptiveTrajectory) -> list[str]:
-        """Return sentences on missed events and on falsely detected ones."""
+        """Return phrases on events of the run `own` that were missed or falsely detected.
+
+        The list is empty if the events of both runs agree.
+        """
         finer, remedy = "shorter steps", "a smaller h"
         if not own._by:
             finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"

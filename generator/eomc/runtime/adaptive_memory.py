@@ -12,24 +12,32 @@ from .status import PART
 
 
 class StepCounters:
-    """Counts the stored rows and events of a run and limits the steps of the next call."""
+    """Count the stored rows and events of a run to keep the run within the machine's memory."""
 
     def __init__(self, model: ModelInfo) -> None:
         self.rows, self.most = 0, room_for(model)
 
     def add(self, work: Any, events: bool) -> None:
-        """Add the rows and events of the last call of C."""
+        """Add the numbers of rows, and if `events` also of events, that the last C call stored.
+
+        work: the C struct of the run, of type adaptive_work.
+        """
         self.rows += work.rows + (work.events if events else 0)
 
     def limit_steps(self, steps: int, each: int) -> int:
-        """Return the number of steps, at most `steps`, whose `each` rows fit in memory."""
+        """Return how many steps the next call may make: at most `steps`, and as fit in memory.
+
+        each: maximum number of rows that a step stores.
+        """
         return int(min(steps, max(0.0, self.most - self.rows) // each))
 
 
 class RowBuffer:
-    """Buffers for times and rows that C fills: a row after each step, or at `times` (n,).
+    """Memory that C fills with the rows (t, q, qd) of a run.
 
-    The rows after steps are stored in several pieces, since their number is not known.
+    times: (n,) requested times of the rows, s; None: a row after each step. In the second case the
+    number of rows is not known in advance, so several arrays ("pieces") are allocated one after
+    the other; `count` is the number of rows of the first one.
     """
 
     def __init__(self, model: ModelInfo, times: Array | None, count: int) -> None:
@@ -45,13 +53,22 @@ class RowBuffer:
         self.to_t = self.to if self.times is None else address(real, self.times)
 
     def reserve(self, steps: int, each: int) -> None:
-        """Allocate a piece for `steps` steps unless the current one has room for `each` rows."""
+        """Allocate a new piece for `steps` steps if the current one has no room for one more step.
+
+        each: maximum number of rows that a step stores. Rows at requested times have one piece
+        only.
+        """
         if self.own and self.count - self.filled < each:
             self.pieces.append(self._filled())
             self._piece(1 + each * steps)
 
     def c_arguments(self, steps: int, each: int) -> tuple[Any, ...]:
-        """Arguments of C: maximum of steps, times, their number, buffers for t, q and qd."""
+        """Return the arguments on rows for the next call of the C function.
+
+        steps: maximum number of steps. each: maximum number of rows that a step stores. The result
+        is (maximum number of steps, pointer to the requested times, their number, pointers to the
+        buffers for t, q and qd).
+        """
         null, nq, left = self.model._c[2], self.model.nq, self.count - self.filled
         to_q = self.to + (self.count + nq * self.filled)
         at = to_q, to_q + nq * self.count
@@ -60,7 +77,7 @@ class RowBuffer:
         return steps, self.to_t + self.filled, left, null, *at
 
     def concatenate(self) -> tuple[Array, Array]:
-        """Return the times (n,) and rows (2, n, nq) of all pieces."""
+        """Return the times (n,), s, and the states [q, qd] (2, n, nq) of all rows so far."""
         times, rows = self._filled()
         if self.pieces:
             times = np.concatenate([*(t for t, _ in self.pieces), times])
@@ -75,12 +92,15 @@ class RowBuffer:
 
 
 def room_for(model: ModelInfo) -> float:
-    """Maximum number of rows and events of a run."""
+    """Return the largest number of rows and events together that a run may store."""
     return PART * machine_memory() / _row(model)
 
 
 def rows_for(model: ModelInfo, count: int) -> Array:
-    """Allocate a buffer for `count` rows (t, q, qd). Raises MemoryError if it does not fit."""
+    """Allocate a flat array for `count` rows (t, q, qd), of count * (1 + 2 nq) numbers.
+
+    Raises MemoryError if it does not fit in the machine's memory.
+    """
     try:
         if count * _row(model) > machine_memory():
             raise MemoryError

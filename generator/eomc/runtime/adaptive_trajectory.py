@@ -43,7 +43,10 @@ def _friction() -> str:
 
 
 def failure_message(model: Stepping, status: str, fixed: str) -> str:
-    """Explain the status of a run with adaptive steps, or with fixed steps of method `fixed`."""
+    """Return a sentence that explains why a run ended with this status, and a remedy.
+
+    fixed: name of the method of fixed steps; "": adaptive steps.
+    """
     if status == "no convergence" and not fixed:
         return STEP_TOO_SHORT.format(FRICTION_REMEDIES[bool(model._rows.modes)].format(_friction()))
     return STATUS_MESSAGES[status]
@@ -51,7 +54,10 @@ def failure_message(model: Stepping, status: str, fixed: str) -> str:
 
 @dataclass(eq=False, repr=False)
 class AdaptiveTrajectory(Run):
-    """Data and derived properties of an adaptive run."""
+    """Data of an adaptive run and quantities that follow from them without another simulation.
+
+    The attributes are described in the subclass `adaptive.AdaptiveRun`.
+    """
 
     tol: float = field(kw_only=True)
     rejected: int = field(kw_only=True)
@@ -73,7 +79,7 @@ class AdaptiveTrajectory(Run):
 
     @property
     def t(self) -> Array:
-        """The times of the rows, (n,), s."""
+        """Return the times of the rows, (n,), s."""
         return self._times
 
     @cached_property
@@ -83,7 +89,7 @@ class AdaptiveTrajectory(Run):
 
     @property
     def message(self) -> str:
-        """Result of the run in a sentence."""
+        """Return a sentence on the result of the run, with the reason of a failure."""
         progress = f"{self.steps} steps, {self.description}"
         if self.status == "ok":
             return progress
@@ -101,7 +107,11 @@ class AdaptiveTrajectory(Run):
 
     @cached_property
     def events(self) -> dict[str, EventLog]:
-        """Times and states of each event of the scene, by name."""
+        """Return the occurrences of each event of the scene as a dict from name to `EventLog`.
+
+        A log has the times t (n,), s, and the states q, qd (n, nq); at a state jump, the state
+        before it.
+        """
         which, rows = self._event_data
         nq, names = self._model.nq, self._model.events
         each = (rows[which == k] for k in range(len(names)))
@@ -110,7 +120,7 @@ class AdaptiveTrajectory(Run):
 
     @property
     def description(self) -> str:
-        """How its steps were chosen, in words."""
+        """Return the numbers of rejected steps and of Newton steps, and the tolerance, as text."""
         stiff = f", {self.stiff_steps} by Newton's method" if self.stiff_steps else ""
         return f"{self.rejected} rejected{stiff}, tolerance {self.tol:g}"
 

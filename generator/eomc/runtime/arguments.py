@@ -28,7 +28,11 @@ _MAX_LIST_NUMBERS = 32  # below this size Python checks numbers faster than NumP
 
 
 class Params:
-    """Parameters of a scene by name: `p = Params(m_c=3.0); p.m_c = 4.0`."""
+    """Parameters of a scene by name, with the scene's values as defaults.
+
+    Each parameter is an attribute: `p = Params(m_c=3.0); p.m_c = 4.0`. Raises ValueError for
+    values that are not finite numbers and for unknown names.
+    """
 
     _names: tuple[str, ...] = ()
     _defaults: tuple[float, ...] = ()
@@ -83,7 +87,25 @@ class Params:
 
 
 class Arguments:
-    """A compiled scene: its names and dimensions, and conversion of arguments for C."""
+    """Names and dimensions of a compiled scene, and the conversion of call arguments for C.
+
+    Attributes
+    ----------
+    name, title : str
+        Name and title of the scene.
+    digest : str
+        Hash of the content of the scene.
+    dtype : numpy.dtype
+        Number type of the module, float64 or float32.
+    coordinates, inputs, parameters, outputs : tuple of str
+        Names, in the order of the arrays.
+    defaults : Mapping
+        Value of each parameter in the scene, by name.
+    units : dict of str
+        Units by name of the quantity.
+    nq, nu : int
+        Numbers of coordinates and of inputs.
+    """
 
     _follows: Mapping[str, str] = {}  # initial values that are formulas of parameters
 
@@ -127,7 +149,7 @@ class Arguments:
 
     @property
     def start(self) -> tuple[Array, Array]:
-        """The initial state (q, qd) of the scene."""
+        """Return copies of the scene's initial positions q and velocities qd, (nq,) each."""
         q, qd = self._start
         return q.copy(), qd.copy()
 
@@ -374,10 +396,32 @@ class Arguments:
 
 
 class StateArguments:
-    """t, u and parameters of one or many states as arguments of C: shared or one for each state.
+    """Time, inputs and parameters of one or many states, checked and converted for C.
 
-    rows: () or (n,). replacement: the argument in place of u, (width,) or (n, width).
-    u_rows: the inputs, (nu,) or (n, nu), None for the signals. Raises ValueError.
+    Each of the three may be common to all states or differ between them.
+
+    Parameters
+    ----------
+    rows : tuple of int
+        Shape of the states without the coordinate axis: () for one state, (n,) for n states.
+    t : float or (n,) array
+        Times, s.
+    u : (nu,) or (n, nu) array, dict or None
+        Inputs; None: the scene's signals.
+    params : dict, Params, array or None
+        Parameters; None: those of the scene.
+    replacement : (width,) or (n, width) array, optional
+        Numbers that are passed to C in place of the inputs.
+
+    Attributes
+    ----------
+    u_rows : (nu,) or (n, nu) array or None
+        The checked inputs; None: the scene's signals.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
     """
 
     def __init__(
@@ -414,11 +458,16 @@ class StateArguments:
             self._from_t = null if self.times is None else address(real, self.times)
 
     def time(self, k: int) -> float:
-        """Return the time of state k."""
+        """Return the time of state k, s."""
         return self.t if self.times is None else float(self.times[k])
 
     def pointers(self, k: int) -> tuple[float, Any, Any, Any]:
-        """Return the last arguments of a C function from state k on: t, u, p and strides."""
+        """Return the arguments of a C function that evaluates the states from number k on.
+
+        The result is (t, u, p, strides): the common time in s, pointers to the inputs and the
+        parameters of state k, and a pointer to a struct that says which of them differ between
+        states (NULL if none does; it also contains the times if these differ).
+        """
         if not self.own:
             return self.t, self.u, self.p, self.own
         if self.times is not None:
@@ -431,7 +480,11 @@ class StateArguments:
 
 
 def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
-    """Return a time for each row, (n,), or None if t is a single number. Raises ValueError."""
+    """Return the times of many states as an array (n,), s, or None if t is a single number.
+
+    rows: shape of the states without the coordinate axis: () for one state, (n,) for n states.
+    Raises ValueError if t is an array of another shape, or is not finite.
+    """
     if not (rows and np.ndim(t)):
         return None
     without_mask(t, "t")
@@ -455,12 +508,18 @@ def _finite(array: Array, words: str) -> Array:
 
 
 def by_name(values: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return the values by name. Keys may be SymPy symbols or functions of time."""
+    """Return a dict with the same values whose keys are strings.
+
+    A key may also be a SymPy symbol or a SymPy function of time, whose name becomes the key.
+    """
     return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in values.items()}
 
 
 def without_mask(value: Any, name: str) -> Any:
-    """Return the value; raise ValueError if it is an array with masked numbers."""
+    """Return the value unchanged; raise ValueError if it is a NumPy array with masked numbers.
+
+    name: name of the argument, for the message.
+    """
     ma: Any = sys.modules.get("numpy.ma")  # NumPy imports it on first use
     masked = getattr(ma, "MaskedArray", ())  # another thread may be importing it
     if isinstance(value, masked) and ma.is_masked(value):
@@ -472,7 +531,10 @@ def without_mask(value: Any, name: str) -> Any:
 
 
 def as_number(value: Any, name: str) -> float:
-    """Return a finite number; raise ValueError that names the argument."""
+    """Return the value as a float; raise ValueError if it is not a finite number.
+
+    name: name of the argument, for the message.
+    """
     if type(value) is float and isfinite(value):
         return value
     try:
@@ -487,7 +549,11 @@ def as_number(value: Any, name: str) -> float:
 
 
 def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
-    """Return a step size > 0 in the precision of the module; raise ValueError otherwise."""
+    """Return a step size or period h as a float, s.
+
+    Raises ValueError, which begins with the argument's `name`, unless h is a positive number in the
+    range of the module's number type `dtype`.
+    """
     if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
         return h
     size = as_number(h, name)
@@ -502,9 +568,22 @@ def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
 
 
 def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
-    """Return the first `count` rows of a table of inputs that has `whole` of them, else u itself.
+    """Shorten a table of inputs over time from `whole` rows to its first `count` rows.
 
-    axis: where the rows of an array with the inputs last are, 1 for the table of a batch.
+    Return u unchanged if it is not a table with `whole` rows, or if whole <= count.
+
+    Parameters
+    ----------
+    u : array_like, dict, callable or None
+        The argument u of a simulation. The tables in a dict, by name of the input, are all
+        shortened.
+    nu : int
+        Number of inputs, the length of the table's last axis; 0: the table has no such axis, as
+        that of a single input in a dict.
+    whole, count : int
+        Numbers of rows.
+    axis : int
+        Axis of the rows: 0 for a single run, 1 for a batch, whose axis 0 is the instance.
     """
     if u is None or callable(u) or whole <= count:
         return u
@@ -524,9 +603,10 @@ def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
 
 
 def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = None) -> None:
-    """Raise ValueError where numbers do not resolve the steps of a run from t0 over a span.
+    """Raise ValueError if floating-point times are too coarse for the steps of a run.
 
-    h: the size of fixed steps; None: a tolerance determines the steps.
+    dtype: number type of the module. t0: start of the run, s. span: its duration, s. h: size of
+    fixed steps, s; None: adaptive steps.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         least = float(np.spacing(dtype.type(abs(t0) + abs(span))))
@@ -544,7 +624,11 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
 
 
 def as_period(period: Any, h: float) -> int:
-    """Return the number of steps in a control period (1 if None); raise ValueError otherwise."""
+    """Return the number of fixed steps of size h in a control period.
+
+    period: control period, s; None: one step. Raises ValueError if the period is not a whole
+    number of steps.
+    """
     if period is None:
         return 1
     count = as_number(period, "control_period") / h
@@ -558,19 +642,25 @@ def as_period(period: Any, h: float) -> int:
 
 
 def aligned(array: Array) -> Array:
-    """Return the array, copied if it is not aligned for C."""
+    """Return the array itself if its memory is aligned for C, else a copy."""
     return array if array.flags.aligned else array.copy()
 
 
 def as_flag(value: Any, name: str) -> bool:
-    """Return a bool; raise ValueError for other types, such as texts and lists."""
+    """Return a Python or NumPy bool as a Python bool.
+
+    Raises ValueError, which begins with the argument's `name`, for values of other types.
+    """
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     raise ValueError(f"{name}: {value!r} is not True or False")
 
 
 def as_count(value: Any, name: str, least: int) -> int:
-    """Return an integer >= least; raise ValueError that names the argument."""
+    """Return the value as an int; raise ValueError unless it is a whole number >= least.
+
+    name: name of the argument, for the message.
+    """
     if type(value) is int and value >= least:
         return value
     number = as_number(value, name)
@@ -580,7 +670,10 @@ def as_count(value: Any, name: str, least: int) -> int:
 
 
 def machine_memory() -> float:
-    """Return the memory of the machine in bytes. The system may allocate larger arrays."""
+    """Return the physical memory of the machine in bytes; inf if it is unknown.
+
+    An allocation of more than this may still succeed, as systems reserve memory at first use.
+    """
     if sys.platform == "win32":
         return float("inf")
     try:
@@ -590,14 +683,20 @@ def machine_memory() -> float:
 
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
-    """Return the message for an unknown name: the known names and a similar one."""
+    """Return the error message for an unknown `name` in the argument `argument`.
+
+    The message lists the known names and suggests a similar one.
+    """
     if not known:
         return f"{argument}: there is no '{name}': this scene has none"
     return f"{argument}: '{name}' is not one of {', '.join(known)}{suggestion(name, known)}"
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
-    """Join start, the parts and end on one line; omit parts that do not fit."""
+    """Join start, the comma-separated parts and end to one line of at most `width` characters.
+
+    The last parts are replaced by "... N more" if they do not fit.
+    """
     whole = start + ", ".join(parts) + end
     if len(whole) <= width:
         return whole

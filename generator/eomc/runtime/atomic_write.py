@@ -26,9 +26,10 @@ _READ = 1 << 16  # bytes of an existing file that are looked at
 
 
 def check_replaceable(file: File) -> None:
-    """Raise FileExistsError if `file` is a scene, or its content does not match its suffix.
+    """Raise FileExistsError if the existing `file` must not be overwritten.
 
-    An empty file may be replaced; a device or a pipe may be written.
+    This is the case if it is a scene (a TOML file of eomc) without the suffix .toml, or if its
+    first bytes do not match its suffix. A missing or empty file, a device or a pipe may be written.
     """
     path = Path(file)
     if not path.is_file():
@@ -50,12 +51,24 @@ def check_replaceable(file: File) -> None:
 
 @contextmanager
 def atomic_write(file: File, cached: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file in the same folder that replaces `file` at the end.
+    """Yield the path of a temporary file in the same folder, which replaces `file` on exit.
 
-    If writing fails or is interrupted, `file` is unchanged and the temporary file is removed. The
-    target of a symbolic link is replaced; a device or pipe is written directly. Raises OSError for
-    `file`, and FileExistsError as `check_replaceable` does. cached: skip that check, for files
-    that no user names.
+    If writing fails or is interrupted, `file` is unchanged and the temporary file is removed. If
+    `file` is a symbolic link, its target is replaced; a device or a pipe is written directly.
+
+    Parameters
+    ----------
+    file : path
+        File to write.
+    cached : bool
+        Skip `check_replaceable`, for files in the cache, whose names no user chooses.
+
+    Raises
+    ------
+    OSError
+        With the name of `file`, if it cannot be written.
+    FileExistsError
+        If `check_replaceable` does not permit to replace it.
     """
     target = Path(file)
     if not cached:

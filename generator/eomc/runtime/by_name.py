@@ -9,7 +9,16 @@ from .arguments import not_one_of
 
 
 class ByName(dict[str, Any]):
-    """A dict whose KeyError lists the known names."""
+    """Dict of values by name; the KeyError for an unknown name lists the known names.
+
+    Parameters
+    ----------
+    what : str
+        What the dict contains, such as "events", for the message of the error.
+    names : sequence of str
+    values : iterable
+        One value for each name.
+    """
 
     def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
         super().__init__(zip(names, values, strict=True))
