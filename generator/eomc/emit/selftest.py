@@ -63,12 +63,28 @@ Happening = tuple[float, int]  # when, and which event
 
 
 class NoCaseError(Exception):
-    """There is no value to compare with: no accelerations, no convergence, nothing but rounding."""
+    """No expected result can be computed for a test case of selftest.c.
+
+    The accelerations are singular or not finite, an iteration does not converge, or the results are
+    not accurate enough.
+    """
 
 
 @dataclass(frozen=True)
 class Point:
-    """Arguments of a call: values by name, whether signals act, which parameters, a span in s."""
+    """Arguments of a test call.
+
+    Attributes
+    ----------
+    values
+        State, time, inputs, parameters and other arguments by name.
+    signals
+        Whether the scene's signals supply the inputs.
+    other
+        Whether the parameters are those of `_Cases.other_parameters`.
+    span
+        Size of a step or length of a run, in s.
+    """
 
     values: Mapping[str, float]
     signals: bool = True
@@ -77,7 +93,7 @@ class Point:
 
 
 def view(target: Target) -> SelfTest:
-    """Return the view of selftest.c."""
+    """Return the data for selftest.c: test calls, their expected results and error limits."""
     cases = _Cases(target)
     double = target.real is DOUBLE
     tested = tuple(t for t in cases.tested() if t.cases)
@@ -102,7 +118,11 @@ def view(target: Target) -> SelfTest:
 
 
 class _Cases:
-    """The cases of one program; states are numbered as cases need them."""
+    """The test cases of selftest.c for one program.
+
+    Expected results are computed in Python. `points` are the states of the cases so far; a case
+    refers to its state by the index in this list.
+    """
 
     def __init__(self, target: Target) -> None:
         self.target, self.public = target, Public(target)
@@ -115,7 +135,11 @@ class _Cases:
     # values in Python
 
     def evaluate(self, name: str, values: Mapping[str, float]) -> Vector:
-        """Return the value of a function. Raises NoCaseError if it is not finite or not regular."""
+        """Return the results of a function of the program, evaluated at `values` (by name).
+
+        Raises NoCaseError if they are not finite, or if a pivot of a matrix to be factored is not
+        positive.
+        """
         try:
             found, regular = self.evaluator(name)(values)
         except (ArithmeticError, ValueError):
@@ -125,14 +149,21 @@ class _Cases:
         return found
 
     def evaluator(self, name: str) -> Callable[[Mapping[str, float]], tuple[Vector, bool]]:
-        """Return the evaluator of a function; its constants are converted once."""
+        """Return the Python evaluator of a function of the program, made once and then cached.
+
+        The evaluator takes values by name. It returns the results, and False if a matrix is
+        singular.
+        """
         if name not in self.known:
             unit = 2.0**-52 if self.double else 2.0**-20  # eight times a float's
             self.known[name] = evaluator(self.program[name], unit=unit)
         return self.known[name]
 
     def value(self, name: str, point: Point) -> Vector:
-        """Return the results of a function of the header; signals may supply the inputs."""
+        """Return the results of the generated C function `name` at a point, computed in Python.
+
+        The scene's signals supply the inputs if the point specifies no inputs. Raises NoCaseError.
+        """
         values = self.complete(point)
         if name in self.program:
             return self.ordered(name, self.evaluate(name, values))
@@ -144,19 +175,28 @@ class _Cases:
         raise NoCaseError
 
     def ordered(self, name: str, values: Vector) -> Vector:
-        """Return results in the header's order: the matrices of the linearization one by one."""
+        """Return results of the program's function `name` in the order in which the C function
+        stores them.
+
+        Only the linearization differs: C stores its matrices A_q, A_qd and B one after the other.
+        """
         if name != "linearization":
             return values
         return self.split([values[k : k + self.width] for k in range(0, len(values), self.width)])
 
     def split(self, rows: Sequence[Sequence[float]]) -> Vector:
-        """Rows of A_q, A_qd and B behind one another."""
+        """Return the entries of A_q, then A_qd, then B, each by rows, from the rows of [A_q, A_qd,
+        B].
+        """
         n = self.nq
         parts = ((0, n), (n, 2 * n), (2 * n, self.width))
         return [x for a, b in parts for row in rows for x in row[a:b]]
 
     def by_columns(self, name: str, values: Mapping[str, float]) -> Vector:
-        """A matrix by its columns, the matrix times each unit vector."""
+        """Return a matrix such as D or the linearization, as C stores it, from its columns.
+
+        Column k is the product of the matrix and unit vector k, which the program computes.
+        """
         names = [x.name for x in (*self.system.q, *self.system.qd, *self.system.u)]
         zero = {f"{n}{ALONG}": 0.0 for n in names}
         own = names if name == "linearization" else names[: self.nq]
@@ -167,7 +207,9 @@ class _Cases:
         return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
 
     def complete(self, point: Point) -> Values:
-        """All values at a point, the signals' among them where these act."""
+        """Return the values of a point by name, with those of the inputs that the scene's signals
+        supply.
+        """
         values = dict(point.values)
         if point.signals and "signal" in self.program:
             u = self.evaluate("signal", values)
@@ -181,27 +223,33 @@ class _Cases:
 
     @property
     def width(self) -> int:
-        """Columns of the linearization."""
+        """The number of columns of [A_q, A_qd, B], the linearization: 2 nq + nu."""
         return 2 * self.nq + len(self.system.inputs)
 
     # steps in Python
 
     def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return qdd at a state x = [q; qd] and a time, with the other arguments of a point."""
+        """Return qdd at the state x = [q; qd] and time t (s), with inputs and parameters from
+        `point`.
+        """
         return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
 
     def shifted(self, point: Point, x: Vector, t: float) -> Point:
-        """Return the point with another state and time."""
+        """Return a copy of the point with the state x = [q; qd] and the time t (s)."""
         names = (s.name for s in (*self.system.q, *self.system.qd))
         values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
         return Point(values, point.signals, point.other, point.span)
 
     def states(self, point: Point) -> Vector:
-        """[q; qd] of a point."""
+        """Return the state [q; qd] of a point as one list."""
         return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
 
     def step(self, m: Method, point: Point, x: Vector, t: float, h: float) -> Vector:
-        """[q; qd] behind a step of a method, by its tableau."""
+        """Return the state [q; qd] after one step of size h (s) of method m, from the state x at
+        time t.
+
+        Raises NoCaseError if the iteration over the stages of an implicit method does not converge.
+        """
         n, a = self.nq, [[0.0] * self.nq for _ in m.b]
         A, AA, (c, b, b_a) = _floats(m.a), _floats(m.a_squared), _floats((m.c, m.b, m.b_a))
 
@@ -243,7 +291,10 @@ class _Cases:
         return self.projected(point, end, t + h)
 
     def projected(self, point: Point, x: Vector, t: float) -> Vector:
-        """A state behind a step moved onto the constraints, where there are."""
+        """Return the state x = [q; qd], projected onto the constraints at time t by iteration.
+
+        Without constraints, return x. Raises NoCaseError if the iteration does not converge.
+        """
         if not self.system.constraints:
             return x
         for _ in range(12):
@@ -254,7 +305,11 @@ class _Cases:
         raise NoCaseError
 
     def flow(self, point: Point, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
-        """[q; qd] a span later, by steps of order 8."""
+        """Return the state [q; qd] after the time `span` (s; may be negative) from the state x at
+        time t.
+
+        The integration takes `steps` equal steps of order 8.
+        """
         for k in range(steps):
             x = self.step(DP8, point, x, t + span * k / steps, span / steps)
         return x
@@ -263,20 +318,24 @@ class _Cases:
 
     @cached_property
     def other_parameters(self) -> tuple[Any, ...]:
-        """The second set of parameters: each differs by one percent or more."""
+        """The parameters with a second set of values, each 1 to 7 percent larger in magnitude."""
         return tuple(
             replace(p, value=self.short(p.value * (1 + 0.01 * (k % 7 + 1))))
             for k, p in enumerate(self.system.parameters)
         )
 
     def short(self, x: float) -> float:
-        """Return a number rounded to six digits, in the element type."""
+        """Return a number rounded to six significant digits and to the C type of numbers."""
         x = float(f"{x:.6g}")
         return x if self.double else _single(x)
 
     @cached_property
     def near(self) -> tuple[Point, ...]:
-        """States near the start: with signals, with inputs, and one with other parameters."""
+        """Test points near the initial state, about three in number.
+
+        The inputs come from the scene's signals, except in the last ones, which specify inputs. One
+        point has the second set of parameters. Expensive systems have two points only.
+        """
         found = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
         if self.other_parameters:
             found[1] = replace(
@@ -290,7 +349,11 @@ class _Cases:
         return tuple(found) if self.is_short else (found[1], found[2])
 
     def point(self, k: int, t: float) -> Point:
-        """The k-th state around the start, with values for whatever else a function may read."""
+        """Return the k-th test point around the initial state, at time t (s).
+
+        It also has values for accelerations, multipliers and frame forces, which functions may
+        read.
+        """
         values = {**nearby(self.system, k), TIME: t}
         more = [x.name for x in (*self.system.qdd, *self.target.wrenches)]
         more += self.target.multipliers
@@ -300,7 +363,7 @@ class _Cases:
 
     @cached_property
     def moving(self) -> frozenset[str]:
-        """Names whose values are chosen here: all but parameters."""
+        """Names of the values of a point other than parameters."""
         return (
             frozenset(nearby(self.system, 0)) - {p.name for p in self.system.parameters}
             | {x.name for x in (*self.system.qdd, *self.target.wrenches)}
@@ -308,7 +371,11 @@ class _Cases:
         )
 
     def driven(self, point: Point, beyond: float) -> Point:
-        """A point with given inputs: within their limits, or beyond the upper or lower ones."""
+        """Return the point with inputs specified rather than supplied by the scene's signals.
+
+        beyond: 0 for inputs within their saturation limits; 1 or -1 for inputs above the upper or
+        below the lower limits.
+        """
         names = self.target.input_names
         u = [0.6 + 0.25 * math.cos(1.3 * i) for i in range(len(names))]
         if "applied" in self.program:
@@ -328,7 +395,9 @@ class _Cases:
         return replace(point, values={**point.values, **values}, signals=False)
 
     def index(self, point: Point) -> int:
-        """The number of a point in the file."""
+        """Return the index of a point in `points`; append the point if it is not yet in the
+        list.
+        """
         if point not in self.points:
             self.points.append(point)
         self.uses_other |= point.other
@@ -336,12 +405,14 @@ class _Cases:
 
     @property
     def arrays(self) -> tuple[tuple[str, str], ...]:
-        """Arrays of a state besides q and qd, with their sizes."""
+        """Name and size (C text) of each array of a test state besides q and qd: qdd, wrenches,
+        lambda.
+        """
         found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
         return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
 
     def state(self, point: Point) -> State:
-        """A point as literals."""
+        """Return the arguments of a test call with numbers as C literals."""
         s, literal = self.system, self.target.literal
         names = {"qdd": [x.name for x in s.qdd], "lambda": self.target.multipliers}
         names["wrenches"] = [x.name for x in self.target.wrenches]
@@ -356,7 +427,9 @@ class _Cases:
         )
 
     def input_names(self, point: Point) -> list[str]:
-        """Return the names of the inputs of a point; none if the signals supply them."""
+        """Return the names of the inputs that a point specifies; none if the signals supply
+        them.
+        """
         return [] if point.signals else self.target.input_names
 
     # cases
@@ -365,10 +438,11 @@ class _Cases:
         self, point: Point, compute: Callable[[Point], Vector], allowed: float = 0.0,
         sharp: bool = False,
     ) -> Case | None:  # fmt: skip
-        """Return the expected results at a point and their error limit; None if it is too large.
+        """Return the expected results at a point with their error limit, as a test case.
 
-        The limit is a thousand times the effect of perturbations of the state by one ulp, at least
-        a rounding error and `allowed`; if `sharp`, it is `allowed`.
+        The limit is relative to the largest result: 1000 times the effect of perturbing the state
+        by one ulp, but at least `allowed` and a basic tolerance. With `sharp`, it is exactly
+        `allowed`. Returns None if the results cannot be computed or the limit would be too large.
         """
         try:
             expected = compute(point)
@@ -384,7 +458,10 @@ class _Cases:
         return Case(self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}"))
 
     def nudged(self, point: Point, turn: int) -> Point:
-        """A point moved by about an ulp, coordinate by coordinate to and fro."""
+        """Return the point with each coordinate and velocity changed by about one ulp.
+
+        turn: 0 or 1, for two different patterns of signs.
+        """
         ulp = self.target.real.epsilon
         names = [x.name for x in (*self.system.q, *self.system.qd)]
         moved = {}
@@ -394,7 +471,7 @@ class _Cases:
         return replace(point, values={**point.values, **moved})
 
     def tested(self) -> Iterator[Tested]:
-        """All that is tested, in the header's order."""
+        """Yield a test of each function of the generated C header, in the order of the header."""
         for function in self.public.evaluations():
             name = function.name.removeprefix(f"{self.target.prefix}_")
             cases = [self.case(p, partial(self.value, name)) for p in self.near]
@@ -418,18 +495,25 @@ class _Cases:
     def written(
         self, name: str, kind: str, call: str, cases: Sequence[Case | None], type: str = ""
     ) -> Tested:
-        """A function of the self-test that makes a call; the template has its statements."""
+        """Return a test of the C function `name` by the C text `call`, without the cases that are
+        None.
+
+        kind: form of the test's body in the template, see `views.Tested`. type: C type of the
+        workspace of an adaptive run.
+        """
         return Tested(name, kind, call, type, tuple(filter(None, cases)))
 
     def call(self, f: CFunction, **passed: str) -> str:
-        """A call at the state s."""
+        """Return a C call of f whose arguments are members of the test state s, except those in
+        `passed`.
+        """
         fields = ("q", "qd", "qdd", "wrenches", "lambda", "t", "u", "p")
         at = {n: member("s", n) for n in fields}
         at |= {"t0": member("s", "t"), "h": member("s", "span")}
         return f.call(**at | passed)
 
     def far(self, name: str) -> list[Case | None]:
-        """Return cases with large angles at which double precision resolves the sines."""
+        """Return up to three test cases of function `name` with large angles."""
         found: list[Case | None] = []
         for values in islice(self.large, FAR):
             allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
@@ -442,11 +526,18 @@ class _Cases:
 
     @cached_property
     def large(self) -> list[dict[str, float]]:
-        """States with large angles at which bias and accelerations are right to enough digits."""
+        """States (values by name) with large angles at which double precision suffices.
+
+        Bias and accelerations, computed in doubles, agree there with the exact results.
+        """
         return [x for x in _large(self.target) if self.is_sharp(x)]
 
     def is_sharp(self, x: Mapping[str, float]) -> bool:
-        """Return True if bias and accelerations agree with those computed with 40 digits."""
+        """Return True if bias and accelerations in doubles agree with those computed with 40
+        digits.
+
+        x: state, time and parameters by name.
+        """
         known = self.complete(Point({n: v if self.double else _single(v) for n, v in x.items()}))
         room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
         for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
@@ -499,12 +590,15 @@ class _Cases:
 
     @cached_property
     def is_short(self) -> bool:
-        """Whether many evaluations in Python take no long time."""
+        """Whether the accelerations are cheap enough for many evaluations in Python."""
         return weight(self.program["acceleration"]) <= LONGEST
 
     @cached_property
     def starts(self) -> tuple[Point, ...]:
-        """Where steps begin: states near the start; under constraints on them."""
+        """Initial points of steps: points near the initial state.
+
+        With constraints, it is only the initial state itself, which satisfies them.
+        """
         if not self.system.constraints:
             return tuple(replace(p, span=1.0) for p in self.near if not p.other)
         point = self.point(0, START)
@@ -512,7 +606,12 @@ class _Cases:
         return (replace(point, span=1.0),)
 
     def spanned(self, m: Method, point: Point) -> Point | None:
-        """A point with a step size: as long as the method can take it, so that errors show."""
+        """Return the point with the largest suitable step size (as `span`) for method m; None if
+        none is.
+
+        A step size is suitable if the error limit of a few steps is small and the state does not
+        grow much.
+        """
         h = self.system.run.h
         most = 1 if m.sweeps else 2 if m.implicit else 4
         for factor in (4.0**k for k in range(most, -5, -1)):
@@ -524,7 +623,9 @@ class _Cases:
         return None
 
     def stepped(self, m: Method, steps: int, point: Point) -> Vector:
-        """[q; qd] behind each of some steps."""
+        """Return the states [q; qd] after each of `steps` steps of size `point.span`, in one
+        list.
+        """
         x, found, t, h = self.states(point), Vector(), point.values[TIME], point.span
         for n in range(steps):
             x = self.step(m, point, x, t + n * h, h)
@@ -532,23 +633,31 @@ class _Cases:
         return found
 
     def rows(self, m: Method, point: Point) -> Vector:
-        """Return the results of a run: its end, and the rows of q and of qd."""
+        """Return the results of a run of three steps as C stores them.
+
+        These are the last state [q; qd], then q after each step, then qd after each step.
+        """
         n, found = self.nq, self.stepped(m, STEPS, point)
         states = [found[k : k + 2 * n] for k in range(0, len(found), 2 * n)]
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
 
     def twice(self, m: Method, point: Point) -> Vector:
-        """Return the end states of two instances with equal initial states."""
+        """Return the final states of two instances in a batch that have equal initial states.
+
+        The order is that of C: q of both instances, then qd of both.
+        """
         end = self.stepped(m, STEPS, point)[-2 * self.nq :]
         return [*end[: self.nq] * 2, *end[self.nq :] * 2]
 
     def projection(self, point: Point) -> Vector:
-        """Return [q; qd] projected onto the constraints."""
+        """Return the state [q; qd] of a point, projected onto the constraints."""
         return self.projected(point, self.states(point), point.values[TIME])
 
     def run_call(self, name: str) -> str:
-        """Return the call of a run of a few steps: its end, and the rows of q and of qd."""
+        """Return the C call of a run of three steps of method `name`, which stores the state of
+        each step.
+        """
         return self.call(
             self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(STEPS),
             u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + STEPS}*NQ",
@@ -556,7 +665,9 @@ class _Cases:
         )  # fmt: skip
 
     def batch_call(self, name: str) -> str:
-        """Return the call of a batch of two instances with equal initial states."""
+        """Return the C call of a batch of two instances with equal initial states, by method
+        `name`.
+        """
         return self.call(
             self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
             steps=str(STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
@@ -564,7 +675,7 @@ class _Cases:
         )  # fmt: skip
 
     def adaptive_call(self) -> str:
-        """Return the call of an adaptive run to t + span."""
+        """Return the C call of an adaptive run from the time t of the test state to t + span."""
         return self.call(
             self.public.adaptive(adaptive.METHOD.name), q="out", qd="out + NQ", t="&t",
             t_end=f"t + {member('s', 'span')}", h_most="0",
@@ -575,7 +686,11 @@ class _Cases:
         )  # fmt: skip
 
     def derivative(self, m: Method, point: Point) -> Case | None:
-        """The derivative of a step along 1, 2, 3, 1, 2, ..., by differences of steps."""
+        """Return the test case for the derivative of a step of method m along a fixed direction.
+
+        The direction has components 1, 2, 3, 1, 2, ... in q, qd and the specified inputs. The
+        derivative is a central difference. Returns None if it is not accurate enough.
+        """
         names = [x.name for x in (*self.system.q, *self.system.qd)]
         names += self.input_names(point)
 
@@ -601,7 +716,11 @@ class _Cases:
     # adaptive runs and events
 
     def adaptive_runs(self) -> Iterator[Tested]:
-        """Runs by a tolerance without an event, and over each event in both directions."""
+        """Yield one test of adaptive runs: runs without events, and runs across each event.
+
+        Events are crossed in both directions. With constraints or friction modes, there are only
+        the runs without events.
+        """
         cases = [self.quiet(p) for p in self.starts]
         if not (self.system.constraints or self.system.modes):
             for k in range(len(self.system.own_events)):
@@ -610,11 +729,13 @@ class _Cases:
         yield self.written("adaptive", "adaptive", self.adaptive_call(), cases, memory)
 
     def spans(self) -> tuple[float, ...]:
-        """Lengths of adaptive runs that are tried."""
+        """Return the lengths (s) of adaptive runs to try, from the longest to the shortest."""
         return tuple(self.short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
 
     def quiet(self, point: Point) -> Case | None:
-        """A run in which nothing happens."""
+        """Return the case of an adaptive run from a point in which no event occurs; None if there
+        is none.
+        """
         for span in self.spans():
             tried = replace(point, span=span)
             try:
@@ -629,11 +750,16 @@ class _Cases:
 
     @property
     def of_runs(self) -> float:
-        """Error limit of adaptive runs."""
+        """Error limit of adaptive runs, relative to the largest result."""
         return 1e-8 if self.double else 2e-3
 
     def ended(self, event: Happening | None, point: Point) -> Vector:
-        """[q; qd] and t at the end of an adaptive run, the number of events, the first of them."""
+        """Return the results of an adaptive run as C stores them.
+
+        These are the final [q; qd] and time and, if the scene has events, the number of events and
+        the number (from 1), time and state of the first event. event: time and index of the event
+        in this run; None for none.
+        """
         x, t, span = self.states(point), point.values[TIME], point.span
         none = [0.0] * (3 + 2 * self.nq) if self.system.events else []
         if event is None:
@@ -650,18 +776,22 @@ class _Cases:
         return [*self.sure(point, x, at, t + span - at), t + span, *found]
 
     def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
-        """Return `flow`; raise NoCaseError if shorter steps do not agree."""
+        """Return the state after `span` as `flow` does; raise NoCaseError if shorter steps do not
+        agree.
+        """
         found, finer = (self.flow(point, x, t, span, n) for n in (4, 6))
         if _off(found, finer) > self.of_runs / 10:
             raise NoCaseError
         return finer
 
     def events(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return the event functions."""
+        """Return the values of the event functions at the state x = [q; qd] and time t."""
         return self.value("events", self.shifted(point, x, t))
 
     def refuse_events(self, point: Point, x: Vector, t: float, span: float) -> None:
-        """Raise NoCaseError if an event function changes its sign on the way, or nearly does."""
+        """Raise NoCaseError if an event function changes sign, or nearly does, within `span` from
+        time t.
+        """
         first = self.events(point, x, t) if self.system.events else []
         for k in range(8) if first else ():
             x = self.flow(point, x, t + span * k / 8, span / 8, 1)
@@ -671,7 +801,9 @@ class _Cases:
                     raise NoCaseError
 
     def crossings(self, k: int) -> list[Case | None]:
-        """Return runs across event k, rising and falling, if there are any."""
+        """Return the cases of runs across event k: at most one with a rising and one with a falling
+        sign.
+        """
         found: dict[bool, Case] = {}
         for point in self.candidates(k):
             for span in self.spans():
@@ -687,7 +819,10 @@ class _Cases:
         return [*found.values()]
 
     def candidates(self, k: int) -> Iterator[Point]:
-        """States on event k: near the start, one coordinate or velocity moved until it is zero."""
+        """Yield points near the initial state at which the event function k is zero.
+
+        Each is found by changing the time, one coordinate or one velocity.
+        """
         names = [x.name for x in (*self.system.q, *self.system.qd)]
         for number in range(1, 5):
             for back in (1, -1):
@@ -701,7 +836,11 @@ class _Cases:
                         continue
 
     def solved(self, k: int, point: Point, name: str) -> Point:
-        """A point whose value `name` is so that event k is zero, by secants."""
+        """Return the point with `name` changed such that event function k is zero, by the secant
+        method.
+
+        Raises NoCaseError if the iteration does not converge or the value is too large.
+        """
 
         def g(x: float) -> float:
             return self.value("events", replace(point, values={**point.values, name: x}))[k]
@@ -722,7 +861,11 @@ class _Cases:
         return replace(point, values={**point.values, name: b})
 
     def crossing(self, k: int, on: Point, span: float) -> tuple[bool, Case | None]:
-        """A run from half a span before a state on event k to half a span behind it."""
+        """Return whether event function k rises, and the test case of a run across its zero.
+
+        on: a point at which the function is zero. The run starts half a `span` (s) before it.
+        Raises NoCaseError if other events occur in the run.
+        """
         x, t, half = self.states(on), on.values[TIME], span / 2
         others = [i for i in range(len(self.system.events)) if i != k]
         begin = self.flow(on, x, t, -half)

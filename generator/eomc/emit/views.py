@@ -1,4 +1,4 @@
-"""Views of the templates besides both forms of C: frozen dataclasses with values only."""
+"""Data for the templates of main.c, selftest.c, the build files and the Python package."""
 
 from __future__ import annotations
 
@@ -13,9 +13,32 @@ from eomc.program.ir import Cost
 
 @dataclass(frozen=True)
 class Main:
-    """c/main.c.jinja: the scene's own run, adaptive where it has a tolerance.
+    """Data for the template c/main.c.jinja: an example program that simulates the scene.
 
-    run, energy, outputs: calls; accelerations: outputs'; refuses: whether these have a status.
+    The scene is the TOML file (or Python model) that the code is generated from. The program prints
+    time, state, outputs and energy as CSV.
+
+    Attributes
+    ----------
+    has_p
+        Whether the C functions take parameters.
+    method
+        Integration method, as in the C name of the workspace type.
+    adaptive
+        Whether steps are adaptive; the scene then has a tolerance.
+    rows, t_end, tolerance
+        Number of printed lines, end time (s) and error tolerance, for adaptive steps.
+    h, steps, every
+        Step size (s), number of steps, and steps between printed lines, for steps of fixed size.
+    events
+        Whether the scene has events.
+    columns
+        Names of the CSV columns, in pieces that each fit on a line.
+    run, energy, outputs, accelerations
+        C calls: of the integrator, the energy, the outputs, and the accelerations that the outputs
+        read. Empty if not needed.
+    refuses
+        Whether the C function of the outputs returns a status.
     """
 
     TEMPLATE: ClassVar[str] = "c/main.c"
@@ -44,10 +67,20 @@ class Main:
 
 @dataclass(frozen=True)
 class State:
-    """A state of selftest.c as literals.
+    """Arguments of one test call in selftest.c, as C literals.
 
-    arrays: q, qd and what else functions read. span: the length of a step or a run. u: empty where
-    the signals act. other: whether the second set of parameters is taken.
+    Attributes
+    ----------
+    arrays
+        Values of q and qd, then of each array in `SelfTest.arrays`.
+    t
+        Time in s.
+    span
+        Size of a step or length of a run, in s.
+    u
+        Inputs; empty if the scene's signals supply them.
+    other
+        Whether the parameters are `SelfTest.other` rather than those of the scene.
     """
 
     arrays: tuple[tuple[str, ...], ...]
@@ -59,7 +92,17 @@ class State:
 
 @dataclass(frozen=True)
 class Case:
-    """The number of a state, what is expected there, the limit relative to its largest entry."""
+    """Expected result of a C function for one state, with an error limit.
+
+    Attributes
+    ----------
+    state
+        Index into `SelfTest.states`.
+    expected
+        Expected numbers as C literals.
+    limit
+        Largest permitted error, relative to the largest expected number.
+    """
 
     state: int
     expected: tuple[str, ...]
@@ -68,9 +111,21 @@ class Case:
 
 @dataclass(frozen=True)
 class Tested:
-    """A function of selftest.c that makes a call to one of the header, and its cases.
+    """A test function of selftest.c, which calls one function of the generated header.
 
-    kind: which of the forms of the template it has. memory: the type of what a run hands on.
+    Attributes
+    ----------
+    name
+        Name of the tested function without the scene's prefix.
+    kind
+        Form of the test's body in the template: "values", "number", "status", "moved", "run",
+        "batch", "derivative" or "adaptive".
+    call
+        The C call that is tested.
+    memory
+        C type of the workspace of an adaptive run; "" for other kinds.
+    cases
+        Expected results for several states.
     """
 
     name: str
@@ -82,10 +137,26 @@ class Tested:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """c/selftest.c.jinja. other: the second set of parameters. arrays: of a state, and extents.
+    """Data for the template c/selftest.c.jinja: a C program that tests the generated functions.
 
-    events, inputs: whether there are any. most: numbers of the largest result. large: whether there
-    are states with large angles.
+    Attributes
+    ----------
+    states
+        Arguments of the test calls.
+    other
+        Values of a second set of parameters; empty if no state uses it.
+    has_p
+        Whether the C functions take parameters.
+    arrays
+        Name and size of each array of a state besides q and qd.
+    tested
+        The test functions with their expected results.
+    events, inputs
+        Whether the scene has events and inputs.
+    most
+        Largest number of expected numbers in a case.
+    large, large_limit
+        Whether some states have large angles, and their limit in rad, for a comment.
     """
 
     TEMPLATE: ClassVar[str] = "c/selftest.c"
@@ -108,7 +179,10 @@ class SelfTest:
 
 @dataclass(frozen=True)
 class CMake:
-    """c/CMakeLists.txt.jinja: a library of the C, for add_subdirectory and find_package."""
+    """Data for the template c/CMakeLists.txt.jinja, which builds the generated C as a library.
+
+    Other projects use the library by add_subdirectory or find_package.
+    """
 
     TEMPLATE: ClassVar[str] = "c/CMakeLists.txt"
     stamp: tuple[FreeText, ...]
@@ -119,7 +193,10 @@ class CMake:
 
 @dataclass(frozen=True)
 class PkgConfig:
-    """c/package.pc.in.jinja, which CMake fills in and installs."""
+    """Data for the template c/package.pc.in.jinja: a pkg-config file of the generated C library.
+
+    CMake completes and installs the file.
+    """
 
     TEMPLATE: ClassVar[str] = "c/package.pc.in"
     stamp: tuple[FreeText, ...]
@@ -129,7 +206,7 @@ class PkgConfig:
 
 @dataclass(frozen=True)
 class Counted:
-    """A function of mechanics and its operations."""
+    """A generated C function by name, with the number of operations of one call."""
 
     name: str
     cost: Cost
@@ -137,7 +214,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Stepped:
-    """A step of a method, and a description of its calls."""
+    """A step function by name, with a text (`words`) on how many accelerations a step computes."""
 
     name: str
     words: str
@@ -145,7 +222,10 @@ class Stepped:
 
 @dataclass(frozen=True)
 class Costs:
-    """c/costs.txt.jinja. width: of the column of names."""
+    """Data for the template c/costs.txt.jinja: a table of operation counts of the C functions.
+
+    `width` is the width of the column of names, in characters.
+    """
 
     TEMPLATE: ClassVar[str] = "c/costs.txt"
     stamp: tuple[FreeText, ...]
@@ -157,11 +237,21 @@ class Costs:
 
 @dataclass(frozen=True)
 class Bound:
-    """An evaluation function in the binding: name and call for row k of many.
+    """An evaluation function, such as D or energy, in the Python binding, called for n states.
 
-    solve: the call for the accelerations that it reads, if any. at: for functions of the state that
-    return a number, the call at x. refuses: for functions that return a status, the number of
-    elements of a row.
+    Attributes
+    ----------
+    name
+        Name of the function without the scene's prefix.
+    call
+        C call for the state with index k, with an assignment if the function returns a number.
+    solve
+        C call that first computes the accelerations which the function reads; "" if it reads none.
+    at
+        C call at x = [q; qd], for SciPy's LowLevelCallable; "" unless the function returns a double
+        that depends on the state and parameters only.
+    refuses
+        Number of results for each state, as C text, if the function returns a status; otherwise "".
     """
 
     name: str
@@ -173,9 +263,18 @@ class Bound:
 
 @dataclass(frozen=True)
 class BoundMethod:
-    """A method in the binding, and the calls of its functions; derivative: if there is one.
+    """C calls of one integration method in the Python binding.
 
-    step_between, derivative_between: of a step behind others, as a control period has them.
+    Attributes
+    ----------
+    step, run, batch
+        Calls for one step, for a run, and for a run of many instances.
+    derivative
+        Call for the derivatives of a step from the state with index k; "" if these are not
+        generated.
+    step_between, derivative_between
+        Calls for each further step and its derivatives, where the derivatives of several steps are
+        multiplied; "" as for `derivative`.
     """
 
     name: str
@@ -190,7 +289,17 @@ class BoundMethod:
 
 @dataclass(frozen=True)
 class BoundAdaptive:
-    """Adaptive steps in the binding: the type of their memory, calls, whether events are."""
+    """Adaptive steps in the Python binding.
+
+    Attributes
+    ----------
+    memory
+        C type of the workspace.
+    run, batch
+        C calls for a run, and for runs of many instances.
+    events
+        Whether the scene has events.
+    """
 
     memory: str
     run: str
@@ -200,7 +309,24 @@ class BoundAdaptive:
 
 @dataclass(frozen=True)
 class Binding:
-    """python/binding.c.jinja. project, linearization: their calls, if there are."""
+    """Data for the template python/binding.c.jinja: C functions that Python calls for many states.
+
+    Attributes
+    ----------
+    evaluations
+        The evaluation functions, such as D or energy.
+    acceleration, project, linearization
+        C calls for the accelerations, the projection onto the constraints and the linearization;
+        "" for those that are not generated.
+    batch
+        Whether runs of many instances are generated.
+    methods, adaptive
+        Integration methods with steps of fixed size, and adaptive steps (None without a tolerance).
+    parameter_count, input_count
+        Number of parameters and inputs of the scene.
+    timed
+        Whether the C functions of steps take the time.
+    """
 
     TEMPLATE: ClassVar[str] = "python/binding.c"
     prefix: str
@@ -220,7 +346,10 @@ class Binding:
 
 @dataclass(frozen=True)
 class Declarations:
-    """python/binding.cdef.jinja: the declarations of the binding for cffi."""
+    """Data for the template python/binding.cdef.jinja: declarations of the Python binding for cffi.
+
+    The fields are those of `Binding` with the same names.
+    """
 
     TEMPLATE: ClassVar[str] = "python/binding.cdef"
     real: str
@@ -234,7 +363,17 @@ class Declarations:
 
 @dataclass(frozen=True)
 class Named:
-    """A coordinate, parameter or input by its author's name; the value of a parameter."""
+    """A coordinate, parameter, input or output, as listed in the Python package.
+
+    Attributes
+    ----------
+    written
+        Its name in the scene, which may differ from the name in C.
+    words
+        Its unit and note.
+    number
+        Value of a parameter as Python text; otherwise "".
+    """
 
     written: str
     words: FreeText
@@ -243,9 +382,39 @@ class Named:
 
 @dataclass(frozen=True)
 class Face:
-    """python/face.py.jinja. start: coordinates and velocities; functions: public, of the model.
+    """Data for the template python/face.py.jinja: the __init__.py of the generated Python package.
 
-    optional: further functions by the key of [run] that adds them.
+    Attributes
+    ----------
+    extension
+        Name of the compiled extension module.
+    digest
+        Digest (SHA-256) of the scene.
+    coordinate_units, input_units, output_units, units
+        Units by name; `units` has all that are not empty, also of parameters.
+    plane
+        Whether frames, momentum or reactions are planar.
+    start
+        Initial values of the coordinates and of the velocities.
+    follows
+        Formulas of the initial values that depend on parameters, by name.
+    h, duration, tolerance
+        Default step size (s), duration (s) and error tolerance of a simulation.
+    fixed
+        Whether assembly keeps the initial value of each coordinate, then of each velocity.
+    holonomic, redundant
+        Number of holonomic constraint equations, and indices of the redundant ones.
+    modes
+        For each joint with stick-slip friction, the index of its discrete coordinate and of the
+        coordinate that slides or sticks.
+    discrete
+        Number of discrete coordinates that are parameters set by state jumps.
+    functions
+        Names of the model's public functions in the package.
+    optional
+        Option of [run] and the functions that it would add, for options that are off.
+    from_python
+        Whether the model was made in Python rather than from a scene.
     """
 
     TEMPLATE: ClassVar[str] = "python/face.py"
@@ -288,7 +457,7 @@ class Face:
 
 @dataclass(frozen=True)
 class Stub:
-    """python/stub.pyi.jinja: the package as type checkers see it."""
+    """Data for the template python/stub.pyi.jinja: type stubs of the generated Python package."""
 
     TEMPLATE: ClassVar[str] = "python/stub.pyi"
     stamp: tuple[FreeText, ...]
@@ -298,8 +467,16 @@ class Stub:
 
 @dataclass(frozen=True)
 class Form:
-    """A variant of the extension in a wheel: name, file, and CPU features that it needs, as in
-    Linux.
+    """A variant of the compiled extension in a wheel, for processors with certain features.
+
+    Attributes
+    ----------
+    name
+        Name of the variant.
+    extension
+        Name of the extension module.
+    needs
+        CPU features that the variant requires, as named by /proc/cpuinfo in Linux.
     """
 
     name: str
@@ -309,7 +486,10 @@ class Form:
 
 @dataclass(frozen=True)
 class Compiled:
-    """python/compiled.py.jinja: selection of one of several extensions."""
+    """Data for the template python/compiled.py.jinja: a module that imports one of the variants.
+
+    By default it imports the first of `forms` whose features the processor has.
+    """
 
     TEMPLATE: ClassVar[str] = "python/compiled.py"
     prefix: str
@@ -319,7 +499,10 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Quad:
-    """report/reference_solution.c.jinja: a motion in __float128. parameters: how many."""
+    """Data for the template report/reference_solution.c.jinja: a simulation in quadruple precision.
+
+    parameters: number of parameters. call: C call of the accelerations.
+    """
 
     TEMPLATE: ClassVar[str] = "report/reference_solution.c"
     prefix: str
