@@ -22,9 +22,10 @@ MAX_NAMED_COORDINATES = 9  # with more coordinates, entries of D get no names D_
 
 
 def abbreviate(equations: AnyEquations) -> AnyEquations:
-    """Return the equations with shared subexpressions named, in the field `named`.
+    """Return a copy of the equations in which subexpressions that occur twice or more have names.
 
-    In the scalar equations, long entries of D are replaced by their names.
+    The field `named` of the copy contains the pairs (name, expression). In the scalar equations,
+    long entries of the mass matrix D are replaced by names such as D_12.
     """
     entries = _entries_of_D(equations)
     left = tuple([(rates, entries.get(c, c)) for rates, c in terms] for terms in equations.left)
@@ -56,7 +57,11 @@ def abbreviate(equations: AnyEquations) -> AnyEquations:
 def extract_common_subexpressions(
     formulas: Sequence[Expr], letter: str
 ) -> tuple[list[tuple[Symbol, Expr]], list[Expr]]:
-    """Return definitions (name, formula over earlier names) and the formulas in terms of them."""
+    """Name the subexpressions that `formulas` share: `letter`_1, `letter`_2, ...
+
+    Returns the list of definitions (name, expression over earlier names), and the formulas
+    rewritten with these names, in the given order.
+    """
     temporary = sympy.numbered_symbols("_", real=True)
     subexpressions, reduced = sympy.cse(formulas, order="none", symbols=temporary)
     uses = Counter(s for e in (*(e for _, e in subexpressions), *reduced) for s in _symbols(e))

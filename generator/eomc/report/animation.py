@@ -43,16 +43,17 @@ MIN_PLAYING_SECONDS, MAX_PLAYING_SECONDS = (
 
 @dataclass(frozen=True)
 class Animation:
-    """A page that plays a motion; notebooks show it, `save` writes it.
+    """An HTML page that plays a motion. Notebooks display it; `save` writes it to a file.
 
-    panels: the number of panels of curves below each other.
+    page: the HTML text. panels: the number of panels with curves below the drawing, from which a
+    notebook computes the height of its frame.
     """
 
     page: str = field(repr=False)
     panels: int = 0
 
     def save(self, file: str | os.PathLike[str]) -> None:
-        """Write the page. Raises EomcError where it can't be written."""
+        """Write the page to `file`. Raises EomcError if the file can't be written."""
         with writing(texts.line(str(file))), atomic_write(file) as new:
             new.write_text(self.page, encoding="utf-8")
 
@@ -72,10 +73,12 @@ def animate(
     scene: Source | None = None,
     title: str | None = None,
 ) -> Animation | None:
-    """Animate runs, side by side.
+    """Animate simulated runs, drawn side by side, as an HTML page or a film.
 
-    file: .html, .gif or .mp4; None: no file is written. scene: of the first run, as in system_of.
-    Returns the page, or None for a film. Raises EomcError if it can't be drawn or written.
+    file: path with the suffix .html, .gif or .mp4; if None, no file is written. scene: the scene
+    of the first run, needed if its module was not loaded with `eomc.load`. title: heading in place
+    of the scenes' titles. Returns the page, or None if a film (.gif or .mp4) was written. Raises
+    EomcError if the animation can't be drawn or written.
     """
     _check(file)
     timelines = [
@@ -93,10 +96,12 @@ def instances(
     scene: Source | None = None,
     title: str | None = None,
 ) -> Animation | None:
-    """Animate instances of a batch, superimposed.
+    """Animate several instances of a batch of runs, drawn over each other.
 
-    names: of the curves. chosen: how many instances, or their numbers. Other arguments and errors
-    as in `animate`; also raises KeyError for unknown names.
+    names: quantities to plot below the drawing, one panel each; by default coordinates and the
+    energy. chosen: the number of instances to show, spread evenly over the batch, or the list of
+    their indices. The other arguments, the result and the errors are those of `animate`; in
+    addition, KeyError is raised for unknown names.
     """
     _check(file)
     return shown([BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title)
@@ -112,7 +117,11 @@ def _check(file: str | os.PathLike[str] | None) -> None:
 def shown(
     timelines: Sequence[Timeline], file: str | os.PathLike[str] | None, title: str | None
 ) -> Animation | None:
-    """Return the page of the timelines, or None for a film; write it if there is a file."""
+    """Make the animation of the timelines (runs to draw side by side) and write it to `file`.
+
+    Returns the page, or None if the suffix of `file` requests a film. If `file` is None, nothing is
+    written.
+    """
     if file is not None and Path(file).suffix.lower() in FILMS:
         from eomc.report import film
 
@@ -126,7 +135,7 @@ def shown(
 
 
 def page(timelines: Sequence[Timeline], title: str | None = None) -> str:
-    """Return the HTML of the page."""
+    """Return the HTML text of the page that plays the timelines (runs) side by side."""
     pages = [_RunOnPage(timeline, len(timelines)) for timeline in timelines]
     heading = title or " and ".join(dict.fromkeys(timeline.title for timeline in timelines))
     seconds = max(page_run.rows[-1] - page_run.rows[0] for page_run in pages)
@@ -187,7 +196,7 @@ class _RunOnPage:
 
     @property
     def rate(self) -> float:
-        """Rows per second of the motion."""
+        """Number of rows (stored instants) per second of simulated time."""
         lasting = self.rows[-1] - self.rows[0]
         return (len(self.rows) - 1) / lasting if lasting else 0.0
 
@@ -205,7 +214,7 @@ class _RunOnPage:
         }
 
     def words(self) -> dict[str, Any]:
-        """Return the texts on the page that describe the run."""
+        """Return the texts that describe the run, as data for the template animation.html."""
         drawing = self.drawing
         scale = np.ptp(drawing.points, axis=(0, 1)).max() / (2 * LEVELS) if drawing else 0.0
         resolution = f"{len(self.rows)} rows, {self.rate:.3g} a second of the motion"

@@ -55,13 +55,16 @@ LARGE_CONDITION = 1e8  # condition number of D, diagonal scaled to 1, above whic
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One run, by fixed steps h or adaptive steps with a tolerance.
+    """Accuracy and computing time of one run, with fixed steps or with adaptive steps.
 
-    Errors are relative, and inf if the run did not reach its end.
+    Errors are relative to the largest value of each component along the motion, and inf if the run
+    did not reach its end.
 
-    q, qd, end: error of the last positions, velocities, and both. along: largest error at any row.
-    energy: largest energy error; energies: its values over time. evaluations: number of evaluations
-    of the accelerations. tol: the tolerance, nan for fixed steps; then h is the mean step size.
+    method: name of the stepper. h: step size in s, the mean one if steps are adaptive. q, qd, end:
+    error of the final positions, of the final velocities, and the larger of both. along: largest
+    error at any stored time. energy: largest energy error; energies: energy errors at the stored
+    times. seconds: computing time. evaluations: number of evaluations of the accelerations. tol:
+    tolerance of adaptive steps, nan for fixed steps.
     """
 
     method: str
@@ -80,20 +83,22 @@ class Point:
 
     @property
     def adaptive(self) -> bool:
-        """True if the steps are adaptive."""
+        """True if the run has adaptive steps."""
         return not math.isnan(self.tol)
 
 
 @dataclass(frozen=True)
 class Line:
-    """One stepper: its runs from coarse to fine, and what follows from them.
+    """Results of one stepper (integration method): its runs from coarse to fine, and their summary.
 
-    observed: observed order, nan if too few errors are above rounding. usable_h: the largest
-    measured h for which the error of its run and of all finer ones is below 1. stable_to: largest
-    stable h by the eigenvalues, inf for any. Below it the method amplifies no perturbation (`check`
-    tests that), but errors accumulate: usable_h is 0.4 to 0.8 of it for regular motions, and a
-    tenth or less where perturbations grow or the fast part is short. rounding: h below which finer
-    steps do not help, or nan. For adaptive steps, all but `order` are nan.
+    points: the runs. order: nominal order of the method. observed: observed order, nan if too few
+    errors are above rounding. usable_h: largest measured step size h (s) for which the relative
+    error of its run and of all finer runs is below 1. stable_to: largest stable h by the
+    eigenvalues of the linearised motion, inf if every h is stable. Below it, the method amplifies
+    no perturbation, but errors accumulate: usable_h is 0.4 to 0.8 of it for regular motions, and a
+    tenth or less if perturbations grow or if the fast part of the motion is short. rounding: h
+    below which finer steps do not reduce the error, or nan. For adaptive steps, all numbers but
+    `order` are nan.
     """
 
     method: str
@@ -107,7 +112,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Report:
-    """Results for one scene. digits: of the reference; skipped: unusable steppers, and why."""
+    """Cost of accuracy of one scene: the results of all steppers and properties of the motion.
+
+    duration: simulated time, s. digits: correct digits of the reference solution at its end. lines:
+    results of each stepper. growth: growth of a perturbation of the initial state. eigenvalue:
+    eigenvalue of the largest magnitude along the motion, 1/s. condition: largest condition number
+    of the mass matrix D, with the time t and the coordinates q at which it occurs. corners:
+    non-smooth functions in the equations. events: names of the scene's events. t: stored times of
+    the reference solution, s. skipped: reason why a stepper can't be used, by its name.
+    """
 
     scene: str
     title: str
@@ -125,17 +138,17 @@ class Report:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """All runs."""
+        """The runs of all steppers, each as a `Point`."""
         return tuple(p for line in self.lines for p in line.points)
 
     def best(self, digits: float) -> Point | None:
-        """Return the fastest run with at least `digits` digits along the whole motion, or None."""
+        """Return the fastest run with at least `digits` correct digits at all times, or None."""
         good = (p for p in self.points if p.along <= 10.0**-digits)
         return min(good, key=lambda p: p.seconds, default=None)
 
     @property
     def finest(self) -> Point:
-        """Run with the smallest error."""
+        """The run whose largest error along the motion is smallest."""
         return min(self.points, key=lambda p: p.along)
 
 
@@ -147,7 +160,9 @@ def measure(
     methods: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> Report:
-    """Measure the cost of accuracy for one scene, from its initial state over its duration.
+    """Measure computing time and error of all steppers for one scene.
+
+    Each run starts from the scene's initial state and lasts for the scene's duration.
 
     Parameters
     ----------
@@ -209,10 +224,11 @@ def measure(
 
 
 def variant(system: System, names: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
-    """Build the scene with all steppers in `names` that it can use.
+    """Build a module from the system with all steppers in `names` that can integrate it.
 
-    Returns the module and the reasons why other steppers can't be used. The scene's events are
-    removed, since neither fixed steps nor the reference solution detect them.
+    root: build directory. Returns the loaded module, and a mapping from each of the other steppers
+    to the reason why it can't be used. The scene's events are removed, since neither fixed steps
+    nor the reference solution detect them. Raises EomcError if no stepper can be used.
     """
 
     def with_methods(methods: Sequence[str]) -> System:

@@ -17,9 +17,10 @@ Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its 
 
 @dataclass(frozen=True)
 class Derived:
-    """Expressions of the equations of motion; `equations.Equations` documents the fields.
+    """The equations of motion D q̈ + C q̇ + g = τ + Aᵀλ of a system as SymPy expressions.
 
-    `symbols` maps names to the symbols that the expressions contain instead of the system's own.
+    The subclass `equations.Equations` documents the fields. `symbols` maps names to the symbols
+    that the expressions contain instead of the system's own.
     """
 
     system: System
@@ -41,12 +42,16 @@ class Derived:
 
     @property
     def multipliers(self) -> tuple[Expr, ...]:
-        """Lagrange multipliers, one per constraint."""
+        """Symbols of the Lagrange multipliers λ, one for each constraint equation."""
         names = (f"lambda_{c.name}" for c in self.system.constraints)
         return tuple(self.symbols.get(name, symbol(name)) for name in names)
 
     def substitute(self, values: Mapping[Expr, Expr], form: Callable[[Expr], Expr]) -> Self:
-        """Return the equations with symbols replaced by `values`, and `form` applied to each."""
+        """Return a copy of the equations in which symbols are replaced by `values`.
+
+        `form` is a function from an expression to an expression, such as a simplification, that is
+        applied to each resulting expression.
+        """
 
         def substituted(e: Expr) -> Expr:
             return form(e.xreplace(values))
@@ -70,21 +75,22 @@ class Derived:
 
     @property
     def right(self) -> ImmutableMatrix:
-        """Right-hand sides of the scalar equations: generalized forces plus Aᵀλ."""
+        """Right-hand sides of the scalar equations, (nq, 1): generalized forces plus Aᵀλ."""
         if not self.multipliers:
             return self.forces
         return self.forces + self.A.T * sympy.Matrix(self.multipliers)
 
     @property
     def L(self) -> Expr:
-        """Lagrangian K - P - U; U is the part of the potential linear in the velocities."""
+        """The Lagrangian K - P - U, where U is the part of the potential linear in velocities."""
         return self.kinetic - self.potential - (self.linear_potential or 0)
 
     @cached_property
     def scalar(self) -> tuple[sympy.Eq, ...]:
         """Scalar equations d/dt ∂L/∂q̇ - ∂L/∂q + friction = forces, one per coordinate.
 
-        They are not evaluated. With constraints, the right-hand side also contains Aᵀλ.
+        L is the Lagrangian. SymPy does not simplify the two sides (evaluate=False). In a system
+        with constraints, the right-hand side also contains Aᵀλ.
         """
         sides = zip(self.left, self.right, strict=True)
         return tuple(

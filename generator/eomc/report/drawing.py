@@ -27,18 +27,21 @@ PLANE_TOLERANCE = 1e-9  # relative to the size of the drawing
 
 
 def drawing(system: System, t: Array, q: Array) -> Drawing | None:
-    """Return the drawing of a system at times `t` (n,) in s and positions `q` (n, nq).
+    """Return the drawing of a mechanism at times `t` (n,) in s and coordinates `q` (n, nq).
 
-    Returns None if the scene does not describe the shape of the mechanism.
+    Returns None if `t` is empty or if the scene of the system does not describe the shape of the
+    mechanism.
     """
     result = _draw(system, t, q) if len(t) else None
     return _flatten(result) if result else None
 
 
 def drawings(systems: Sequence[System], t: Array, q: Array, names: Sequence[str]) -> Drawing | None:
-    """Return one drawing of several instances of a scene, drawn over each other.
+    """Return one drawing of several instances of a mechanism, drawn over each other.
 
-    `q` has shape (batch, n, nq); `names` are the names of the instances. None as for `drawing`.
+    systems: one system for each instance, with its parameter values. t: times (n,) in s, common to
+    all. q: coordinates (batch, n, nq). names: the names of the instances. Returns None if `t` is
+    empty or if the scene does not describe the shape of the mechanism.
     """
     if not len(t):
         return None

@@ -72,7 +72,7 @@ class Equations(Derived):
 
     @cached_property
     def set_out(self) -> Equations:
-        """The equations as they are printed: abbreviated if they are long."""
+        """The equations as they are printed: long ones with names for shared subexpressions."""
         if self.named:
             return self
         if self._internal is not None:
@@ -81,7 +81,11 @@ class Equations(Derived):
         return abbreviations.abbreviate(self) if long else self
 
     def with_user_symbols(self) -> Equations:
-        """Return the equations over symbols that the user has, or can create by name."""
+        """Return the equations over the user's symbols instead of the internal ones.
+
+        These are the symbols that were passed to `System.make`; any other name becomes a plain
+        symbol, such as sympy.Symbol("m"), which the user can create.
+        """
         s = self.system
         names = [x.name for x in (*s.q, *s.qd, *s.qdd, *s.u, *(p.symbol for p in s.parameters))]
         names += [*(x.name for x in self.multipliers), *(x.name for x, _ in self.named), "t"]
@@ -93,19 +97,19 @@ class Equations(Derived):
         return replace(changed, symbols=symbols, _internal=self)
 
     def with_values(self, values: Mapping[Any, Any] | None = None, /, **by_name: Any) -> Equations:
-        """Return the equations with numbers in place of parameters.
+        """Return a copy of the equations with numbers in place of some or all parameters.
 
         Parameters
         ----------
         values : mapping, optional
-            From parameters, as names or as the symbols of `symbols`, to numbers.
+            Numbers by parameter. A parameter is given by its name or by its symbol in `symbols`.
         **by_name
-            The same by keyword, ``with_values(m=2)``.
+            Numbers by the names of parameters as keywords, ``with_values(m=2)``.
 
         Returns
         -------
         Equations
-            Decimal numbers are taken as exact fractions, as in a scene.
+            With decimal numbers converted to exact fractions, as in a scene.
 
         Raises
         ------
@@ -140,7 +144,7 @@ class Equations(Derived):
 
 
 def equations(scene: System | ScenePath) -> Equations:
-    """Derive the equations of motion of a scene file or a System, simplified.
+    """Derive and simplify the equations of motion of a scene file or a System.
 
     Parameters
     ----------
@@ -149,8 +153,8 @@ def equations(scene: System | ScenePath) -> Equations:
     Returns
     -------
     Equations
-        SymPy expressions over plain symbols of the scene's names, or over the symbols that
-        `System.make` was given.
+        SymPy expressions. For a scene file, their symbols are plain symbols of the scene's names;
+        for a System, they are the symbols that were passed to `System.make`.
 
     Raises
     ------
@@ -164,9 +168,9 @@ def equations(scene: System | ScenePath) -> Equations:
 
 
 def derive(system: System) -> Equations:
-    """Return the simplified equations of a system, over its own symbols.
+    """Derive and simplify the equations of motion of a system, over its internal symbols.
 
-    Raises EomcError if they would fill many pages.
+    Raises EomcError if the printed equations would fill many pages.
     """
     system = with_constant_parameters(system)
     if not symbolic.is_small(system, MAX_EXPANDED_SIZE):
@@ -219,17 +223,17 @@ def _operations(derived: Equations) -> int:
 
 
 def write_equations(system: System, form: str = "text") -> str:
-    """Return the equations of motion as text.
+    """Derive the equations of motion of a system and return them as text.
 
-    L, the scalar equations, D, C, g and all other parts are simplified and printed as in a
-    textbook. If they would fill many pages, the text states from what they are computed, and at
-    which cost.
+    The Lagrangian L, the scalar equations, D, C, g and all other parts are simplified and printed
+    as in a textbook. If they would fill many pages, the text instead describes how they are
+    computed and how many operations this takes.
 
     Parameters
     ----------
     system : System
     form : {"text", "latex", "python"}
-        "text" is Unicode for a terminal.
+        "text" is Unicode text for a terminal; "python" is source code with SymPy matrices.
 
     Raises
     ------
@@ -249,7 +253,7 @@ def write_equations(system: System, form: str = "text") -> str:
 
 
 def too_long_error(system: System) -> EomcError:
-    """Return the error for equations that would fill many pages."""
+    """Return the exception for a system whose printed equations would fill many pages."""
     return EomcError(
         f"{system.name}: written out, its equations would fill many pages: 'eomc show' without "
         "--python says what they come from and how they are computed"

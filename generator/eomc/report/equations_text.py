@@ -61,7 +61,7 @@ def _values(equations: Derived) -> dict[str, Expr | MatrixBase]:
 
 
 def text(equations: Derived) -> str:
-    """Return the equations for a terminal, at most WIDE columns plus an indent."""
+    """Return the equations as Unicode text for a terminal, in lines of at most WIDE + 4 columns."""
     system, write = equations.system, Typesetter(equations.system)
     values, section_lines = _values(equations), list[str]()
     parts = [wrap(f"{title_line(system)}: {equation_form('tau' in values, system)}")]
@@ -94,27 +94,37 @@ def text(equations: Derived) -> str:
 
 
 def section(head: str, lines: list[str]) -> str:
-    """Return a heading followed by indented lines."""
+    """Return `head` and a colon, followed by `lines` indented by four spaces, as one text."""
     return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
 
 
 def title_line(system: System) -> str:
-    """Return the title of a system on one line."""
+    """Return the title of a system, or its name if it has no title, on one line."""
     return texts.line(system.title or system.name)
 
 
 def equation_form(driven: bool, system: System) -> str:
-    """Return the form of the equations and the order of q, as one line."""
+    """Return the form of the equations and the order of the coordinates q, as one line.
+
+    An example is "D q̈ + C q̇ + g = τ, q = (x, theta)". driven: True if the right-hand side has
+    generalized forces τ.
+    """
     return f"D q̈ + C q̇ + g = {right_hand_side(driven, system)}, q = ({_order(system)})"
 
 
 def right_hand_side(driven: bool, system: System) -> str:
-    """Return the right-hand side of the equations: τ, Aᵀλ, their sum, or 0."""
+    """Return the right-hand side of D q̈ + C q̇ + g as text: "τ", "Aᵀλ", "τ + Aᵀλ" or "0".
+
+    driven: True if there are generalized forces τ. Aᵀλ is present if the system has constraints.
+    """
     return " + ".join([*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]) or "0"
 
 
 def constraint_note(c: Constraint) -> list[str]:
-    """Return a line with the name and kind of a constraint; also whether it is redundant."""
+    """Return a list of one line: the name of a constraint, its kind, and if it is redundant.
+
+    The kind is "positions" for a holonomic constraint, else "rates".
+    """
     parts = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
     parts += ["implied by others, its multiplier 0"] if c.redundant else []
     return [f"    {', '.join(parts)}"]
@@ -125,7 +135,7 @@ def _order(system: System) -> str:
 
 
 def wrap(words: str) -> str:
-    """Wrap text to WIDE columns."""
+    """Return text wrapped to lines of WIDE columns; all lines but the first are indented."""
     return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
 
 
@@ -160,7 +170,7 @@ def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
 
 
 def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
-    """Return the lines of the equation name = e."""
+    """Return the text lines of the equation `name` = `e`."""
     return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
 
 
@@ -184,7 +194,10 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
 
 
 def latex(equations: Derived) -> str:
-    """Return the equations as amsmath environments: the equations of motion, then their parts."""
+    """Return the equations as LaTeX: align* environments of the package amsmath.
+
+    The equations of motion come first, then the energies, matrices and outputs.
+    """
     return "\n".join(
         r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}"
         for body in environment_bodies(equations)
@@ -192,7 +205,10 @@ def latex(equations: Derived) -> str:
 
 
 def environment_bodies(equations: Derived) -> list[str]:
-    """Return the contents of each environment, at most about MAX_ENVIRONMENT_LENGTH long."""
+    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment.
+
+    Each text has about MAX_ENVIRONMENT_LENGTH characters at most.
+    """
     results: list[str] = []
     for lines in latex_lines(equations):
         results.append("")
@@ -204,7 +220,11 @@ def environment_bodies(equations: Derived) -> list[str]:
 
 
 def latex_lines(equations: Derived) -> tuple[list[str], list[str]]:
-    """Return the lines of the equations of motion, and those of energies, matrices and outputs."""
+    """Return LaTeX lines: those of the equations of motion, and those of all other formulas.
+
+    The equations of motion include constraints and abbreviations; the other formulas are energies,
+    matrices and outputs. A line that continues the previous one begins with CONTINUATION.
+    """
     system, write = equations.system, Typesetter(equations.system)
     motion = []
     for left, force in zip(equations.left, equations.right, strict=True):
@@ -233,7 +253,7 @@ def latex_lines(equations: Derived) -> tuple[list[str], list[str]]:
 
 
 def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
-    """Return the lines of the equation symbol = value."""
+    """Return the LaTeX lines of the equation `symbol` = `value`; `symbol` is LaTeX already."""
     first, *more = write.latex_lines(write.terms(value))
     return [f"  {symbol} &= {first}", *(CONTINUATION + line for line in more)]
 
@@ -264,7 +284,10 @@ class _Exact(StrPrinter):  # type: ignore[misc]
 
 
 def python(equations: Derived) -> str:
-    """Return Python source that defines the same SymPy matrices exactly."""
+    """Return Python source code that defines the equations as SymPy matrices and expressions.
+
+    Numbers are written as exact fractions.
+    """
     system = equations.system
     symbols = [
         *system.q,
@@ -311,13 +334,16 @@ def _functions(value: Expr | MatrixBase) -> set[Expr]:
 
 
 def cost(system: System) -> str:
-    """Return the operation counts of each generated function by each of its routes."""
+    """Return a table, as text, of the floating-point operations of each generated function.
+
+    A function that can be computed by several routes (algorithms) has one count for each of them.
+    """
     head = f"{title_line(system)}: operations of one call, those on parameters alone left out"
     return f"{head}\n\n{costs(system)}"
 
 
 def costs(system: System) -> str:
-    """Return the table of `cost` without its heading."""
+    """Return the table of operation counts that `cost` returns, without its heading."""
     lowered = program.build(lagrange.derive(system))
     lines = []
     wide = max(map(len, lowered.functions))

@@ -36,7 +36,11 @@ WHITE_LEVEL = 248  # entries brighter than this become white: Pillow is off by a
 
 
 def write(timelines: Sequence[Timeline], file: Path, title: str | None) -> None:
-    """Write a film of the mechanisms in real time, side by side. Raises EomcError if it can't."""
+    """Write a film (.gif or .mp4) that shows the mechanisms side by side in real time.
+
+    timelines: the runs to show. Raises EomcError if matplotlib or ffmpeg is missing, the film would
+    be too long, a scene does not describe its shape, or the file can't be written.
+    """
     suffix, shown = file.suffix.lower(), texts.line(str(file))
     try:
         import matplotlib
@@ -78,10 +82,12 @@ def write(timelines: Sequence[Timeline], file: Path, title: str | None) -> None:
 
 
 def render(run: Any, t: Any, scene: Source | None) -> Pixels:
-    """Draw the mechanism at the times `t`, in a view with room for the whole motion.
+    """Draw the mechanism of a run at the times `t`, in a view that contains the whole motion.
 
-    Returns pixels (height, width, 3), or (n, height, width, 3) for times (n,). Raises EomcError if
-    the scene has no shape, ImportError without matplotlib.
+    t: a time in s or times (n,); None for the end of the run. scene: needed if the module of the
+    run was not loaded with `eomc.load`. Returns RGB pixels of shape (height, width, 3), or
+    (n, height, width, 3) for times (n,). Raises EomcError if the scene does not describe the shape
+    of the mechanism, and ImportError if matplotlib is not installed.
     """
     imported("matplotlib", "render")
     instants = np.asarray(run.t[-1] if t is None else t, dtype=float)
@@ -140,7 +146,7 @@ def _mp4(pictures: Pictures, file: Path, title: str) -> None:
 
 
 class Pictures:
-    """The pictures of a film: the drawings of all runs, side by side, at the instants `times`.
+    """The pictures of a film: the drawings of all runs, side by side, at `times` (n,) in s.
 
     The static background is drawn once, and the moving marks are drawn over it.
     """
@@ -167,7 +173,7 @@ class Pictures:
         self.standing = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def picture(self, k: int) -> Pixels:
-        """Return the picture at instant k, (height, width, 4)."""
+        """Return the RGBA pixels (height, width, 4) of the picture at `times[k]`."""
         self.canvas.restore_region(self.standing)
         for moving in self.moving:
             moving.draw(k)
@@ -203,7 +209,7 @@ class _Moving:
         return f"{self.words}, t = {self.times[k]:.2f} s"
 
     def draw(self, k: int) -> None:
-        """Draw the artists at instant k over the background."""
+        """Draw the marks, paths and title at `times[k]` over the background of the figure."""
         self.title.set_text(self._title(k))
         for (line,), point in zip(self.paths, self.points, strict=True):
             line.set_data(*self.flat[: k + 1, point].T)
