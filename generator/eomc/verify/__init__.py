@@ -1,1 +1,1 @@
-"""Independent answers, and built modules compared with them; how these are made is unknown here."""
+"""Independent reference values, and the comparison of compiled modules with them (`eomc check`)."""

@@ -38,7 +38,11 @@ MAX_PREDICTION_STEPS = 2000  # steps of the scene's h in which these lie
 
 
 class Advice:
-    """Checks of advised step sizes. `holonomic`: for each constraint, whether it is holonomic."""
+    """Checks of the step sizes h that a compiled module advises, by runs with other step sizes.
+
+    runs: the runs of the module and its scene's data. holonomic: for each constraint equation,
+    whether it is holonomic (one of positions).
+    """
 
     def __init__(self, runs: Convergence, holonomic: Sequence[bool] = ()) -> None:
         self.holonomic = np.array(holonomic, bool)
@@ -46,13 +50,18 @@ class Advice:
         self.duration = runs.duration
 
     def failing_fraction(self, method: str) -> Measurement:
-        """Return the least of PARTS of the advised h with which a run is unstable.
+        """Return the least fraction of the advised h, one of PARTS, with which a run is unstable.
 
-        From where the start of the motion allows the shortest h. Lost: it stops, or a difference
-        grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
-        inf where there is nothing to test, with why. Where runs do not agree with the advice, or
-        it is longer than the motion, but eigenvalues agree, it is right, though the motion does not
-        stay where it holds: how far it is from the eigenvalues' then, times.
+        The run starts at `stiffest_state`. It is unstable if it stops early, if a small difference
+        of the initial state grows UNSTABLE_GROWTH times as much as with fine steps, or if it has
+        steps longer than advised and its final state is wrong by MAX_END_ERROR of the motion. The
+        value is nan if no fraction is unstable, and inf, with a reason, if there is nothing to
+        test.
+
+        If the runs contradict the advice, or the advised h is longer than the motion, but the
+        advice agrees with the eigenvalues of the linearised motion, the motion leaves the region
+        where the advice holds. The result is then the ratio of the two step sizes, with its own
+        limit.
         """
         if method == "euler" and self._velocities_matter():
             return Measurement(math.inf, "for forces of positions alone")
@@ -83,10 +92,10 @@ class Advice:
 
     @cached_property
     def stiffest_state(self) -> State:
-        """Return the state near the start of the motion for which the shortest h is advised.
+        """State near the start of the motion for which the module advises the shortest h.
 
-        As far as that stays near: steps that are too long for it end at 1e40, where no difference
-        has a digit.
+        Only states within MAX_DISTANCE times the scale of the initial state count: if steps are too
+        long for the motion, later states are as large as 1e40 and differences have no digits left.
         """
         start = self.start
         method = next(m for m in self.runs.methods if math.isfinite(min(METHODS[m].limits)))

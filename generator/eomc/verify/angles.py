@@ -16,10 +16,11 @@ PERIODIC = (sympy.sin, sympy.cos, sympy.tan)
 
 
 def largest_angle(system: System) -> Callable[[State], float]:
-    """Return a function of a state: the largest angle in the formulas there, in radians.
+    """Return a function of a state: the largest angle in the system's formulas there, in rad.
 
-    An angle is as exact as its last digit, and so is all that depends on it. Angles that contain
-    dot(...) are left out.
+    An angle is an argument of a sine, cosine or tangent; its rounding error, relative to its size,
+    limits the precision of all results. Angles that contain dot(...) are ignored; the result is 0
+    if there are none.
     """
     formulas = [
         system.kinetic, system.potential, system.linear_potential, system.dissipation,

@@ -1,8 +1,9 @@
 """Comparison of a compiled module with the reference and with general laws of mechanics.
 
-Two kinds of row. A value of the module is compared with the independent `reference`, in units of
-rounding (see `sampling`). A property (symmetry, order of convergence, power balance) is tested on
-the module alone, whatever the reference says.
+The report of `eomc check` has one line, called a row, for each check. There are two kinds. A value
+of the module is compared with the independent `reference`, in units of rounding (see `sampling`). A
+property (symmetry, order of convergence, power balance) is tested on the module alone, whatever
+the reference returns.
 """
 
 from __future__ import annotations
@@ -45,12 +46,26 @@ SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wron
 def check(
     system: System, module: Any, *, plain: Any = None, seed: int = 0, states: int | None = None
 ) -> Report:
-    """Test the compiled `module` of `system` at random states and parameters.
+    """Compare the compiled `module` of `system` with the reference, and return the report.
 
-    plain: the same compiled from plain C, which is compared with the reference and with `module`.
-    states: how many, by default as many as take seconds. Always the same states for the same
-    seed. A module that raises fails the row, which shows its words. Raises EomcError where
-    `symbolic.reference_for` does.
+    Parameters
+    ----------
+    plain : module, optional
+        The module of the portable form of the C code, compared with the reference and `module`.
+    seed : int
+        Seed of the random states and parameters; the same seed gives the same states.
+    states : int, optional
+        Number of states; by default as many as take seconds.
+
+    Returns
+    -------
+    Report
+        One row for each check. If the module raises an exception, the row fails and shows it.
+
+    Raises
+    ------
+    EomcError
+        If `symbolic.reference_for` raises it: there is no reference for the system.
     """
     comparison = Comparison(system, module, np.random.default_rng(seed), states, plain)
     models = [form._model for form, _ in comparison.forms if hasattr(form, "_model")]
@@ -101,7 +116,7 @@ def _report(comparison: Comparison, module: Any) -> Report:
 
 
 def value_rows(comparison: Comparison) -> None:
-    """Add the rows against the reference: values, one step, runs."""
+    """Append the rows that compare values, single steps and short runs with the reference."""
     row, rounding = comparison.row, "units of rounding"
     for name in (*VALUES, "acceleration"):
         row(name, LIMIT, rounding, partial(comparison.value, name))
@@ -114,7 +129,7 @@ def value_rows(comparison: Comparison) -> None:
 
 
 def property_rows(comparison: Comparison) -> None:
-    """Add the rows about the module alone, and those by differences."""
+    """Append the rows on derivatives and on laws for the module's values, such as D = Dᵀ."""
     row, rounding = comparison.row, "units of rounding"
     row("D = D^T", LIMIT, rounding, comparison.symmetry)
     if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
@@ -129,7 +144,7 @@ def property_rows(comparison: Comparison) -> None:
 
 
 def compiled_rows(comparison: Comparison) -> None:
-    """Add the rows about runs, refusals and, where the module has them, batches."""
+    """Append the rows on runs, refusals and, if the module has them, batches of compiled C."""
     runs, refusals = Runs(comparison), Refusals(comparison)
     runs.report()
     rows_sines.report(comparison)

@@ -47,7 +47,21 @@ def _corrected(e: Expected) -> Vector | float:
 
 
 class Comparison:
-    """The checks of one report. plain: the module of the plain form of C, or None."""
+    """The checks of one module: its states, the reference's values at them, and the report's rows.
+
+    Parameters
+    ----------
+    system : System
+        The system of which `module` is the compiled form.
+    module : module
+        The compiled module; an object with the same functions will do.
+    random : Generator
+        Source of the random states.
+    states : int or None
+        Number of states; None for the default, which depends on the cost of the reference.
+    plain : module, optional
+        The module of the portable form of the C code.
+    """
 
     def __init__(
         self, system: System, module: Any, random: np.random.Generator, states: int | None,
@@ -66,7 +80,7 @@ class Comparison:
         self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
-        """Append checks of orders, advised steps and the balance of power; see `convergence`."""
+        """Append the rows on orders of convergence, advised step sizes and the balance of power."""
         runs, methods = self.convergence, self.methods
         for method in methods:
             least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
@@ -87,7 +101,12 @@ class Comparison:
         self, name: str, limit: float, unit: str, measure: Callable[[], float | Measurement],
         minimum: bool = False,
     ) -> None:  # fmt: skip
-        """Add what `measure` finds: at most the limit, or more than it where it is the least."""
+        """Append the row `name` with the number that `measure` returns.
+
+        It passes if the number is at most `limit` or, with `minimum`, greater than `limit`. It
+        fails if `measure` raises an exception. `unit` describes the number. A Measurement may
+        replace unit and limit, or give a reason why nothing is judged: the row then passes.
+        """
         try:
             result = measure()
         except Exception as fault:  # whatever the module raises is an outcome of the check
@@ -110,7 +129,10 @@ class Comparison:
     def smooth_row(
         self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
-        """Append a check of orders; it is not judged if the scene has discontinuities or kinks."""
+        """Append a row on an order of convergence, which must exceed `limit`.
+
+        If it does not pass and the scene has discontinuities or kinks, it is not judged.
+        """
         self.row(name, limit, unit, measure, minimum=True)
         row = self.rows[-1]
         if math.isinf(row.error):
@@ -120,7 +142,11 @@ class Comparison:
             self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
 
     def advice_row(self, method: str) -> None:
-        """Append a check of the advised h: an eighth of it is stable, twice it is not."""
+        """Append the row on the step size h that the module advises for `method`.
+
+        It passes if runs with an eighth of the advised h are stable and runs with twice that h are
+        not.
+        """
         unit = "of the advised h, where runs are lost"
         find = partial(self.advice.failing_fraction, method)
         self.row(f"h of {method}", PARTS[0], unit, find, minimum=True)
@@ -154,22 +180,25 @@ class Comparison:
 
     @cached_property
     def unusual_states(self) -> list[Expected]:
-        """States that runs hardly reach, at which values must be correct as well."""
+        """Reference values at states that runs hardly reach; values must be correct there, too."""
         return self.sampler.unusual_states(1 if self.large else 2)
 
     @cached_property
     def corners(self) -> str:
-        """Functions in the scene that have discontinuities or kinks."""
+        """Text naming the scene's functions with discontinuities or kinks; "" without any."""
         return nonsmooth_functions(self.system)
 
     @property
     def forms(self) -> list[tuple[Any, str]]:
-        """Modules of both forms of C, if present, with the prefix of their checks."""
+        """Modules with the prefix of their rows: "" for optimised C, "plain C: " for portable C."""
         plain = [] if self.plain is None else [(self.plain, "plain C: ")]
         return [(self.module, ""), *plain]
 
     def largest(self, error: Callable[[Expected], float], few: int | None = None) -> float:
-        """Return the largest error over all states, or a few; nan if any is nan."""
+        """Return the largest value of the function `error` over all states; nan if one is nan.
+
+        few: the number of states to use, the first and the last ones; all by default.
+        """
         return float(np.max([error(e) for e in (self.few(few) if few else self.expected)]))
 
     # against the reference
@@ -190,7 +219,10 @@ class Comparison:
         return float(sum(theirs != ours for theirs, ours in pairs))
 
     def value(self, name: str) -> float:
-        """Return the largest error of one of VALUES or of the acceleration."""
+        """Return the largest error of the value `name` over all states, in units of rounding.
+
+        name: "acceleration" or a key of VALUES, such as "D" or "energy".
+        """
         # energies in units of what they usually are: k - k cos(q) may be 0 at a state
         typical = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
 
@@ -201,7 +233,10 @@ class Comparison:
         return float(np.max([error(e) for e in (*self.expected, *self.unusual_states)]))
 
     def steps(self) -> float | Measurement:
-        """Return the error of one step of the scene's h from a few states."""
+        """Return the largest error of one RK4 step with the scene's h, in units of rounding.
+
+        The step starts at a few of the states and is compared with the reference's step.
+        """
         h, far = self.system.run.h, MAX_DISTANCE * self.sampler.scale
 
         def reference(**rows: Any) -> Vector:
@@ -221,10 +256,11 @@ class Comparison:
         return largest(map(error, self.few(self.effort.few)), "all steps are thrown far")
 
     def step_by(self, method: str) -> float | Measurement:
-        """One step of a method from a few states, by its tableau on the reference's accelerations.
+        """Return the largest error of one step of `method` over a few states, in units of rounding.
 
-        Of the scene's h, and of LONGER, where what is of high order in h is more than rounding.
-        Shorter where the stages of an implicit one are else not found.
+        It is compared with a step by the method's tableau on the reference's accelerations, for the
+        scene's h and for LONG_STEP times that h, at which terms of high order in h exceed rounding.
+        Both are shortened if the iteration for the stages of an implicit method does not converge.
         """
         errors = (
             self.one_step_error(method, e, h)
@@ -234,7 +270,10 @@ class Comparison:
         return largest(errors, "no step from any state is finite")
 
     def accelerations(self, s: State) -> one_step.Acceleration:
-        """Return the reference's accelerations at one or many states, with one state's inputs."""
+        """Return the reference's accelerations as a function of q, qd and t, for the inputs of `s`.
+
+        q, qd and the result have the shape (nq,) or (n, nq). The parameters are those of `s`, too.
+        """
 
         def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
             inputs = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
@@ -243,9 +282,12 @@ class Comparison:
         return acceleration
 
     def one_step_error(self, method: str, e: Expected, longest: float) -> float | None:
-        """Return the error of a step; None without a reference step, inf if the module refuses it.
+        """Return the error of one step of at most `longest` seconds, in units of rounding.
 
-        That is, its shortest; or two in a row whose stages the module does not find.
+        STEP_FRACTIONS of `longest` are tried in turn until the reference finds a step that stays
+        near the state and the module makes it, too. The result is None if there is none. It is inf
+        if the stages of the module's steps do not converge for two of them, or if it refuses the
+        shortest.
         """
         s, gain, failures, refused = e.state, e.size["acceleration"], 0, False
         for h in (part * longest for part in STEP_FRACTIONS):
@@ -281,12 +323,21 @@ class Comparison:
         return math.inf if failures == 2 or refused else None
 
     def runs(self) -> float | Measurement:
-        """Return the error of a short run from the start, and of one from a random state."""
+        """Return the largest error of two short runs, in units of rounding.
+
+        One run starts at the initial state of the scene, the other at a random state.
+        """
         errors = map(self.run, self.few(2))
         return largest(errors, "a difference grows too much in one step")
 
     def run(self, e: Expected, h: float = 0.0, steps: int = 0) -> float | None:
-        """Return the error of a run, while a perturbation grows by less than GROWTH_LIMIT."""
+        """Return the error of a run from the state of `e`, in units of rounding.
+
+        The run has `steps` steps of `h` seconds; 0 stands for the scene's h and a default number.
+        It is compared with the reference's run as long as a small difference of the initial state
+        grows by less than GROWTH_LIMIT; None if that is less than one step. Units take that growth
+        and the number of steps into account.
+        """
         s, h = e.state, h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         key = id(s), h, steps  # the states live as long
@@ -337,13 +388,19 @@ class Comparison:
         return s.t if self.system.constraints else 0.0
 
     def simulate(self, s: State, **how: Any) -> Any:
-        """Return the module's run from a state."""
+        """Return the module's run from the state `s`.
+
+        how: further arguments of the module's `simulate`, such as h and steps.
+        """
         if begin := self.start_time(s):
             how.setdefault("t0", begin)
         return simulate(self.module, projected_start(self.module, s), **how)
 
     def run_energy(self) -> float:
-        """Return the error of the energy of a run, at the states of the run."""
+        """Return the largest error of the energies that a run stores, in units of rounding.
+
+        They are compared with the reference's energy at the states that the run stores.
+        """
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
         far = MAX_DISTANCE * self.sampler.scale
@@ -355,7 +412,7 @@ class Comparison:
         return float(np.max(errors, initial=0))
 
     def ask(self, name: str, s: State) -> Vector:
-        """Return the module's value of this name."""
+        """Return the module's value `name`, such as "D" or "energy", at the state `s`."""
         return evaluate_module(self.module, name, s)
 
     def has_finite_accelerations(self, s: State) -> bool:
@@ -369,18 +426,21 @@ class Comparison:
         return True
 
     def few(self, count: int) -> list[Expected]:
-        """Return the first and last states, `count` in all."""
+        """Return the first and last states with their reference values, `count` in all."""
         half = count // 2
         return self.expected[:half] + self.expected[half:][-half:]
 
     def units(self, values: Any, expected: Any, size: Any) -> float:
-        """Return the largest difference in units of the module's rounding."""
+        """Return the largest error in units of rounding, |values - expected| / (eps size).
+
+        eps is the relative rounding error of the module's numbers.
+        """
         return units(values, expected, size, self.eps)
 
     # properties of the module alone
 
     def symmetry(self) -> float:
-        """Return the error of D = D^T."""
+        """Return the largest difference of D and Dᵀ over all states, in units of rounding."""
 
         def error(e: Expected) -> float:
             D = evaluate_module(self.module, "D", e.state)
@@ -401,10 +461,10 @@ class Comparison:
         return -self.largest(lambda e: -least_eigenvalue(e))
 
     def skewness(self) -> float:
-        """(Ddot - 2C + dD/dt) + its transpose, Ddot and dD/dt by differences of order 8.
+        """Return the largest entry of N + Nᵀ over all states, N = Ḋ - 2C + ∂D/∂t, relative to Ḋ.
 
-        The best of some widths counts: too wide is inexact, too narrow rounds, but no width
-        makes a wrong C right.
+        Ḋ and ∂D/∂t are differences of order 8 of the module's D, with steps of several widths. The
+        width with the smallest result counts: if C is wrong, no width makes N + Nᵀ vanish.
         """
         stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 
@@ -431,7 +491,7 @@ class Comparison:
         return self.largest(error)
 
     def bias(self) -> float:
-        """Return the error of bias = C qd + g."""
+        """Return the largest error of bias = C q̇ + g over all states, in units of rounding."""
 
         def error(e: Expected) -> float:
             bias, C, g = (
@@ -442,7 +502,10 @@ class Comparison:
         return self.largest(error)
 
     def motion(self) -> float:
-        """Return the error of D qdd + bias = tau, or tau + A^T lambda with constraints."""
+        """Return the largest residual of D q̈ + bias = τ over all states, in units of rounding.
+
+        With constraints the right-hand side is τ + Aᵀλ.
+        """
 
         def error(e: Expected) -> float:
             names = ("D", "acceleration", "bias", "tau")

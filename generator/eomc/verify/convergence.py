@@ -58,7 +58,7 @@ class _End(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """A state from which to run, and the scale of its energy."""
+    """An initial state for runs, and the scale of its energy (J) for rounding errors."""
 
     state: State
     energy: float
@@ -105,10 +105,22 @@ class _Ladder:
 
 
 class Convergence:
-    """Checks of one module that use runs with several step sizes.
+    """Checks of one module by runs with several step sizes: orders of convergence, power balance.
 
-    places: where to run from, with the scene's own parameters; start: where its motion starts.
-    scale: (2, nq), of q and qd. h, duration: the scene's, s.
+    Parameters
+    ----------
+    module : module
+        The compiled module.
+    methods : sequence of str
+        Its integration methods.
+    places : sequence of Place
+        Initial states of the runs, with the scene's own parameters.
+    start : State
+        The initial state of the scene.
+    scale : (2, nq) array
+        Typical sizes of q and of q̇.
+    h, duration : float
+        Step size and duration of the scene's run, s.
     """
 
     def __init__(
@@ -119,7 +131,10 @@ class Convergence:
         self.scale, self.h, self.duration = scale, h, duration
 
     def run(self, s: State, method: str, **how: Any) -> Any:
-        """Return a run from a state, whatever its status."""
+        """Return the module's run by `method` from the state `s`, even if the run stops early.
+
+        `how` are further arguments of the module's `simulate`.
+        """
         if method != self.methods[0]:
             how["method"] = method
         if getattr(self.module, "constraint_names", ()):  # rows may stand in time
@@ -128,14 +143,22 @@ class Convergence:
         return simulate(self.module, s, **how)
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
-        """Return the scaled final state of a run, (2, nq); None if it stops early."""
+        """Return the scaled final state of a run of `steps` steps over `span` seconds.
+
+        The shape is (2, nq), in units of the scale; None if the run stops early.
+        """
         run = self.run(s, method, h=span / steps, steps=steps, every=steps)
         if str(run.status) != "ok":
             return None
         return np.array([run.q[-1], run.qd[-1]]) / self.scale
 
     def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
-        """Return the effect of rounding on the end of a run: in its sums and in its start."""
+        """Return how far rounding moves the final state of a run, in units of the scale.
+
+        It is estimated from runs whose initial states differ by a rounding, and is at least one
+        rounding of the state. `end` computes the scaled final state of a run from a state, over
+        `span` seconds in `steps` steps; `there` is that of the run from `at`.
+        """
         s = at.state
         size = np.abs(np.array([s.q, s.qd])) + np.abs(there) * self.scale
         least = EPS * float(np.max(size / self.scale))
@@ -150,9 +173,10 @@ class Convergence:
     # --- orders -----------------------------------------------------------------------------------
 
     def order(self, method: str) -> Measurement:
-        """Return the best order of convergence from any place; inf if runs are exact.
+        """Return the order of convergence of `method`: the best over the initial states.
 
-        Raises RuntimeError if no run from any place reaches its end.
+        It is inf if all differences are rounding errors, and nan, with a reason, if it can't be
+        judged. Raises RuntimeError if no run from one of the initial states reaches its end.
         """
         least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
         orders = []
@@ -235,10 +259,11 @@ class Convergence:
     # --- two methods ------------------------------------------------------------------------------
 
     def compare_methods(self, method: str) -> Measurement:
-        """Return the distance of two methods' final states, relative to the changes by halving h.
+        """Return how far `method` and the module's first method differ at the ends of runs.
 
-        From each place the lesser of two spans: errors may meet by chance at one. The median of
-        the places.
+        The unit is the sum of the changes of both final states as h is halved. For each initial
+        state the smaller result of two spans counts, since at one of them these changes may vanish
+        by chance; the result is the median over the initial states.
         """
         ratios = [self._method_difference(at, method) for at in self.places]
         known = [x for x in ratios if not math.isnan(x)]
@@ -279,11 +304,14 @@ class Convergence:
 
     @property
     def closing_limit(self) -> float:
-        """Return the least accepted order: half of that of the method and Simpson's rule."""
+        """Least accepted order of the power balance: half that of its method, at most 2."""
         return min(METHODS[self._best_method].order, 4) / 2
 
     def closing(self) -> Measurement:
-        """Return the order of jacobi(T) - jacobi(0) - integral of power; inf if that is 0."""
+        """Return the order in h at which jacobi(T) - jacobi(0) - ∫ power dt vanishes.
+
+        The smallest order over the initial states counts; inf if the balance is closed to rounding.
+        """
         orders = [self._closing(at) for at in self.places]
         return _pick_order(orders, min, "the balance is neither closed nor left open")
 
@@ -340,7 +368,7 @@ class Convergence:
         return (gaps if np.all(np.isfinite(gaps)) else []), False
 
     def ask(self, name: str, s: State) -> Vector:
-        """Return the module's value of this name."""
+        """Return the module's value `name`, such as "power" or "jacobi", at the state `s`."""
         return evaluate_module(self.module, name, s)
 
 

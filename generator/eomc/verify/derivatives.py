@@ -20,11 +20,22 @@ def differentiate(
     reference: Reference, s: State, scale: Vector, defaults: Mapping[str, float],
     name: str = "acceleration",
 ) -> Iterator[tuple[Vector, Vector]]:  # fmt: skip
-    """Yield the derivatives of the reference's accelerations, for each of WIDTHS.
+    """Yield difference quotients of the reference's accelerations, one pair for each of WIDTHS.
 
-    Yields dqdd/d[q, qd, u, p] (nq, 2 nq + nu + np) and the scales of these variables. `scale` (2,
-    nq) is the scale of q and qd. Inputs are held constant, at the signals if the state has none.
-    `name` selects another function of the reference, with values (m,), in place of `acceleration`.
+    Each pair is (J, scales). J (nq, 2 nq + nu + np) are the derivatives with respect to q, q̇, the
+    inputs u and the parameters p; scales are typical sizes of these variables. WIDTHS are the steps
+    of the quotients relative to `scales`.
+
+    Parameters
+    ----------
+    scale : (2, nq) array
+        Typical sizes of q and q̇.
+    defaults : mapping
+        Parameter values, used if the state has none.
+    name : str
+        Method of the reference to be differentiated in place of `acceleration`.
+
+    Inputs are held constant: at those of the state or, if it has none, at the scene's signals.
     """
     n, params = len(s.q), dict(s.params or defaults)
     u = np.zeros(0)
@@ -51,10 +62,12 @@ def differentiate(
 
 
 def relative_differences(values: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
-    """The differences of two (nq, k), relative to each row's largest in those scales.
+    """Return |values - exact|, (nq, k), relative to the largest scaled entry in the matrix row.
 
-    size: (nq,), of the sums that the accelerations are: differences lose 1e-10 of it.
-    nan where `exact` is not finite, inf where `values` alone is not.
+    Column j of both matrices is multiplied by scales[j]. `size` (nq,) is the size of the terms
+    summed up in each acceleration: 1e-4 of it is added to the divisor, since difference quotients
+    lose digits of it. An entry is nan if `exact` is not finite there, and inf if only `values` is
+    not.
     """
     largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
     with np.errstate(all="ignore"):

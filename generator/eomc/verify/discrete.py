@@ -19,7 +19,11 @@ KINETIC = ("kinetic", "energy", "jacobi")
 
 
 class DiscreteReference(Reference):
-    """Reference of `system`, given one in which discrete variables are parameters."""
+    """Reference of a system in which jumps set some parameters, called discrete variables.
+
+    system: the system with the discrete variables as additional coordinates. core: the reference of
+    the same system in which they are parameters.
+    """
 
     def __init__(self, system: System, core: Reference) -> None:
         self.system, self.core = system, core
@@ -28,7 +32,7 @@ class DiscreteReference(Reference):
         self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the sizes of terms, as `Reference.terms`."""
+        """Return the sum of the sizes of all terms of "energy" or "power", as `Reference.terms`."""
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
         values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
         params = {**(s.get("params") or {}), **values}

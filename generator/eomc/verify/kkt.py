@@ -29,10 +29,10 @@ CONVERGENCE_TOLERANCE = (
 
 
 def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
-    """x and lambda with D x - A^T lambda = force and A x = level.
+    """Return x and λ with D x - Aᵀλ = force and A x = level, at one or many states.
 
-    D: (..., n, n); A: (..., m, n); force: (..., n); level: (..., m). nan where something is not
-    finite.
+    Shapes: D (..., n, n), A (..., m, n), force (..., n), level (..., m), x (..., n), λ (..., m).
+    The results are nan for a state with an argument that is not finite.
     """
     n, m = D.shape[-1], A.shape[-2]
     shape = np.broadcast_shapes(D.shape[:-2], A.shape[:-2], force.shape[:-1], level.shape[:-1])
@@ -68,7 +68,7 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
 
 
 def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Return D and A for which the coordinates `fixed` do not change."""
+    """Return copies of D and A with which the coordinates of indices `fixed` do not change."""
     D, A = D.copy(), A.copy()
     for i in fixed:
         D[i] = D[:, i] = A[:, i] = 0
@@ -77,9 +77,10 @@ def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tupl
 
 
 def absolute_inverse(D: Vector, A: Vector) -> Vector:
-    """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded.
+    """Return the absolute values of the inverse of the KKT matrix of D and A, (n + m, n + m).
 
-    A row of zeros has the multiplier 0.
+    They bound how rounding errors of the right-hand side spread. For a zero row of A the equation
+    of the multiplier is λ = 0.
     """
     scale, none = scales(D, A), np.diag((~A.any(axis=1)).astype(float))
     matrix = _scaled(D, A, none, scale)
@@ -87,9 +88,10 @@ def absolute_inverse(D: Vector, A: Vector) -> Vector:
 
 
 def is_regular(D: Vector, A: Vector, least: float) -> bool:
-    """Return whether all singular values of the scaled matrix exceed `least`.
+    """Return whether the scaled KKT matrix of D and A is regular.
 
-    Those of rows are squares of A's.
+    Its least singular value must exceed `least` times the largest one. Singular values that belong
+    to A grow with the square of those of A.
     """
     matrix = _scaled(D, A, np.zeros((len(A), len(A))), scales(D, A))
     if not np.all(np.isfinite(matrix)):
@@ -103,9 +105,10 @@ def _scaled(D: Vector, A: Vector, corner: Vector, scale: Vector) -> Vector:
 
 
 def scales(D: Vector, A: Vector) -> Vector:
-    """(n + m,): of the rows and columns of the matrix, so that coordinates and rows alike are 1.
+    """Return factors for rows and columns of the KKT matrix of D and A, (n + m,).
 
-    A coordinate without inertia has that of the rows that it is in.
+    They scale the diagonal of D and the norms of the rows of A to 1. For a coordinate without
+    inertia, an inertia is estimated from its entries in A.
     """
     inertia = np.abs(np.diag(D))
     known = inertia > 0
@@ -119,9 +122,9 @@ def scales(D: Vector, A: Vector) -> Vector:
 
 
 def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
-    """The least eigenvalue of D, (n, n), along what rows A, (m, n), make zero, scaled to 1.
+    """Return the least eigenvalue of D (n, n), scaled to a unit diagonal, on the null space of A.
 
-    nan: not to be judged, as where rows depend on one another.
+    nan if it can't be judged: a value is not finite, or rows of A are zero or linearly dependent.
     """
     size = np.sqrt(np.abs(np.diag(D)))
     size = np.where(size > 0, size, 1.0)
@@ -143,12 +146,11 @@ def is_nonnegative(D: Vector, A: Vector) -> bool:
 def project_to_nearest(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
-    """The x nearest to q on the rows, in the metric of D, and its last correction, in its sizes.
+    """Return the x nearest to q, in the metric of D, on the constraints, and its last correction.
 
-    rows: D, A and what is to be zero, at x. There D (x - q) is a sum of rows of A: after Newton's
-    method x becomes q plus the least change with A (x - q) = A (x_k - q) - off, again and again, by
-    part where that does not converge. The last correction is more than rounding where none is
-    found.
+    rows: a function of x that returns D, A and the residual of the constraint equations. The second
+    result is the size of the last correction, relative to x. It is rounding if the iteration has
+    converged, and inf otherwise.
     """
     x, last = project(q, rows)
     part, before = 1.0, np.inf
@@ -172,10 +174,12 @@ def project_to_nearest(
 def project(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
-    """A q by Newton's method in the metric of D, and its last correction, in sizes of q.
+    """Return an x near q that satisfies the constraints, and the size of the last correction.
 
-    Long corrections are halved until what is to be zero gets less. The last correction is inf where
-    the last q is not on the rows.
+    Newton's method starts at q and each correction is minimal in the metric of D; a long one is
+    halved until it reduces the residual. rows: a function of x that returns D, A and the residual
+    of the constraint equations. The size is relative to x: rounding if the iteration has converged,
+    inf if x does not satisfy the constraints.
     """
     D, A, residual = rows(q)
     last = np.inf

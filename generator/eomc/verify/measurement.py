@@ -12,9 +12,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Measurement:
-    """A measured value; inf if there is nothing to measure, with the reason in `why`.
+    """A measured value, or the reason `why` it proves nothing: the row of the report then passes.
 
-    unit, limit: replace those of the row, if another quantity was measured.
+    With a reason, inf means that there is nothing to test; any other value is not judged. unit,
+    limit: replace those of the row if another quantity was measured.
     """
 
     value: float
@@ -24,13 +25,19 @@ class Measurement:
 
 
 def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
-    """Return the largest known error, nan if any is; not judged, with `why`, if none is known."""
+    """Return the largest of the errors that are not None; nan if one of them is nan.
+
+    If all are None, return a Measurement with the reason `why`, which is not judged.
+    """
     known = [x for x in errors if x is not None]
     return float(np.max(known)) if known else Measurement(math.nan, why)
 
 
 def units(values: Any, expected: Any, size: Any, eps: float) -> float:
-    """Return the largest difference in units of rounding; nan if a value is not a number."""
+    """Return the largest of |values - expected| / (eps size), the error in units of rounding.
+
+    0 if there are no values; nan if one is nan. Raises ValueError if the shapes differ.
+    """
     difference = np.abs(np.asarray(values, float) - expected)
     if difference.shape != np.shape(expected):
         raise ValueError(f"shape {np.shape(values)} where {np.shape(expected)} is meant")

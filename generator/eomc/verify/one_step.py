@@ -23,10 +23,12 @@ Acceleration = Callable[[Vector, Vector, Any], Vector]
 
 
 def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h: float) -> Vector:
-    """(2, ..., nq): q and qd at t + h; q, qd (..., nq), t a number or (...,).
+    """Return q and q̇ at t + h by one step of the Runge-Kutta method `m`, (2, ..., nq).
 
-    acceleration: a(q, qd, t), of that shape; of one state also (stages, nq), each with its t. nan
-    where the stages of an implicit method are not found by plain sweeps: h is too long for them.
+    q and qd are (..., nq), t is a number or (...,). acceleration: a function of q, q̇ and t that
+    returns q̈ of the same shape; for a single state and an implicit method it is also called with
+    all stages at once, (stages, nq) and t (stages,). The result is nan if the fixed-point iteration
+    for the stages does not converge because h is too long.
     """
     q, qd = np.asarray(q, float), np.asarray(qd, float)
     A, AA = (_square(rows, m.stages) for rows in (m.a, m.a_squared))
@@ -62,7 +64,10 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
 
 
 def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> Vector:
-    """(nq, 2 nq): da/dq and da/dqd at one state, by differences of WIDTH of scale (2, nq)."""
+    """Return the derivatives of the acceleration function `a` with respect to q and q̇, (nq, 2 nq).
+
+    They are central differences at one state, with steps of WIDTH times the scale (2, nq).
+    """
     n = len(q)
     by = np.diag(WIDTH * np.ravel(scale))
     moved = np.concatenate([by, -by]) + np.concatenate([q, qd])
@@ -73,7 +78,7 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
 def contraction_factor(m: Method, slopes: Vector, h: float) -> float:
     """Return the contraction factor of fixed-point iteration for the stages of an implicit method.
 
-    slopes: (nq, 2 nq), da/dq and da/dqd.
+    slopes: the derivatives of the accelerations with respect to q and q̇, (nq, 2 nq). h in s.
     """
     return float(np.max(np.abs(np.linalg.eigvals(_sweep(m, slopes, h)))))
 
@@ -88,10 +93,11 @@ def _sweep(m: Method, slopes: Vector, h: float) -> Vector:
 def step_by_newton(
     m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: float, h: float
 ) -> tuple[Vector, int]:
-    """(2, nq): q and qd (nq,) at t + h by an implicit method, and how many sweeps it took.
+    """Return q and q̇ at t + h by one implicit step, (2, nq), and the number of Newton iterations.
 
-    By Newton's method with the derivatives at the start, from the acceleration there. nan where
-    corrections do not get small, which is after SWEEPS.
+    The stages are found by Newton's method with the derivatives at the start of the step; the first
+    guess is the acceleration there. The state is nan if that has not converged in MAX_SWEEPS
+    iterations.
     """
     n, S = len(q), m.stages
     A, AA = (_square(rows, S) for rows in (m.a, m.a_squared))

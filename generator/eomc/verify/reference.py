@@ -37,10 +37,11 @@ SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", 
 
 
 class Reference(ABC):
-    """D q̈ + bias = τ of a system and related quantities, at given states.
+    """Equations of motion D q̈ + bias = τ of a system and related quantities, evaluated at states.
 
-    If q is (b, nq), there are b states: qd is (b, nq) and u (b, nu), t and every value in params
-    one number or (b,), and each result has a leading dimension b.
+    All methods take one state or b states at once. For one state, q and qd are (nq,) and u is
+    (nu,). For b states, q and qd are (b, nq), u is (b, nu), t and each value in params are one
+    number or (b,), and each result has a leading dimension b.
     """
 
     system: System
@@ -48,7 +49,8 @@ class Reference(ABC):
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
         """Return the sum of the sizes of all terms of "energy" or "power", multiplied out.
 
-        0 if the expressions are not written out.
+        s: the arguments of `evaluate` by name. The result is 0 if the expressions are not written
+        out.
         """
         return 0.0
 
@@ -67,14 +69,25 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Any:
-        """The value of `name`: a float, an (nq,) or (nu,) vector or an (nq, nq) matrix.
+        """Return the value of `name` at a state: a float, a vector or a matrix.
 
-        name: D, C, g, bias, tau, kinetic, potential, energy, jacobi, power or signals, as in
-        `symbolic.derive`, or of the m constraints constraints (m,), constraint_jacobian (m, nq),
-        constraint_rates (m,) or gamma (m,). q, qd: (nq,), m or rad per coordinate and their rates,
-        qd None at rest; u: (nu,), None for the scene's signals; params: values in place of
-        defaults. nan where a formula has no real value. Raises EomcError where params names no
-        parameter.
+        Parameters
+        ----------
+        name : str
+            D or C (nq, nq); g, bias or tau (nq,); kinetic, potential, energy, jacobi or power; or
+            signals (nu,), as in `symbolic.derive`. For the m constraint equations: constraints,
+            constraint_rates or gamma (m,), or constraint_jacobian (m, nq).
+        q, qd : (nq,) array
+            Coordinates, m or rad each, and their velocities; zero velocities if qd is None.
+        t : float
+            Time, s.
+        u : (nu,) array, optional
+            Inputs; by default the scene's signals.
+        params : mapping, optional
+            Parameter values in place of their defaults.
+
+        The result is nan if a formula has no real value. Raises EomcError if params contains a name
+        that is not a parameter.
         """
         q = np.asarray(q, float)
         qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
@@ -88,9 +101,9 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Vector:
-        """Solve D qdd = tau - bias, under constraints D qdd = tau - bias + A^T lambda: (nq,).
+        """Return q̈ (nq,) from D q̈ = τ - bias or, under constraints, D q̈ = τ - bias + Aᵀλ.
 
-        nan where D is singular.
+        Arguments are as in `evaluate`. The result is nan if D is singular.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         return self._acceleration(q, qd, t, u, self._values(params))
@@ -103,7 +116,10 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Vector:
-        """Return the Lagrange multipliers of the m constraints, (m,); 0 for redundant ones."""
+        """Return the Lagrange multipliers of the m constraint equations, (m,).
+
+        Those of redundant equations are 0. Arguments are as in `evaluate`.
+        """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         _, solved = self._constrained(q, qd, t, u, self._values(params))
         return np.asarray(solved @ self.solved)
@@ -117,10 +133,11 @@ class Reference(ABC):
         fixed: tuple[int, ...] = (),
         nearest: bool = True,
     ) -> tuple[Vector, Vector]:
-        """Project q and qd onto the constraints, by Newton's method in the metric of D.
+        """Return q and qd projected onto the constraints, by Newton's method in the metric of D.
 
-        fixed: coordinates that keep position and velocity. nearest: return the nearest q in
-        that metric; otherwise each correction is minimal. nan without convergence.
+        fixed: indices of coordinates that keep position and velocity. nearest: return the nearest q
+        in that metric; otherwise only each Newton correction is minimal. The results are nan if the
+        iteration does not converge.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         project_one = partial(self._project_state, fixed=fixed, nearest=nearest)
@@ -129,7 +146,10 @@ class Reference(ABC):
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
-        """q and qd behind a step, corrected as a step is: of one state, or many at once."""
+        """Return q and qd after a step, corrected onto the constraints as generated steppers do it.
+
+        q, qd: (nq,), or (b, nq) for b states.
+        """
         return self._corrected(q, qd, t, self._values(params))
 
     def step(
@@ -141,9 +161,10 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> tuple[Vector, Vector]:
-        """One step of the classical Runge-Kutta method of order 4: q and qd at t + h, corrected.
+        """Return q and qd at t + h by one step of the classical Runge-Kutta method of order 4.
 
-        u None: the scene's signals at every stage; u given: held over the step.
+        The result is corrected onto the constraints. With `u`, inputs are held constant over the
+        step; without, they are the scene's signals at every stage.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         return self._step(q, qd, h, np.asarray(t, float), u, self._values(params))
@@ -159,9 +180,11 @@ class Reference(ABC):
         params: Params = None,
         t0: float = 0.0,
     ) -> tuple[Vector, Vector, Vector]:
-        """Run from the start: t (n,) and q, qd (n, nq), rows every `every` steps and the last.
+        """Return a run by RK4 steps: times t (n,), and q and qd, both (n, nq).
 
-        With b states q and qd are (n, b, nq).
+        The initial state, every `every`-th state and the last one are stored. Arguments that are
+        None have the scene's values: initial state, step size h (s), and number of steps for its
+        duration. For b initial states q and qd are (n, b, nq). t0: initial time, s.
         """
         start = self.system.coordinates
         q = np.array([c.start for c in start] if q0 is None else q0, float)
@@ -193,9 +216,9 @@ class Reference(ABC):
 
     @cached_property
     def solved(self) -> Vector:
-        """Weights (r, m): the accelerations are solved with r weighted sums of the m constraints.
+        """Weights (r, m) of the r sums of the m constraint equations that are solved for.
 
-        In most systems, each is one constraint.
+        The r sums are independent. In most systems each is one of the constraint equations.
         """
         rows = self.system.solved
         sums = np.zeros((len(rows), len(self.system.constraints)))
@@ -206,7 +229,7 @@ class Reference(ABC):
 
     @cached_property
     def switched(self) -> Vector:
-        """(r,): of `solved`, whether it holds in some modes only."""
+        """For each of the r sums in `solved`, whether it applies in some modes (sticking) only."""
         rows = self.system.constraints
         return np.array([any(rows[k].switched for k, _ in row) for row in self.system.solved])
 
@@ -359,6 +382,6 @@ class Reference(ABC):
 
 
 def by_rows(x: ArrayLike, rows: int) -> list[Any]:
-    """One value for each row, or the values of all."""
+    """Return a list of `rows` values: x repeated if it is one number, else its entries."""
     each: list[Any] = [np.asarray(x).tolist()] * rows
     return each if np.ndim(x) == 0 else np.broadcast_to(x, rows).tolist()

@@ -14,7 +14,7 @@ LIMIT = 1e3
 
 @dataclass(frozen=True)
 class Row:
-    """One check: its error, unit and limit.
+    """One row of the report: a check with its measured error, the limit, and the unit of both.
 
     If nothing could be judged, `judged` is False and `unit` gives the reason; such a row counts as
     passed.
@@ -30,9 +30,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of `check`: `states` were used, `rejected` ones had no regular D.
+    """The report of `eomc check`: its rows, one for each check, and how they were obtained.
 
-    reference: "equations written out" or "Taylor arithmetic".
+    states: number of states used. rejected: number of random states left out since their mass
+    matrix D was not regular. reference: how expected values were computed, "equations written out"
+    or "Taylor arithmetic".
     """
 
     scene: str
@@ -47,7 +49,7 @@ class Report:
         return all(row.passed for row in self.rows)
 
     def table(self) -> str:
-        """Return the rows as text for a terminal."""
+        """Return the rows as a text table, 100 columns wide, for a terminal."""
         from rich.box import SIMPLE_HEAD
         from rich.console import Console
         from rich.table import Table
@@ -68,7 +70,7 @@ class Report:
         return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the report for JSON, with None for numbers that are not finite."""
+        """Return the report as a dict for JSON; an error that is not finite becomes None."""
         rows = [asdict(row) for row in self.rows]
         for row in rows:
             row["error"] = row["error"] if math.isfinite(row["error"]) else None

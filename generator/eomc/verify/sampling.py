@@ -45,9 +45,9 @@ DRAWS = 8  # how often: the influence is known to a quarter of itself
 class SampleBudget:
     """How much is compared with the reference, depending on the cost of its evaluation.
 
-    states: number of states. prediction_steps: steps taken to estimate the range of the motion,
-    each of `stride` times the scene's h. few: number of states for single steps. run: steps of a
-    run.
+    states: number of states. prediction_steps: number of steps that estimate the range of the
+    motion, each of `stride` times the scene's h. few: number of states from which single steps
+    start. run: number of steps of a compared run.
     """
 
     states: int
@@ -82,7 +82,11 @@ OF_INPUTS = ("tau", "power", "acceleration", "multipliers")
 
 @dataclass(frozen=True)
 class State:
-    """Where to evaluate: q, qd (nq,), t in s, u (nu,) or None for the signals, params or None."""
+    """Arguments at which functions of a module or of the reference are evaluated.
+
+    q, qd: (nq,). t: time, s. u: inputs (nu,), or None for the scene's signals. params: all
+    parameters by name, or None for their defaults.
+    """
 
     q: Vector
     qd: Vector
@@ -92,7 +96,7 @@ class State:
 
 
 def evaluate_module(module: Any, name: str, s: State) -> Vector:
-    """Return the module's value of this name."""
+    """Return the module's value `name`, such as "D" or "acceleration", at the state `s`."""
     place = (s.q,) if name in OF_POSITIONS else (s.q, s.qd)
     inputs = {"u": s.u} if name in OF_INPUTS else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
@@ -107,19 +111,26 @@ def projected_start(module: Any, s: State) -> State:
 
 
 def simulate(module: Any, s: State, **how: Any) -> Any:
-    """Return the module's run from a state, without a warning if it stops early."""
+    """Return the module's run from the state `s`, without a warning if it stops early.
+
+    how: further arguments of the module's `simulate`, such as h and steps.
+    """
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         return module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
 
 
 def states_of_run(run: Any, s: State) -> list[State]:
-    """Return the states of the rows of a run from `s`."""
+    """Return the states that a run has stored, with the inputs and parameters of its start `s`."""
     rows = zip(run.t, run.q, run.qd, strict=True)
     return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
 
 
 def perturb_each_input(s: State, defaults: Mapping[str, float]) -> list[State]:
-    """Return the state with one input at a time changed by a small part of itself."""
+    """Return copies of the state, in each of which one number is multiplied by 1 + NUDGE.
+
+    Each coordinate, velocity, input, parameter and the time that is not zero is changed in turn.
+    Without parameters in the state, those are `defaults`.
+    """
     states = []
     for field in ("q", "qd", "u"):
         values = getattr(s, field)
@@ -160,7 +171,11 @@ def _stacked(states: Sequence[State], defaults: Mapping[str, float]) -> dict[str
 
 @dataclass(frozen=True)
 class Expected:
-    """The reference's values at a state, and the sizes that errors are measured against."""
+    """The reference's values at a state, and the sizes in units of which their errors are measured.
+
+    value, size: by name, such as "D" or "acceleration"; an error of eps times the size is one unit
+    of rounding.
+    """
 
     state: State
     value: Mapping[str, Vector]
@@ -168,7 +183,11 @@ class Expected:
 
 
 class Sampler:
-    """Draws states around the start that are finite and have a regular D."""
+    """Draws random states around the initial state of the scene, at which D is finite and regular.
+
+    effort: how many states and steps are used. spread, speed: how far coordinates and velocities go
+    in a motion, (nq,); scale is both, (2, nq). rejected: number of states left out.
+    """
 
     def __init__(
         self, reference: Reference, random: np.random.Generator, effort: SampleBudget
@@ -214,7 +233,11 @@ class Sampler:
         return np.asarray(np.max(np.nan_to_num(ranges, posinf=0), axis=1))
 
     def states(self, count: int) -> list[Expected]:
-        """Return the start, some states with default parameters, then random states."""
+        """Return `count` states with the reference's values there; fewer if too many are rejected.
+
+        The first is the initial state. A quarter of them have the parameters' defaults, the others
+        random parameters; every second one has random inputs.
+        """
         states_: list[Expected] = []
         nearness = 1.0  # every rejection moves the next draw closer to the start
         for attempt in range(20 * count):
@@ -236,8 +259,10 @@ class Sampler:
         return states_
 
     def unusual_states(self, slow: int) -> list[Expected]:
-        """States that a run hardly comes to: a unit away, and `slow` that are almost at rest, where
-        what smooths friction acts. Fewer, where some are none.
+        """Return reference values at states that runs hardly reach, those with a regular D.
+
+        One state is about a unit of each coordinate away from the start. In `slow` others all
+        velocities are almost zero, where the functions that smooth friction are steep.
         """
         drawn = [self.draw(1.0, True, False) for _ in range(1 + slow)]
         way = np.array([drawn[0].q - self.start.q, drawn[0].qd - self.start.qd])
@@ -248,14 +273,23 @@ class Sampler:
         return [e for state in states if (e := self.regular_expected(self.project(state)))]
 
     def far_states(self) -> list[Expected]:
-        """Return a state FAR_FACTOR times as far from the start, or none if it is invalid."""
+        """Return one state FAR_FACTOR times as far from the start as others, in a list.
+
+        The list is empty if D is not regular there. Terms that are small near the start count
+        there.
+        """
         drawn = [self.draw(FAR_FACTOR, True, False) for _ in range(4)]
         state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
         expected = self.regular_expected(state)
         return [] if expected is None else [expected]
 
     def draw(self, nearness: float, with_defaults: bool, with_inputs: bool) -> State:
-        """Return a random state, with the parameters' defaults or with inputs from outside."""
+        """Return a random state, projected onto the constraints; nan if that fails.
+
+        nearness: distance from the initial state, relative to that of a motion. with_defaults: use
+        the parameters' defaults in place of random values. with_inputs: draw inputs in place of the
+        signals.
+        """
         random, n, start = self.random, len(self.start.q), self.start
         centre = np.where(self.angles, nearness < 1, 1) * start.q
         q = centre + nearness * self.spread * random.uniform(-1, 1, n)
@@ -307,9 +341,9 @@ class Sampler:
                 q[mode.at], qd[mode.at] = np.sign(qd[mode.of]), 0.0
 
     def project(self, s: State, nearest: bool = False) -> State:
-        """The state put onto the constraints; nan where that leads nowhere, or some row is off.
+        """Return the state projected onto the constraints; nan if no such state is found.
 
-        nearest: the positions are the nearest ones, as those of a module's `project` are.
+        nearest: find the nearest positions, as a module's `project` does.
         """
         if not self.system.constraints:
             return s
@@ -330,20 +364,24 @@ class Sampler:
         return find_wrong_rotations(self.system)
 
     def wrong_rotations(self, s: State) -> list[str]:
-        """Return the loops that are closed by a wrong rotation though their equations hold."""
+        """Return the names of the loops closed by a wrong rotation though their equations hold."""
         if not (self.system.reactions and np.all(np.isfinite(s.q))):
             return []
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
     def rows(self, name: str, s: State) -> Vector:
-        """Return values of the constraints that are solved for."""
+        """Return `name` of the independent constraint equations that are solved for.
+
+        name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq).
+        """
         values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
         return np.asarray(self.reference.solved @ values)
 
     def regular(self, s: State) -> bool:
-        """D finite and far from singular, and positive definite where we chose the parameters.
+        """Return whether D is finite and far from singular at a state.
 
-        Under constraints the KKT matrix is to be far from singular, and D not negative.
+        With random parameters, D must also be positive definite. Under constraints the KKT matrix
+        must be far from singular, and D not negative.
         """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
@@ -361,12 +399,12 @@ class Sampler:
         return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
 
     def regular_expected(self, s: State) -> Expected | None:
-        """Return `expected`, or None if D is not regular."""
+        """Return the reference's values and sizes at a state; None if D is not regular there."""
         with np.errstate(all="ignore"):
             return self.expected(s) if self.regular(s) else None
 
     def expected(self, s: State) -> Expected | None:
-        """Return the reference's values and their scales; None if any is not finite."""
+        """Return the reference's values and their sizes at a state; None if one is not finite."""
         value: dict[str, Vector] = {}
         reach: dict[str, Vector] = {}
         for name, field in VALUES.items():
@@ -450,9 +488,11 @@ class Sampler:
         ])  # fmt: skip
 
     def rounded(self, s: State, *others: Vector) -> Vector:
-        """q and qd, others, and under constraints with last digits changed, (2, n, nq).
+        """Return q and qd of a state and of neighbours, stacked as (2, n, nq).
 
-        Where rows all but depend on each other, what a step rounds grows by more than differences.
+        others: further states, (2, nq) each. Under constraints three states are added that differ
+        from `s` in the last digits: near a singular position, rounding errors of a step grow by
+        more than differences of its initial state.
         """
         x = np.array([s.q, s.qd])
         digits = EPS * (np.abs(x) + self.scale)
@@ -461,17 +501,18 @@ class Sampler:
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
-        """Return K + P and its scale."""
+        """Return the reference's energy K + P (J) at a state, and the size for its rounding errors."""
         names = ("kinetic", "potential")
         K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
         size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
         return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def value_and_size(self, function: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
-        """f and |f| + sum_i |x_i df/dx_i|; function: f of states as rows.
+        """Return f and |f| + Σ |x_i ∂f/∂x_i|, the size for its rounding errors, at a state.
 
-        Where there are many inputs the sum is the root of that of the squares, from DRAWS changes
-        of all at once: no larger, and smaller by the root of their number at most.
+        function: f of the arguments of `evaluate`, for many states at once. With more than
+        MOST_NUDGES inputs x_i, the sum is replaced by the root of the sum of squares, estimated
+        from DRAWS random changes of all inputs: it is smaller at most by the root of their number.
         """
         near = perturb_each_input(s, self.defaults)
         many = len(near) > MOST_NUDGES
