@@ -501,7 +501,7 @@ class Sampler:
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
-        """Return the reference's energy K + P (J) at a state, and the size for its rounding errors."""
+        """Return the reference's energy K + P (J) at a state, and the size for its roundings."""
         names = ("kinetic", "potential")
         K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
         size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
