@@ -26,14 +26,14 @@ _Function = Callable[[Array], Array]
 
 
 class Equilibrium(NamedTuple):
-    """A state and inputs at which the accelerations are zero.
+    """State and inputs at which the accelerations are zero, or a steady motion.
 
     Attributes
     ----------
     q, qd : (nq,) arrays
         Positions and velocities.
     u : (nu,) array, or None
-        Inputs; None where the scene has none.
+        Inputs; None if the scene has none.
     """
 
     q: Array
@@ -50,12 +50,15 @@ def equilibrium(
 ) -> Equilibrium:  # fmt: skip
     """Solve tau + A^T lambda = C qd + g for the variables in `free`, by Newton's method.
 
-    q, qd, u: initial guess, and the values of all other variables. The residual is a force, not an
-    acceleration, since D may be singular. The Jacobian is a finite difference; its error slows
-    convergence but does not affect the result. Underdetermined systems: minimum-norm steps. u
-    None: the scene's signals. With constraints, the residual has the forces that multipliers
-    cannot balance, and the velocity constraints and their rates; steps are tangent to the position
-    constraints.
+    q, qd, u: initial guess of the variables in `free`, and the values of all other variables. u
+    None: the scene's signals. free: names of coordinates, velocities (such as "theta_dot") and
+    inputs. Raises MotionError if no solution is found, ValueError for an unknown name.
+
+    The residual is a force, not an acceleration, since D may be singular. The Jacobian is a finite
+    difference; its error slows convergence but does not affect the result. Newton steps of
+    underdetermined systems are those of minimum norm. With constraints, the residual consists of
+    the forces that multipliers cannot balance, the residuals of the velocity constraints and the
+    time derivatives of these; steps are tangent to the position constraints.
     """
     n, known = model.nq, (*model._states, *model.inputs)
     if strange := [name for name in free if name not in known]:
@@ -246,7 +249,10 @@ def _tried(onto: _Function, z: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Constraints of a model at z = [q; qd; u], (len(z),); `moved` masks the free variables."""
+    """Constraint equations of a model as functions of z = [q; qd; u], (len(z),).
+
+    moved: mask (len(z),) of the free variables. t: time, s.
+    """
 
     model: Constrained
     moved: Array
@@ -254,14 +260,18 @@ class _Rows:
     params: Any
 
     def onto(self, z: Array) -> Array:
-        """Project the free coordinates of z onto the constraints. Raises MotionError."""
+        """Return z with its free coordinates projected onto the constraints. Raises MotionError."""
         n = self.model.nq
         fixed = [not x for x in self.moved[:n]] + [False] * n
         q, _ = self.model._projected(z[:n], np.zeros(n), self.t, self.params, fixed)
         return np.concatenate([q, z[n:]])
 
     def tangent_basis(self, z: Array) -> Array:
-        """Return an orthonormal basis (k, len(z)) of free directions tangent to the constraints."""
+        """Return an orthonormal basis (k, len(z)) of free directions tangent to the constraints.
+
+        Coordinates move tangentially to the position constraints; each free velocity or input adds
+        one direction.
+        """
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
         _, s, V = np.linalg.svd(self._slopes(z)[: self.model._rows.holonomic, moved])
         rank = int(np.sum(s > _RANK_TOLERANCE * np.max(s, initial=0)))
@@ -270,10 +280,11 @@ class _Rows:
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
     def residual(self, z: Array, forces: Array) -> Array:
-        """Return the forces that multipliers cannot balance, and the velocity residuals.
+        """Return what remains of `forces` (nq,) beyond A^T lambda, and the velocity residuals.
 
-        The parts are: forces (nq,), residuals of the velocity constraints (nc,), and the rates of
-        these at constant velocities (nc,), by a central difference.
+        The result concatenates: forces that no multipliers lambda can balance (nq,), residuals of
+        the velocity constraints (nc,), and their time derivatives at constant velocities (nc,), by
+        a central difference.
         """
         A, (q, qd) = self._slopes(z), self._halves(z)
         forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
@@ -285,7 +296,7 @@ class _Rows:
         return np.concatenate([forces, now, (then - before) / (2 * short)])
 
     def sizes(self, z: Array) -> Array:
-        """Return the magnitudes (2 nc,) of the terms of the velocity residuals."""
+        """Return the magnitudes (2 nc,) of the terms of the velocity residuals and their rates."""
         sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
         return np.concatenate([sizes, sizes * self._pace(z)])
 

@@ -20,8 +20,14 @@ from .package import option, reduced
 
 
 class Pose(NamedTuple):
-    """position: m, (3,); in the plane (2,). rotation: (3, 3), its columns the frame's axes; in the
-    plane the angle, rad.
+    """Position and orientation of a frame, or of several frames.
+
+    Attributes
+    ----------
+    position : (3,) array, in plane scenes (2,)
+        Position of the frame's origin in the world, m.
+    rotation : (3, 3) array, in plane scenes a number
+        Rotation matrix, whose columns are the frame's axes; in plane scenes the angle, rad.
     """
 
     position: Array
@@ -32,9 +38,20 @@ class Pose(NamedTuple):
 
 
 class Momentum(NamedTuple):
-    """Momentum of all moving bodies, linear kg m/s, angular kg m2/s; mass, kg; centre of mass, m.
+    """Mass, centre of mass and momentum of all moving bodies.
 
-    `angular` is about the centre of mass. The velocity of the centre is linear/mass.
+    Vectors are (3,), or (2,) in plane scenes. The velocity of the centre of mass is linear / mass.
+
+    Attributes
+    ----------
+    mass : float
+        Total mass, kg.
+    center : array
+        Centre of mass, m.
+    linear : array
+        Linear momentum, kg m/s.
+    angular : array, in plane scenes a number
+        Angular momentum about the centre of mass, kg m^2/s.
     """
 
     mass: Any
@@ -47,19 +64,43 @@ class Momentum(NamedTuple):
 
 
 class Frames(Functions):
-    """Functions of bodies that [run] enables: `frames`, `inverse_dynamics`, `momentum`."""
+    """Functions of bodies and points (frames): poses, Jacobians, inverse dynamics, momentum.
+
+    A module has them if the scene's [run] enables them. A *twist* is the velocity of a frame's
+    origin, m/s, and the angular velocity, rad/s: (6,), or (3,) in plane scenes. A *wrench* is a
+    force at the frame's origin, N, and a moment, N m, in the same order. All components are along
+    the world's axes. Results for n states, q (n, nq), have a leading axis n; results for all nf
+    frames have an axis nf after it.
+    """
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The bodies and points that have poses and Jacobians, in the order of results."""
+        """Names of the bodies and points that have poses and Jacobians, in the order of results."""
         return self._frames[0]
 
     def pose(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Pose:
-        """Return the pose of a body or point, or of all frames if `frame` is None.
+        """Return the pose of a body or point, or of all frames.
 
-        Raises ValueError for a frame that is not among the scene's `frames`.
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array_like
+            Generalized coordinates.
+        frame : str, optional
+            Name in `frames`; by default all, and the results have an axis nf before the last ones.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        Pose
+            (position, rotation) in the world.
+
+        Raises
+        ------
+        ValueError
+            If `frame` is not among the scene's `frames`.
         """
         poses = self._evaluate_frame("frame_poses", 1, frame, q, None, t, params)
         if self._plane:
@@ -70,16 +111,45 @@ class Frames(Functions):
         self, q: ArrayLike, qd: ArrayLike, frame: str | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """The twist of a frame, (6,), in the plane (3,): m/s, rad/s."""
+        """Return the twist of a frame: the velocity of its origin and the angular velocity.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        frame : str, optional
+            Name in `frames`; by default all, and the result has an axis nf before the last one.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (6,) array, in plane scenes (3,)
+            m/s and rad/s; with a leading axis n for n states.
+        """
         return self._evaluate_frame("frame_velocities", 1, frame, q, qd, t, params)
 
     def frame_acceleration(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike | None = None, frame: str | None = None,
         t: float = 0.0, params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """The rate of `frame_velocity` at accelerations qdd: m/s2, rad/s2.
+        """Return the time derivative of a frame's twist: J qdd + dJ/dt qd.
 
-        Without qdd at zero, which leaves dJ/dt qd: J qdd + that is the acceleration.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        qdd : (nq,) or (n, nq) array_like, optional
+            Accelerations; by default zero, so that the result is dJ/dt qd.
+        frame : str, optional
+            Name in `frames`; by default all, and the result has an axis nf before the last one.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (6,) array, in plane scenes (3,)
+            m/s^2 and rad/s^2; with a leading axis n for n states.
         """
         each = np.zeros(np.shape(q), self.dtype) if qdd is None else qdd
         full = self._like(each, "qdd", (self.nq,), q)
@@ -88,16 +158,44 @@ class Frames(Functions):
     def jacobian(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """J of a frame, (6, nq), in the plane (3, nq): J qd is its twist."""
+        """Return the Jacobian J of a frame, with which J qd is the twist of the frame.
+
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array_like
+            Generalized coordinates.
+        frame : str, optional
+            Name in `frames`; by default all, and the result has an axis nf before the last two.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (6, nq) array, in plane scenes (3, nq)
+            With a leading axis n for n states.
+        """
         return self._evaluate_frame("frame_jacobians", 2, frame, q, None, t, params)
 
     def frame_forces(
         self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """The generalized forces of wrenches, (nq,): the sum of J^T w.
+        """Return the generalized forces of wrenches on frames: the sum of J^T w.
 
-        wrenches: by frame, (6,) or (n, 6) each, N and N m, in the plane 3; or all, (nf, 6).
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array_like
+            Generalized coordinates.
+        wrenches : mapping or array_like
+            Wrenches by the frame's name, (6,) or (n, 6) each, or those of all frames, (nf, 6); in
+            plane scenes 3 instead of 6. Force at the frame's origin, N, then moment, N m.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Generalized forces, N or N m.
         """
         forces: Array = self._evaluate(
             "frame_forces", q, None, t, None, params, None, self._wrenches(wrenches, q)
@@ -109,11 +207,30 @@ class Frames(Functions):
         f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """tau = D qdd + C qd + g, (nq,), less what f_ext does: recursively, without D.
+        """Return the generalized force D qdd + C qd + g - sum(J^T f_ext) that a motion requires.
 
-        f_ext: wrenches from outside, as in `frame_forces`. tau is all that acts along the
-        coordinates, N or N m: what drives have to give is that less `tau` at u = 0, friction.
-        Under constraints it is tau + A^T lambda; `drive_forces` parts them.
+        The evaluation is recursive, without D. The force is the sum of all forces along the
+        coordinates, including friction: drives must supply it minus `tau` at u = 0. With
+        constraints it equals tau + A^T lambda; `drive_forces` separates the two.
+
+        Parameters
+        ----------
+        q, qd, qdd : (nq,) or (n, nq) array_like
+            State and accelerations.
+        f_ext : mapping or array_like, optional
+            External wrenches on frames, in the form of `wrenches` in `frame_forces`.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Generalized forces, N or N m.
+
+        Raises
+        ------
+        ValueError
+            If `f_ext` is given and the module has no frames.
         """
         if f_ext is not None and not self.frames:
             raise ValueError(f"f_ext acts at frames: build it with {option('frames')}")
@@ -126,7 +243,20 @@ class Frames(Functions):
     def momentum(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Momentum:
-        """Mass, centre of mass and momenta of all bodies that move, rotors of drives aside."""
+        """Return mass, centre of mass and momenta of all moving bodies, except rotors of drives.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        Momentum
+            Named tuple (mass, center, linear, angular); with a leading axis n for n states.
+        """
         d = 2 if self._plane else 3
         x = self._evaluate("momentum", q, qd, t, None, params)
         angular = x[..., -1] if self._plane else x[..., 7:]

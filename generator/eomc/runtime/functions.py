@@ -23,7 +23,11 @@ _ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at mo
 
 
 class StateFunction(NamedTuple):
-    """A function of a state: the shape of its result in a model, and whether it reads qd."""
+    """Describe a generated C function of a state.
+
+    shape: function that returns the shape of the result at one state from the model. of_velocity:
+    whether the C function takes the velocities qd as well as q.
+    """
 
     shape: Callable[[Any], tuple[int, ...]]
     of_velocity: bool = True
@@ -68,7 +72,16 @@ FUNCTIONS: Mapping[str, StateFunction] = {
 
 
 class Functions(Arguments):
-    """The functions of a state of a compiled scene."""
+    """Functions of the state of a compiled scene: D, C, g, energies, accelerations, derivatives.
+
+    All methods take one state, q and qd (nq,), or n states, (n, nq). For n states the results have
+    a leading axis n, and t may be (n,), u (n, nu), and the value of a parameter (n,). Other
+    arguments: t is the time, s. u: constant inputs (nu,), or a mapping that gives all inputs by
+    name; None: the signals of the scene. params: a mapping of the parameters that differ from the
+    scene's values, or all of them (np,). out: a C-contiguous array of the result's shape and the
+    module's dtype, into which the result is written. Angles in rad, all else in SI units. Invalid
+    arguments raise ValueError.
+    """
 
     def _evaluate(
         self, name: str, q: ArrayLike, qd: ArrayLike | None, t: Any = 0.0, u: Any = None,
@@ -124,90 +137,213 @@ class Functions(Arguments):
         return count, "ok"
 
     def D(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
-        """D(q): mass matrix, (nq, nq), symmetric positive definite. Others call it M."""
+        """Return the mass matrix D(q), symmetric positive definite (in other texts M).
+
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array_like
+            Generalized coordinates.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq, nq) or (n, nq, nq) array
+            Kinetic energy is qd^T D qd / 2 for models whose K is quadratic in qd.
+        """
         return self._evaluate("D", q, None, t, None, params, out)
 
     def C(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """C(q, qd): Coriolis matrix, (nq, nq), Christoffel form: Ddot - 2 C is skew-symmetric."""
+        """Return the Coriolis matrix C(q, qd) in Christoffel form: dD/dt - 2 C is skew-symmetric.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq, nq) or (n, nq, nq) array
+        """
         return self._evaluate("C", q, qd, t, None, params, out)
 
     def g(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
-        """g(q) = dP/dq, (nq,): generalized forces of the potential energy."""
+        """Return g(q) = dP/dq, the gradient of the potential energy P.
+
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array_like
+            Generalized coordinates.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Generalized forces, N or N m, on the left-hand side of D qdd + C qd + g = tau.
+        """
         return self._evaluate("g", q, None, t, None, params, out)
 
     def bias(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """C(q, qd) qd + g(q), (nq,), without forming C."""
+        """Return the bias force C(q, qd) qd + g(q), computed without forming C.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Generalized forces, N or N m.
+        """
         return self._evaluate("bias", q, qd, t, None, params, out)
 
     def tau(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """tau = Q - dR/dqd, (nq,): of inputs, friction and other forces. u None: the signals."""
+        """Return the generalized force tau = Q - dR/dqd of the inputs, friction and other forces.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs; by default the signals of the scene.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Generalized forces, N or N m; Q are the applied forces, R is the dissipation function.
+        """
         return self._evaluate("tau", q, qd, t, u, params, out)
 
     def kinetic_energy(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """K(q, qd), J."""
+        """Return the kinetic energy K(q, qd), J: a number, or (n,) for n states.
+
+        t: time, s; params: parameters that differ from the scene's; out: array for the result.
+        """
         return self._evaluate("kinetic_energy", q, qd, t, None, params, out)
 
     def potential_energy(
         self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None
     ) -> Any:
-        """P(q), J."""
+        """Return the potential energy P(q), J: a number, or (n,) for n states.
+
+        t: time, s; params: parameters that differ from the scene's; out: array for the result.
+        """
         return self._evaluate("potential_energy", q, None, t, None, params, out)
 
     def energy(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """K + P, J."""
+        """Return the energy K(q, qd) + P(q), J: a number, or (n,) for n states.
+
+        t: time, s; params: parameters that differ from the scene's; out: array for the result.
+        """
         return self._evaluate("energy", q, qd, t, None, params, out)
 
     def jacobi(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """qd.dK/dqd - K + P, J: K + P where K is quadratic in qd, else what takes its place."""
+        """Return Jacobi's integral qd . dK/dqd - K + P, J: a number, or (n,) for n states.
+
+        It equals the energy K + P if K is purely quadratic in qd. Otherwise, as in a rotating
+        frame, it is conserved instead of the energy. t: time, s; params: parameters that differ
+        from the scene's; out: array that receives the result.
+        """
         name = "jacobi" if self.has_jacobi else "energy"
         return self._evaluate(name, q, qd, t, None, params, out)
 
     @property
     def has_jacobi(self) -> bool:
-        """Whether Jacobi's integral is another than the energy: K is not purely quadratic in qd."""
+        """True if Jacobi's integral differs from the energy: K is not purely quadratic in qd."""
         return hasattr(self._lib, "jacobi")
 
     @property
     def has_power(self) -> bool:
-        """Whether energy, or Jacobi's integral, is put in or lost: there are forces or the time."""
+        """True if forces or explicit time dependence may change the energy (or Jacobi's integral).
+
+        Otherwise `power` is always zero.
+        """
         return hasattr(self._lib, "power")
 
     def power(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """d(jacobi)/dt, W: by inputs, friction and driven supports. u None: the signals."""
+        """Return the power d(jacobi)/dt of inputs, friction, other forces and driven supports, W.
+
+        `jacobi` is the energy if K is purely quadratic in qd.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs; by default the signals of the scene.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        float or (n,) array
+        """
         return self._evaluate("power", q, qd, t, u, params, out)
 
     def signal(self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None) -> Any:
-        """The scene's own inputs at a state and time, (nu,)."""
+        """Return the values of the scene's input signals at a state and time, before saturation.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (nu,) or (n, nu) array
+            A value for each input, in the order of `inputs`.
+        """
         return self._evaluate("signal", q, qd, t, None, params)
 
     @property
     def has_limits(self) -> bool:
-        """Whether an input has limits."""
+        """True if at least one input of the scene has limits (saturates)."""
         return hasattr(self._lib, "applied")
 
     def limits(self, params: Parameters = None) -> dict[str, tuple[float, float]]:
-        """The limits of each input, (least, largest), by name; -inf and inf where it has none."""
+        """Return the limits of each input.
+
+        Parameters
+        ----------
+        params : mapping or (np,) array_like, optional
+            Parameters that differ from those of the scene, since limits may depend on them.
+
+        Returns
+        -------
+        dict
+            (smallest, largest) value by the input's name; -inf and inf for an input without limits.
+        """
         far, params = float(np.finfo(self.dtype).max), self._parameters(params)
         both = [self._within(np.full(self.nu, x, self.dtype), params).tolist() for x in (-far, far)]
         ends = [[x if abs(x) < far else copysign(inf, x) for x in some] for some in both]
@@ -216,7 +352,21 @@ class Functions(Arguments):
     def applied(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
+        """Return the inputs that act at a state: `u`, or the signals, saturated at their limits.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs before saturation; by default the signals of the scene.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        (nu,) or (n, nu) array
+        """
         if self.has_limits:
             return np.asarray(self._evaluate("applied", q, qd, t, u, params))
         at, moving = self._state(q, qd)
@@ -247,9 +397,27 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Array:  # fmt: skip
-        """The scene's outputs, (ny,), in the order of `outputs`. u None: the scene's signals.
+        """Return the scene's outputs at a state.
 
-        nan where one needs accelerations and D is singular. Raises ValueError where there are none.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs; by default the signals of the scene.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (ny,) or (n, ny) array
+            Values in the order of the names in `outputs`; nan where an output needs accelerations
+            and D is singular.
+
+        Raises
+        ------
+        ValueError
+            If the scene has no outputs.
         """
         if not self.outputs:
             raise ValueError(f"output: {self.name} has none: {named_outputs()}")
@@ -260,9 +428,26 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Array:  # fmt: skip
-        """Qdd from D qdd + C qd + g = tau, (nq,). u None: the scene's signals.
+        """Return the accelerations qdd, from D qdd + C qd + g = tau (+ A^T lambda of constraints).
 
-        Raises MotionError where D is singular or a result is not finite.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs; by default the signals of the scene.
+        t, params, out
+            Time, s; parameters that differ from the scene's; array that receives the result.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+            Accelerations, m/s^2 or rad/s^2.
+
+        Raises
+        ------
+        MotionError
+            If D is singular or a result is not finite; `out` is then unchanged.
         """
         from_q, from_qd, at, moving = self._read(q, qd)
         values = result = empty(at.shape, self.dtype)
@@ -295,23 +480,51 @@ class Functions(Arguments):
 
     @property
     def has_slopes(self) -> bool:
-        """Whether the module was built with the derivatives of its accelerations."""
+        """True if the module was built with derivatives of its accelerations (`linearize`)."""
         return hasattr(self._lib, "linearization")
 
     def linearize(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Any = None, *,
         outputs: bool = False, closed: bool = False,
     ) -> tuple[Array, ...]:  # fmt: skip
-        """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
+        """Linearise the motion at a state: d(dx)/dt = A dx + B du for the state x = [q; qd].
 
-        With outputs=True also C (ny, 2 nq) and D (ny, nu) of the outputs, dy = C dx + D du. Many
-        states, (n, nq), give each of them a leading n; u may be (n, nu) then, and a parameter (n,).
+        Derivatives are exact to rounding.
 
-        Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
-        m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
-        the scene's signals, where these depend on the state as well; with closed=True they are
-        followed: A is that of the closed loop, B of what is added to the signals.
-        Raises MotionError as `acceleration` does, ValueError where the module lacks them.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State at which to linearise, or n states.
+        t : float or (n,) array_like
+            Time, s.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs. By default the values of the scene's signals, which are held constant even if a
+            signal depends on the state.
+        params : mapping or array_like, optional
+            Parameters that differ from those of the scene; each value may be (n,).
+        outputs : bool
+            Return C and D of the outputs, too.
+        closed : bool
+            Let the scene's signals follow the state: A is then the matrix of the closed loop, and B
+            belongs to inputs that are added to the signals. Only without `u`.
+
+        Returns
+        -------
+        A : (2 nq, 2 nq) array
+            [[0, 1], [dqdd/dq, dqdd/dqd]], in m or rad per s^2, per m, rad or their rates. For n
+            states this and all other results have a leading axis n.
+        B : (2 nq, nu) array
+            [0; dqdd/du].
+        C, D : (ny, 2 nq) and (ny, nu) arrays, if `outputs`
+            Derivatives of the outputs: dy = C dx + D du.
+
+        Raises
+        ------
+        MotionError
+            If D is singular or a derivative is not finite.
+        ValueError
+            If the module was built without these derivatives, or has no outputs or no feedback
+            signal.
         """
         if not self.has_slopes:
             raise ValueError(
@@ -425,7 +638,27 @@ class Functions(Arguments):
         return E, self._evaluate("output_sensitivity", q, qd, t, u, params) + by_qdd @ E
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
-        """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
+        """Return dx/dt = [qd; qdd] for x = [q; qd], as `scipy.integrate.solve_ivp` calls it.
+
+        Parameters
+        ----------
+        t : float
+            Time, s.
+        x : (2 nq,) array_like
+            State: q, then qd.
+        u, params
+            Inputs, (nu,) or by name (None: the scene's signals); parameters that differ from the
+            scene's.
+
+        Returns
+        -------
+        (2 nq,) array
+
+        Raises
+        ------
+        MotionError
+            If D is singular or an acceleration is not finite.
+        """
         n, state = self.nq, self._numbers(x, "x")
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")

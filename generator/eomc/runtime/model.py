@@ -48,13 +48,34 @@ RARELY = 2**48  # steps from row to row, more than any run makes
 
 
 class Model(Stepping):
-    """The functions of a compiled scene; the package exports them under the same names."""
+    """A compiled scene: its functions, steps and runs.
+
+    Each built package has one `Model` and exports its public methods as functions of the same
+    names.
+    """
 
     def load_run(self, file: File) -> Any:
-        """Load a run, or a batch, from an .npz file that `save` has written.
+        """Load a run, or a batch of runs, from an .npz file that `run.save` has written.
 
-        Raises ValueError if the file is not of this scene, OSError if it cannot be read; warns if
-        it is of another version of the scene. Additional events of the run are compiled if needed.
+        Additional events of the run (its argument `events`) are compiled if needed. A warning is
+        issued if the run is of another version of the scene.
+
+        Parameters
+        ----------
+        file : str or path
+            The .npz file.
+
+        Returns
+        -------
+        Run or batch of runs
+            Of the class that was saved.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a run of this scene, or is a batch and the module has no batches.
+        OSError
+            If the file cannot be read.
         """
         model, kind, arrays = saved.read(self, file)
         if (run_class := model._kinds.get(kind)) is None:
@@ -73,13 +94,43 @@ class Model(Stepping):
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Any = None, method: str | None = None, *, control_period: float | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(Phi, Gamma): dx' = Phi dx + Gamma du of `step`, x = [q; qd], x' one step later.
+        """Return the derivatives (Phi, Gamma) of one step: dx' = Phi dx + Gamma du.
 
-        Phi (2 nq, 2 nq), Gamma (2 nq, nu), with a leading n for many states (n, nq), for which u
-        may be (n, nu) and a parameter (n,); the step's own derivatives, exact to rounding. u None:
-        Phi follows the scene's signals, as steps do, and Gamma is along what is added to them.
-        control_period: over so many steps, in s, u held or the signals read at their start. Raises
-        MotionError as `step` does, ValueError where the module lacks them.
+        x = [q; qd] is the state before the step and x' the state after it. The derivatives are
+        those of the step itself, not of the exact motion, and are exact to rounding.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State before the step, or n states.
+        h : float, optional
+            Step size, s; by default that of the scene.
+        t : float
+            Time at the start of the step, s.
+        u : (nu,) or (n, nu) array_like or mapping, optional
+            Inputs, constant over the step. By default the step follows the scene's signals, and
+            Gamma belongs to constant inputs that are added to them.
+        params : mapping or array_like, optional
+            Parameters that differ from those of the scene; each value may be (n,).
+        method : str, optional
+            Name in `methods`; by default the first.
+        control_period : float, optional
+            Differentiate all steps of this period, s, with constant inputs: `u`, or the scene's
+            signals at the start of the period.
+
+        Returns
+        -------
+        Phi : (2 nq, 2 nq) array
+            dx'/dx. For n states both results have a leading axis n.
+        Gamma : (2 nq, nu) array
+            dx'/du.
+
+        Raises
+        ------
+        MotionError
+            If a step fails or a derivative is not finite.
+        ValueError
+            If the module was built without these derivatives.
         """
         at, moving = self._state(q, qd)
         h = self.h if h is None else as_step_size(h, self.dtype)
@@ -95,19 +146,69 @@ class Model(Stepping):
         tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
         stiff: bool = False, events: Mapping[str, Any] | None = None, **unknown: Never,
     ) -> Run:  # fmt: skip
-        """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
+        """Simulate the motion by fixed steps of size h or by adaptive steps, and return the run.
 
-        q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
-        of `methods`; "auto": by a tolerance. every: rows are after every so many steps, and the
-        ends. u: None, the scene's signals; (nu,), constant; (steps, nu), held over a step each; a
-        dict of all inputs by name, numbers or (steps,); a function u(t, q, qd), called before each
-        step. control_period: in s, of fixed steps a whole number: once in it the function is asked,
-        a row taken, or the signals read. out: (q, qd), arrays for rows. progress: called with
-        (done, steps). estimate: find `run.error`. tol: what adaptive steps err by, of their way;
-        [run] tolerance, where h, steps and method are not given. times: (n,) ascending: the rows,
-        within duration. h_most: of adaptive steps, s. stiff: begin by Newton's method. events:
-        more, by name a formula or an [[event]]. A run that can't go on warns; Ctrl-C raises
-        Interrupted.
+        Steps are adaptive if `tol`, `h_most`, `stiff` or method="auto" is given, or if the scene
+        has a tolerance and none of `h`, `steps` and `method` is given. A run that cannot go on ends
+        with its last valid state, and a warning is issued.
+
+        Parameters
+        ----------
+        q0, qd0 : (nq,) array_like or mapping by coordinate, optional
+            Initial positions and velocities; missing values are those of the scene.
+        h : float, optional
+            Size of fixed steps, s; by default that of the scene.
+        duration : float, optional
+            Simulated time, s; by default that of the scene.
+        steps : int, optional
+            Number of fixed steps, instead of `duration`.
+        every : int
+            Store a row after each `every` steps, besides the start and the end.
+        u : optional
+            Inputs: None for the scene's signals; (nu,) for constant ones; (steps, nu), a row for
+            each step or control period; a mapping of all inputs by name to numbers or arrays
+            (steps,); or a function u(t, q, qd) that returns them and is called before each step.
+        params : mapping or (np,) array_like, optional
+            Parameters that differ from those of the scene.
+        method : str, optional
+            Name in `methods` (by default the first), or "auto" for adaptive steps.
+        t0 : float
+            Initial time, s.
+        control_period : float, optional
+            Time, s, over which inputs are constant: the function is called, a row of `u` is taken,
+            or the signals are read once in it. For fixed steps it is a whole number of steps.
+        out : (q, qd), optional
+            Arrays (rows, nq) for the rows of a run by fixed steps.
+        progress : callable, optional
+            Function that is called with (completed steps, all steps).
+        estimate : bool
+            Estimate the error, too, as `run.error`.
+        tol : float, optional
+            Tolerance of adaptive steps: error of a step relative to the distance that it moves.
+        times : (n,) array_like, optional
+            Ascending output times from t0 on, s, of the rows; within `duration` if that is given.
+        h_most : float, optional
+            Largest adaptive step, s.
+        stiff : bool
+            Begin adaptive steps with Newton's method, for stiff motion.
+        events : mapping, optional
+            Additional events by name, each a formula or a table such as [[event]] of a scene.
+
+        Returns
+        -------
+        Run
+            The trajectory; `run.status` is "ok" if it reached its end.
+
+        Raises
+        ------
+        ValueError
+            If an argument is invalid or two of them exclude each other.
+        TypeError
+            If an argument is unknown.
+        MemoryError
+            If the rows do not fit in memory.
+        Interrupted
+            On Ctrl-C; its attribute `run` is the run up to there.
         """
         if events is not None or unknown:
             other, arguments = with_events(self.simulate, dict(locals()))
@@ -198,7 +299,28 @@ class Model(Stepping):
         u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
         t0: float = 0.0,
     ) -> str | None:  # fmt: skip
-        """Return a message if h is beyond the stability limit at the initial state, else None."""
+        """Return a message if h is beyond the stability limit of the method at the initial state.
+
+        Parameters
+        ----------
+        q0, qd0 : (nq,) array_like or mapping by coordinate, optional
+            Initial positions and velocities; missing values are those of the scene.
+        h : float, optional
+            Step size, s; by default that of the scene.
+        u : (nu,) array_like, optional
+            Inputs; by default the signals of the scene.
+        params : mapping or (np,) array_like, optional
+            Parameters that differ from those of the scene.
+        method : str, optional
+            Name in `methods`; by default the first.
+        t0 : float
+            Initial time, s.
+
+        Returns
+        -------
+        str or None
+            None if h is within the limit, or if no limit can be computed.
+        """
         p, method = self._parameters(params), self._method(method)
         q, qd = self._state(*initial_state_for_parameters(self, q0, qd0, p))
         h = self.h if h is None else as_step_size(h, self.dtype)

@@ -23,13 +23,36 @@ class Statics(Constrained):
         f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(tau, lambda): what drives give in a motion, (nq,), and the multipliers, (nc,).
+        """Return the actuator forces and the multipliers that a motion requires.
 
-        tau + A^T lambda is `inverse_dynamics` less friction and the scene's other forces at
-        inputs of 0. drives: the coordinates along which they act, all where None; tau is 0 along
-        the others. As many drives as freedoms have one answer; of more the least is taken,
-        tau^T D^-1 tau. Raises ValueError where the drives can't give this motion, or constraints
-        don't allow qdd.
+        tau + A^T lambda equals `inverse_dynamics` minus friction and all other forces of the scene
+        at zero inputs. If there are more drives than degrees of freedom, the solution with the
+        smallest tau^T D^-1 tau is returned.
+
+        Parameters
+        ----------
+        q, qd, qdd : (nq,) or (n, nq) array_like
+            State and accelerations of the motion.
+        drives : sequence of str, optional
+            Coordinates along which actuators act; by default all. tau is 0 along the others.
+        f_ext : mapping or array_like, optional
+            External wrenches on frames, in the form of `wrenches` in `frame_forces`.
+        t, params
+            Time, s; parameters that differ from the scene's.
+
+        Returns
+        -------
+        tau : (nq,) or (n, nq) array
+            Actuator forces along the coordinates, N or N m.
+        multipliers : (nc,) or (n, nc) array
+            Lagrange multiplier of each constraint equation.
+
+        Raises
+        ------
+        ValueError
+            If the drives cannot produce this motion, or the constraints do not allow `qdd`.
+        MotionError
+            If D is not positive definite or a value is not finite.
         """
         which = actuated_coordinates(self, drives)
         force = self.inverse_dynamics(q, qd, qdd, f_ext, t=t, params=params)

@@ -35,7 +35,13 @@ STATUS_MESSAGES = {
 
 
 class MotionError(ArithmeticError):
-    """No acceleration or step exists at a state; `status` is the reason, as of a run."""
+    """No acceleration or step exists at a state.
+
+    Attributes
+    ----------
+    status : str
+        The reason, a status of a run: "singular", "not finite", "no convergence", "locked", ...
+    """
 
     def __init__(self, message: str, status: str) -> None:
         super().__init__(message)
@@ -50,7 +56,13 @@ class MotionError(ArithmeticError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a simulation; `run` is the run up to there."""
+    """KeyboardInterrupt (Ctrl-C) during a simulation.
+
+    Attributes
+    ----------
+    run : Run
+        The run up to the interruption.
+    """
 
     def __init__(self, run: Any) -> None:
         super().__init__(run.message)
@@ -65,7 +77,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def state_text(q: Array, qd: Array) -> str:
-    """Format a state for a message."""
+    """Return a state q, qd as text for a message, such as "q = [0.1 2.], qd = [0. 1.]"."""
 
     def text(x: Array) -> str:
         return np.array2string(x + 0.0, precision=6, threshold=12)  # no -0
