@@ -11,22 +11,31 @@ from eomc.emit.plain.parts import Named
 
 @dataclass(frozen=True)
 class AdaptiveTableau(Named):
-    """Coefficients and constants of adaptive steps.
+    """Coefficients and constants that the templates of adaptive steps share, as C literals.
 
     Attributes
     ----------
     method
         Prefix of the C names.
+    extent
+        Length of vectors of coordinates, as a C expression.
+    stages, c
+        Number of stages, and the nodes.
+    f, sqrt
+        Suffix of C literals of this precision, and the name of the C square root.
+    eps, tiny
+        The rounding unit, and a small positive number that avoids divisions by zero.
     powers
         Matrix from accelerations at the stages (rows) to coefficients of their polynomial.
     most
         Largest number of iterations over the stages.
     retry_after
-        Steps by Newton's method before fixed-point iteration is tried again.
+        Number of steps by Newton's method before fixed-point iteration is tried again.
     of_most, of_most_coarse
-        Least scale of coordinates and velocities, relative to the largest; for rounding errors.
+        Least scale of a coordinate or velocity, relative to the largest one: in general, and where
+        rounding errors are judged.
     unscaled
-        Number of trailing coordinates that only jumps change, which have no scale.
+        Number of trailing coordinates that only jumps change; they have no scale.
     """
 
     method: str
@@ -47,17 +56,49 @@ class AdaptiveTableau(Named):
 
 @dataclass(frozen=True)
 class Adaptive(AdaptiveTableau):
-    """c/adaptive.c.jinja and the four templates that it includes: a step with error control.
+    """Data for the template c/adaptive.c and the four that it includes: an adaptive step.
 
-    total: the sum of half[0], ... over half of the stages. lanes: macro before loops over stages.
-    top: matrix from accelerations at the stages (rows) to the last four Legendre coefficients.
-    weights: matrix to the increments of position and velocity. project: the call that projects the
-    end of a step, given as an increment, or as a state with `whole`. may_rest: whether time-
-    dependent forces may hold all bodies at rest; capped: the effect of rounding errors then.
-    corners: whether forces jump or have kinks; share: of the tolerance, for steps with them. ends:
-    weights of the values at both ends of a step. forces: accelerations at a state; slopes: their
-    derivatives, by finite differences with step `nudge`. eigenvalues, to_parts, from_parts: see
-    `Method.eigen`.
+    Attributes
+    ----------
+    lanes
+        Macro before loops over stages that the compiler is to vectorise; "" for none.
+    total
+        C expression for the sum of half[0], half[1], ..., the sums of pairs of stages.
+    top
+        Rows of the matrix from accelerations at the stages to the coefficients of the last four
+        Legendre polynomials, from which the error is estimated.
+    weights
+        Rows of weights of the stage accelerations in the increments of position and velocity.
+    timed, events, begins
+        Whether accelerations depend on time, whether there are events, and whether some events may
+        trigger at the start of a motion.
+    may_rest, capped, capped_now
+        Whether time-dependent forces may hold all bodies at rest, so that only rounding errors are
+        left; the function that then limits the scales of the error estimate; its call.
+    project, whole
+        C call that projects the end of a step onto the constraints ("" for none), and whether it
+        takes the state rather than the increment.
+    solve_stages, sweep, solve, solve_within
+        The function that solves for the stages, the call of one iteration in it, and the calls of
+        the function for a step and for the state within a step.
+    step, start, within
+        The function for the next step, the call of the accelerations at its start, and the function
+        for the state within a step (dense output).
+    corners, share
+        Whether forces jump or have kinks, and the fraction of the tolerance for steps with these.
+    fabs, longest, close
+        Name of the C function; largest number of initial time scales to which the least step size
+        is relative; number of least step sizes within which kinks count as repeated.
+    ends
+        Weights of the stage accelerations in the values of their polynomial at both ends of a step.
+    forces, forces_there, forces_here, forces_near
+        The function for the accelerations at a state, and its calls at the end of a step, at a
+        state, and at a perturbed state.
+    slopes, slopes_now, nudge
+        The function for the derivatives of the accelerations by finite differences, its call, and
+        the relative size of the differences.
+    eigenvalues, to_parts, from_parts
+        The three results of `Method.eigen`, for Newton's method.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -101,12 +142,23 @@ class Adaptive(AdaptiveTableau):
 
 @dataclass(frozen=True)
 class FixedSteps(Named):
-    """c/fixed_steps.c.jinja: steps of fixed size with event detection.
+    """Data for the template c/fixed_steps.c: steps of fixed size with event detection.
 
-    fixed, at: the next step, and the state within the last one. step: the call of the method
-    through a function pointer. inside: the call for the state within an adaptive step.
-    forces_before, forces_halfway, forces_after: calls of the accelerations at both ends and the
-    middle of a step. above: whether there are events of stick-slip friction.
+    Attributes
+    ----------
+    method, extent, stages, f, eps, fabs
+        As in `AdaptiveTableau`; fabs is the name of the C function.
+    timed, jumps, above
+        Whether accelerations depend on time, whether events make the state jump, and whether there
+        are events of stick-slip friction.
+    fixed, at
+        The functions for the next step and for the state within the last step.
+    inside
+        C call for the state within an adaptive step.
+    step
+        C call of the integration method through the function pointer memory->step.
+    forces_before, forces_halfway, forces_after
+        C calls of the accelerations at the start, the middle and the end of a step.
     """
 
     TEMPLATE: ClassVar[str] = "c/fixed_steps.c"
@@ -130,14 +182,55 @@ class FixedSteps(Named):
 
 @dataclass(frozen=True)
 class Events(Named):
-    """c/events.c.jinja: event detection in adaptive steps.
+    """Data for the template c/events.c: event detection in a step, and state jumps.
 
-    samples, nodes: number and positions of evaluations in a step. slopes: matrix from values at the
-    nodes to derivatives. last: weights of the last Chebyshev coefficients. max_tail: largest such
-    coefficient relative to the largest value; above it, a step is halved, at most `halvings` times
-    besides one step in `recent_steps`. max_events: largest number of events in a step.
-    difference_step, near, close: fractions of a step. chance: fraction of the time between jumps
-    below which the next jump counts as coincidental.
+    Attributes
+    ----------
+    method, fabs, sqrt, eps, tiny, huge
+        Prefix of C names, names of C functions, and constants.
+    samples, nodes, slopes
+        Number and positions (fractions of the step) of the evaluations of an event function in a
+        step, and the matrix from these values to the derivatives at the same positions.
+    stages, once, twice
+        Number of stages; integrals of the powers of time up to each node, taken once and twice.
+    directions, actions, above
+        For each event: -1, 0 or 1 for falling, both or rising; 0, 1 or 2 for record, stop or jump;
+        1 if its function cannot become negative immediately after it was zero.
+    jumps
+        Whether events make the state jump.
+    max_events, together
+        Largest number of events in one step, and of jumps at the same time.
+    difference_step, near, close
+        Tolerances as fractions of a step: for finite differences, for corrections of a root, and
+        for an accurate root.
+    chance
+        Fraction of the time between jumps below which the next jump counts as coincidental.
+    halvings, recent_steps
+        A step is halved at most `halvings` times to resolve event functions, not counting one
+        halving in every `recent_steps` steps.
+    max_tail, last
+        Largest size of the last Chebyshev coefficients of a resolved event function, relative to
+        its largest value, and the weights that compute these coefficients.
+    rounding, rounded, values_near
+        The function for the rounding error of an event function, its call, and the call in it.
+    evaluate_events, refine_root, find_root, event_step, changed, restart
+        The functions: event functions within a step, root between two times, first root in a step,
+        all events of a step, changes by new inputs, and the start after an event.
+    values, values_there, values_end, values_now, values_before, values_after
+        C calls of the event functions: in `evaluate_events`, at a state within the step, at its
+        end, in `changed`, and before and after a jump.
+    look_value, look_before, look_after, bracket, bracket_dip, cross, inside
+        C calls of `evaluate_events` at a time and shortly before and after it, of `refine_root` up
+        to a node and up to a minimum, of `find_root`, and of the state within a step.
+    jump, project, project_all
+        C calls of the jump map, and of the projection onto the constraints with and without fixed
+        entries; "" for none.
+    set
+        For each event of the scene, 1 for the entries of q and qd that its jump sets, else 0.
+    modes
+        Initialisers with the indices of each friction mode and of its coordinate.
+    own
+        Number of events that the scene itself defines; the others belong to friction.
     """
 
     TEMPLATE: ClassVar[str] = "c/events.c"
@@ -199,7 +292,11 @@ class Events(Named):
 
 @dataclass(frozen=True)
 class InitialEvents(Named):
-    """c/initial_events.c.jinja: events at the start of a motion."""
+    """Data for the template c/initial_events.c: events that trigger at the start of a motion.
+
+    function: prototype of the static function. values: C call of the functions that are positive
+    for events that trigger. restart: C call that makes the jump. method: prefix of C names.
+    """
 
     TEMPLATE: ClassVar[str] = "c/initial_events.c"
     function: CFunction
@@ -210,7 +307,34 @@ class InitialEvents(Named):
 
 @dataclass(frozen=True)
 class AdaptiveRun(Named):
-    """c/adaptive_run.c.jinja: the loop over adaptive steps, rows and events."""
+    """Data for the template c/adaptive_run.c: a run by adaptive steps, with its rows and events.
+
+    A row is one stored state of the run, at one of the requested times.
+
+    Attributes
+    ----------
+    constants, compute_constants
+        Whether precomputed expressions of the parameters are a struct, and the C call that computes
+        it ("" for none).
+    unread_p
+        Whether the parameters are an argument that the body does not use.
+    loosest, tightest
+        Largest and smallest tolerance.
+    events, max_events
+        Whether there are events, and their largest number in one step.
+    recent_steps, retry_after
+        As in `Events` and `AdaptiveTableau`.
+    initial_events, changed, happen, restart, values
+        C calls: jumps at the start, changes of event functions by new inputs, detection of events
+        in a step, the start after an event, and the event functions; "" for none.
+    run, advance, fixed
+        Prototype of the public function, and C calls of an adaptive step and of a fixed step.
+    row, row_before, look
+        C calls that store a row: the state at the end of a step, the state before a jump, and the
+        state within a step.
+    project_row, project_restart
+        C calls that project a row and the state after an event onto the constraints; "" for none.
+    """
 
     TEMPLATE: ClassVar[str] = "c/adaptive_run.c"
     method: str
@@ -244,7 +368,11 @@ class AdaptiveRun(Named):
 
 @dataclass(frozen=True)
 class AdaptiveBatch:
-    """c/adaptive_batch.c.jinja: instances one after the other. alone: the call for one."""
+    """Data for the template c/adaptive_batch.c: many instances, stepped one after the other.
+
+    batch: prototype of the public function. alone: the C call that steps instance k. events:
+    whether the scene has events.
+    """
 
     TEMPLATE: ClassVar[str] = "c/adaptive_batch.c"
     prefix: str

@@ -11,28 +11,43 @@ from eomc.emit.plain.parts import Computed, Named
 
 @dataclass(frozen=True)
 class Projection:
-    """c/projection.c.jinja: projection of a step's end onto the constraints.
+    """Data for the template c/projection.c: projection of the end of a step onto the constraints.
 
     Attributes
     ----------
     L, lane, mask
-        Suffix of C names ("" for one number), type and failure type of the lane.
+        The template is printed for one instance and for a lane, a vector register with one value of
+        each of several instances. L: suffix of C names ("" for one instance); lane: C type of a
+        value; mask: C type of failures.
+    extent, size
+        Length of vectors of coordinates, as a C expression, and number of results of `projection`.
     increments
-        Whether r and v are increments of a step.
-    near, scale_floor
-        Squares of the relative correction above which it is large, and of the least scale of a
-        coordinate, relative to all.
+        Whether the arguments r and v are increments of a step rather than the state at its end.
+    projection, call
+        The function that computes corrections of q and q̇ and the inverse pivots of the constraint
+        equations, and its C call.
+    function
+        Prototype of the function that applies these corrections.
     rate_terms, rate_terms_call, rows
-        Rates of constraints that may be dropped, and their number.
+        The function for the rates of constraint equations that may be dropped as dependent, its C
+        call, and the number of these equations.
     tolerance, part
-        Largest rate of a dropped constraint, relative to the largest terms and to its own terms.
+        Largest rate of a dropped constraint equation, relative to the largest terms of all
+        equations and to its own terms.
+    near, scale_floor
+        Square of the relative correction above which it counts as large, and square of the least
+        scale of a coordinate, relative to all.
+    crossed
+        Bound on the product of the squared relative corrections of q and q̇; above it, another
+        correction is made.
     little, slight, rounded
-        Squares that bound corrections near a singular configuration, of coordinates and velocities,
-        and below which a correction of a coordinate may be rounding.
+        Squares of relative corrections: bounds for coordinates and for velocities near a singular
+        configuration, and the bound below which a correction of a coordinate may be rounding.
     sines, sines_call
-        Type of sines that a caller may supply, and the call that computes them at `at`.
+        C type of the sines and cosines that a caller may supply ("" for none), and the C call that
+        computes them.
     onto
-        The projection of a stage, for iterated stages.
+        The function that projects a stage of an iterated step to first order; None if not needed.
     """
 
     TEMPLATE: ClassVar[str] = "c/projection.c"
@@ -66,38 +81,48 @@ class Projection:
 
 @dataclass(frozen=True)
 class Project(Named):
-    """c/project.c.jinja: projection of a state onto the constraints.
+    """Data for the template c/project.c: the public projection of a state onto the constraints.
 
     Attributes
     ----------
+    count, holonomic
+        Number of constraint equations, and of holonomic ones.
+    function
+        Prototype of the function.
+    call_D, call_A, call_phi, call_rates
+        C calls of the mass matrix, the constraint Jacobian, the residuals and their rates.
     dependent
-        Fraction of a gradient's square below which a constraint depends on others.
+        Fraction of a gradient's square below which a constraint equation depends on others.
     small, enough
         Squares of relative changes of q that are rounding errors, and of sufficiently small
         residuals.
     tolerance, rounded
-        Fractions of a rate's terms, and of residuals and rates below which the state is unchanged.
+        Largest residual of a projected state, and largest residual of a state that is left
+        unchanged, both relative to the terms of the constraint equation.
     redundant
-        Constraints that others imply.
+        Indices of constraint equations that others imply.
     weights
-        Initialiser of the weights of constraints where D alone is singular.
+        C initialiser of the weights of the constraint equations that are added to D where D alone
+        is singular; "" for none.
     sums, sum_places
-        Initialisers of sums of constraints, and the constraints that they replace.
+        C initialisers of the sums of constraint equations that replace dependent equations, and the
+        indices of the equations that they replace.
     pinned
         Whether coordinates may have neither inertia nor a holonomic constraint.
     errors
-        The function of the rotation errors of loops, if there are any.
+        The function of the rotation errors of closed loops; None if there are no such loops.
     error_rows, error_ends
-        Constraints that have a rotation error, and the ends of each loop's part of them.
+        Indices of the constraint equations that have a rotation error, as a C initialiser, and
+        where the indices of each loop end in it.
     rotated, call_rotated, call_turn
-        The function that replaces these residuals by rotation vectors, its call, and its call
+        The function that replaces these residuals by rotation vectors, its C call, and its C call
         without gradients.
     searched, starts
         Whether random starts are tried if the search from a state fails, and their number.
     converged
         Square of the last change towards the nearest state, relative to that of its distance.
     half_turn
-        The squared cosine of half an angle, below which a rotation counts as half a turn.
+        Squared cosine of half an angle below which a rotation counts as half a turn.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"

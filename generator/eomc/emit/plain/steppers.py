@@ -42,9 +42,10 @@ MAX_ITERATIONS = {True: 50, False: 60}  # over the stages, with Newton's method 
 def files(
     program: Program, show: Show, real: Real | None = None, rooms: Sequence[int] = ()
 ) -> dict[str, str]:
-    """Return header and source of portable C by file name.
+    """Return the header and the source of a program in portable C, as texts by file name.
 
-    real: the type of numbers, the scene's by default. rooms: see `header`.
+    show: renders template data ("views") as text. real: the C type of numbers; by default that of
+    the scene. rooms: see `header`.
     """
     plain = portable_functions(program, real)
     name = plain.prefix
@@ -80,10 +81,13 @@ def header(
     rooms: Sequence[int],
     fast: bool = False,
 ) -> Header:
-    """Return the view of the header.
+    """Return the data for the template of the C header.
 
-    rooms: the workspace size of each method in optimised C, and of adaptive steps. Portable C
-    reserves the same space, so that a program compiled with one header runs with both forms.
+    slopes: data of the derivatives of the accelerations; None if the scene does not need them.
+    stamp: number that the source compares with its own, to detect a header of another build. rooms:
+    the workspace size, in numbers, of each method in optimised C and then of adaptive steps; 0 for
+    the default. Portable C reserves the same space, so that a program compiled with one header runs
+    with both forms. fast: whether the header belongs to the optimised C.
     """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
@@ -129,7 +133,11 @@ def header(
 
 
 def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) -> dict[str, Any]:
-    """Return the fields that the source views of both forms share, except for the methods."""
+    """Return the template fields that the C sources of both forms share, by name of the field.
+
+    The forms are portable and optimised C. All fields of `AnySource` are included except
+    `steppers`. Arguments as in `header`; show renders template data as text.
+    """
     target, s = functions.target, functions.target.system
     return {
         "title": FreeText(s.title),
@@ -151,7 +159,10 @@ def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) 
 
 
 def linearization(plain: Functions) -> Slopes | None:
-    """Return the view of A_q, A_qd and B; None where the program has none."""
+    """Return the template data for the derivatives of the accelerations: A_q, A_qd and B.
+
+    These are ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂u. None if the program does not contain them.
+    """
     target = plain.target
     function = evaluations.source(target, "linearization")
     if function is None:
@@ -214,7 +225,7 @@ def _about(m: Method) -> tuple[str, ...]:
 
 
 def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
-    """Return the view of one step."""
+    """Return the template data for the C function that makes one step of the method `m`."""
     if m.implicit:
         return _gauss(plain, m)
     accelerate, step = plain.acceleration.function.call, plain.public.step(m.name)
@@ -260,7 +271,7 @@ def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
 
 
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
-    """Return the view of functions that implicit methods share."""
+    """Return the template data for the C functions that the implicit ones among `methods` share."""
     real, accelerate = plain.target.real, plain.acceleration.function.call
     newton = any(m.newton for m in methods)
     return Implicit(
@@ -359,7 +370,10 @@ def _adaptive(plain: Functions) -> list[View]:
 
 
 def loop(plain: Functions, m: Method) -> Loop:
-    """Return the view of a method's step, run and batch."""
+    """Return the template data for the C functions that make many steps by the method `m`.
+
+    These are the run of one instance and the batch of many.
+    """
     NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)
     one = stepper(plain, m)

@@ -21,7 +21,10 @@ from eomc.emit.plain.parts import Computed, Named, Tableau
 
 @dataclass(frozen=True)
 class Indexed:
-    """A coordinate, input or output: enumerator, unit and note."""
+    """A coordinate, input, output, constraint or event, as an enumerator in the C header.
+
+    enum: the name of the C enumerator. words: unit and note of the scene, for the comment.
+    """
 
     enum: str
     words: FreeText
@@ -29,7 +32,11 @@ class Indexed:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter: name, the scene's value as a literal, unit and note."""
+    """A parameter of the scene, as a member of the parameter struct in the C header.
+
+    name: the C name. value: the scene's value as a C literal. words: unit and note of the scene,
+    for the comment.
+    """
 
     name: str
     value: str
@@ -38,7 +45,23 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """A method in the header: step, run, batch and derivative. workspace: its length."""
+    """The functions of one integration method, as declared in the C header.
+
+    Attributes
+    ----------
+    name, title
+        The method's name in C names, and its title in comments.
+    implicit
+        Whether the method is implicit.
+    workspace
+        Length of the workspace of a run, in numbers.
+    step, run, batch
+        Prototypes of the functions for one step, for many steps, and for many instances; `batch` is
+        None if the scene does not request it.
+    derivative
+        Prototype of the function for the derivatives of a step by the state and the inputs; None if
+        the scene does not request it.
+    """
 
     name: str
     title: str
@@ -52,11 +75,22 @@ class Declared:
 
 @dataclass(frozen=True)
 class AdaptiveDeclared:
-    """Adaptive steps in the header.
+    """The functions of adaptive step-size control, as declared in the C header.
 
-    memory, workspace: C type of the workspace and its length. together: whether optimised C steps
-    many instances in parallel. fixed: the function type of fixed steps with event detection, for
-    scenes with events.
+    Attributes
+    ----------
+    title
+        The method's title in comments.
+    memory, workspace
+        C type of the workspace of a run, and its length in numbers.
+    run, batch
+        Prototypes of the functions for one instance and for many; `batch` is None if the scene does
+        not request it.
+    together
+        Whether the optimised C steps many instances of a batch in parallel.
+    fixed
+        C function type of a step of fixed size, which a run with event detection takes instead of
+        adaptive steps; None for scenes without events.
     """
 
     title: str
@@ -70,7 +104,29 @@ class AdaptiveDeclared:
 
 @dataclass(frozen=True)
 class Header(Named):
-    """c/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
+    """Data for the template c/header.h: the header of the generated C.
+
+    Attributes
+    ----------
+    stamp, notes, description
+        Lines of comments at the top.
+    handshake
+        Number by which the source detects the header of another build.
+    fast
+        Whether the header belongs to the optimised rather than the portable C.
+    implicit
+        Whether some steps are implicit, or adaptive.
+    timed
+        Whether steps take the time t as an argument.
+    functions, linearization, project
+        Prototypes of the functions of mechanics (such as D, energy and accelerations), of the
+        derivatives of the accelerations, and of the projection onto the constraints; None for those
+        that the scene does not have.
+    methods, adaptive
+        The integration methods with fixed steps, and with adaptive steps (None if not requested).
+    max_events
+        Largest number of events in one step.
+    """
 
     TEMPLATE: ClassVar[str] = "c/header.h"
     title: FreeText
@@ -98,7 +154,24 @@ class Header(Named):
 
 @dataclass(frozen=True)
 class AnySource(Named):
-    """Source of either form. slopes, steppers: rendered text of other views."""
+    """Data that the C sources of both forms share, the portable and the optimised one.
+
+    Attributes
+    ----------
+    stamp
+        Lines of the comment at the top.
+    handshake
+        Number that must be equal to the one in the header of the same build.
+    q0, qd0
+        Initial coordinates and velocities, as C literals.
+    evaluations, acceleration
+        The functions of mechanics, and the function for the accelerations.
+    solved
+        Lines of a comment that says how the accelerations are solved for.
+    slopes, steppers
+        C text for the derivatives of the accelerations ("" for none), and for the steps and runs of
+        each method: the rendered text of other templates.
+    """
 
     title: FreeText
     stamp: tuple[FreeText, ...]
@@ -116,7 +189,10 @@ class AnySource(Named):
 
 @dataclass(frozen=True)
 class Source(AnySource):
-    """c/plain/source.c.jinja."""
+    """Data for the template c/plain/source.c: the source file of the portable C.
+
+    adaptive: whether it contains adaptive steps.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/source.c"
     adaptive: bool
@@ -124,7 +200,23 @@ class Source(AnySource):
 
 @dataclass(frozen=True)
 class Slopes(Named):
-    """c/slopes.c.jinja. width: of a row [da/dq, da/dqd, da/du]. unread: unused arguments."""
+    """Data for the template c/slopes.c: derivatives of the accelerations by q, q̇ and u.
+
+    Attributes
+    ----------
+    inputs
+        Whether the scene has inputs u.
+    width
+        Length of one row [da/dq, da/dqd, da/du], as a C expression.
+    slopes
+        The static function that computes all rows.
+    linearization
+        Prototype of the public function, which splits the rows into A_q, A_qd and B.
+    unread
+        Names of arguments of the public function that its body does not use.
+    signal_call, slopes_call
+        C calls of the scene's signals for u ("" if they are not needed) and of `slopes`.
+    """
 
     TEMPLATE: ClassVar[str] = "c/slopes.c"
     inputs: bool
@@ -138,14 +230,36 @@ class Slopes(Named):
 
 @dataclass(frozen=True)
 class Derivative(Tableau):
-    """c/derivative.c.jinja: of a step by a tableau. rates, eliminate: what methods share.
+    """Data for the template c/derivative.c: derivatives of one step by q, q̇ and u.
 
-    width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
-    projection, moved: under constraints how rows move a state, shared too, and what moves a step's
-    end by that; near, scale_floor: as in Projection. start, stage: calls of accelerations.
-    converged, tolerance: relative corrections of velocities below which the stages are accepted,
-    without and with a stagnating iteration; other: relative difference of the ends of two steps
-    with different stages.
+    Attributes
+    ----------
+    inputs, width
+        Whether there are inputs u, and the number of variables in q, q̇ and u, as a C expression.
+    rates, eliminate, projection
+        Functions that all methods share, so that only one method prints them: the derivatives of
+        the accelerations, Gaussian elimination, and the correction onto the constraints with its
+        directional derivative.
+    linearization, feedback
+        C calls of the derivatives of the accelerations, and of the derivatives of the signals (""
+        if the signals do not depend on the state).
+    moved, projection_call, move
+        For scenes with constraints: the function that projects the end of a step and its
+        derivatives onto the constraints, the call of `projection` in it, and the call of `moved`.
+    near, scale_floor
+        Tolerances of that correction, as in `Projection`.
+    function, implicit, stages
+        Prototype of the function, whether the method is implicit, and its number of stages.
+    step, start, stage, rates_call
+        C calls of the step, of the accelerations at its start and at a stage, and of `rates`.
+    converged, tolerance
+        Largest relative correction of velocities with which the stages of an implicit method are
+        accepted: in general, and when Newton's iteration does not reduce it further.
+    other
+        Largest relative difference between the end of the step itself and the end that follows from
+        the stages computed here; if it is exceeded, the function fails.
+    most
+        Largest number of Newton iterations.
     """
 
     TEMPLATE: ClassVar[str] = "c/derivative.c"
@@ -179,10 +293,22 @@ class Derivative(Tableau):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named):
-    """c/plain/rk4.c.jinja: the calls of the four accelerations.
+    """Data for the template c/plain/rk4.c: one step of the classical Runge-Kutta method.
 
-    advance: the step, which under constraints also tells whether a row has no multiplier behind it;
-    correct: the call that moves its end onto the constraints.
+    Attributes
+    ----------
+    about
+        Lines of the comment above the function.
+    step
+        Prototype of the public function.
+    advance, advance_call
+        The function that makes the step, and its C call. With constraints it is a static function
+        that also reports a constraint equation without multiplier (singular configuration); without
+        constraints it is `step`.
+    correct
+        C call that projects the end of the step onto the constraints; "" without constraints.
+    first, second, third, fourth
+        C calls of the accelerations at the four stages.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/rk4.c"
@@ -199,9 +325,10 @@ class RungeKutta4(Named):
 
 @dataclass(frozen=True)
 class Explicit(Tableau):
-    """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations.
+    """Data for the template c/plain/explicit.c: one step of an explicit Runge-Kutta method.
 
-    advance, correct: as of RungeKutta4.
+    about, step, advance, advance_call, correct: as in `RungeKutta4`. stages: the number of stages.
+    stage: the C call of the accelerations at stage i.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/explicit.c"
@@ -216,9 +343,19 @@ class Explicit(Tableau):
 
 @dataclass(frozen=True)
 class Implicit(Named):
-    """c/plain/implicit.c.jinja: what implicit methods share, and what adaptive steps take of it.
+    """Data for the template c/plain/implicit.c: functions that all implicit methods share.
 
-    here, near: calls of accelerations.
+    Attributes
+    ----------
+    nudge
+        Relative step of finite differences.
+    corrections, factors, newton
+        Which functions are needed: the size of corrections of the stages, LU factorisation, and
+        derivatives of the accelerations by finite differences.
+    slopes
+        Prototype of the function for these derivatives.
+    here, near
+        C calls of the accelerations at the state and at a perturbed state.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/implicit.c"
@@ -236,9 +373,29 @@ class Implicit(Named):
 
 @dataclass(frozen=True)
 class Gauss(Tableau):
-    """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with.
+    """Data for the template c/plain/gauss.c: one step of a Gauss method, solved by iteration.
 
-    onto: the call that moves a stage onto constraints, of methods that find stages by sweeps alone.
+    Attributes
+    ----------
+    method
+        Prefix of the method's C names.
+    newton
+        Whether Newton's method is used where fixed-point iteration converges too slowly.
+    sweeps
+        Largest number of iterations.
+    eps, tenth, half
+        C literals: the rounding unit, 0.1 and 0.5.
+    stages_function, matrix, solve, step
+        Functions for the accelerations at all stages, for the factors of Newton's matrix, for the
+        solution of the step, and the public function.
+    about
+        Lines of the comment above the step.
+    stage, slopes_call, start, sweep, matrix_start, matrix_mid, solve_call
+        C calls: the accelerations at stage i, their derivatives, the accelerations at the start,
+        `stages_function`, `matrix` at the start and at the middle of the step, and `solve`.
+    onto, correct
+        C calls that project a stage and the end of the step onto the constraints; "" for none. Only
+        methods without Newton's method project stages.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/gauss.c"
@@ -268,9 +425,11 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Nodes(Named):
-    """c/plain/nodes.c.jinja: a sweep over the stages of a method, as adaptive steps take it.
+    """Data for the template c/plain/nodes.c: one fixed-point iteration over the stages of a method.
 
-    onto: the call that moves a stage onto constraints, where there are.
+    Adaptive steps in portable C call it. c, A, AA: nodes and coefficients as in `Tableau`. sweep:
+    prototype of the function. stage: C call of the accelerations at stage i. onto: C call that
+    projects that stage onto the constraints; "" without constraints.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/nodes.c"
@@ -287,7 +446,12 @@ class Nodes(Named):
 
 @dataclass(frozen=True)
 class Loop(Named):
-    """c/plain/run.c.jinja: run and batch of one method, and the calls in them."""
+    """Data for the template c/plain/run.c: the functions for many steps and for many instances.
+
+    run, batch: prototypes of the two functions; `batch` is None if the scene does not request it.
+    one_step, run_one: the C calls of one step in `run`, and of `run` in `batch`. implicit,
+    constrained: whether the method is implicit and whether the scene has constraints.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/run.c"
     implicit: bool
