@@ -13,9 +13,11 @@ from eomc.emit.plain.views import AnySource
 
 @dataclass(frozen=True)
 class Library:
-    """A function of the mathematics library over a lane. two: whether it has two arguments.
+    """A function of the C mathematics library, to be wrapped for a lane.
 
-    whole: a single AVX-512 instruction for it over a register, or "".
+    A *lane* is a vector register with one value of each of several instances. name: ending of the
+    wrapper's C name. c: name of the library function. two: whether it has two arguments. whole: the
+    single AVX-512 instruction for a whole register, as C text, or "".
     """
 
     name: str
@@ -26,7 +28,23 @@ class Library:
 
 @dataclass(frozen=True)
 class Source(AnySource):
-    """c/fast/source.c.jinja. lanes: finished texts of the views below."""
+    """Data for the template c/fast/source.c: the source file of the optimised C.
+
+    Attributes
+    ----------
+    rolled
+        Whether loops over coordinates are left to the compiler to vectorise, not unrolled.
+    unroll, inline
+        Macros before loops over coordinates and before inlined functions.
+    extent
+        Length of vectors of coordinates, as a C expression.
+    wide
+        Whether the code uses vector registers with values of several instances.
+    csrc
+        Texts of the hand-written C that this scene needs.
+    lanes
+        Finished C texts of the accelerations, for one number and for vector registers.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/source.c"
     rolled: bool
@@ -40,7 +58,13 @@ class Source(AnySource):
 
 @dataclass(frozen=True)
 class Laned:
-    """Common fields of code over a lane: its type, the type of failures, the suffix of C names."""
+    """Fields that select the type of numbers for which a template is printed.
+
+    The *lane* type is one number, or a vector register with one value of each of several instances.
+
+    inline: macro before inlined functions. lane: C type of a value. mask: C type of failures. L:
+    suffix of C names, "" for one number.
+    """
 
     inline: str
     lane: str
@@ -50,7 +74,7 @@ class Laned:
 
 @dataclass(frozen=True)
 class Driven:
-    """Whether steps read the time, inputs, and constants of the parameters."""
+    """Whether steps read the time t, inputs u, and precomputed expressions of the parameters."""
 
     timed: bool
     inputs: bool
@@ -59,7 +83,10 @@ class Driven:
 
 @dataclass(frozen=True)
 class LibraryText(Prefixed, Laned):
-    """c/fast/library.c.jinja: the library's functions over a lane. count: numbers in it, in C."""
+    """Data for the template c/fast/library.c: mathematical functions for a vector register.
+
+    count: number of values in the register, as a C expression. calls: the functions.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/library.c"
     count: str
@@ -68,10 +95,35 @@ class LibraryText(Prefixed, Laned):
 
 @dataclass(frozen=True)
 class LaneText(Laned):
-    """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text.
+    """Data for the template c/fast/lane.c: the accelerations for one lane type, see `Laned`.
 
-    across: angles go into registers of four together.
-    signal_call: where accelerations have to find the signals.
+    Attributes
+    ----------
+    unroll, clear
+        Macro before loops over angles, and initialiser for "no failure".
+    constants
+        C text of the struct of precomputed expressions and of the function that computes it.
+    angles, count
+        Length of arrays of angles as C text ("" without angles), and the number of angles.
+    across
+        Whether the sines of four angles are computed in one register.
+    angles_at, changes
+        The functions for the angles at q, and for their change with a change of q.
+    sincos
+        Name of the C function for sine and cosine of one angle.
+    signal, signal_call
+        The function for the scene's signals (None without signals), and its C call in the
+        accelerations ("" if all callers supply the inputs).
+    rates, rates_call
+        C text of the accelerations from the state, its sines and the inputs, and the C call of that
+        function.
+    accelerations
+        Prototype of the function that computes signals and sines too, where they are not supplied.
+    two_point, takes_c
+        Whether the accelerations are split into two parts, see `TwoPoints`, and whether these read
+        precomputed expressions.
+    alone
+        Whether some caller does not supply the sines.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/lane.c"
@@ -98,7 +150,11 @@ class LaneText(Laned):
 
 @dataclass(frozen=True)
 class Blocks:
-    """c/fast/blocks.c.jinja: instances of a batch that are stepped together."""
+    """Data for the template c/fast/blocks.c: a tile, the instances of a batch that step together.
+
+    lane: C type of a vector register. inputs: whether there are inputs. constants: C type of the
+    precomputed expressions, or "". blocks: number of vector registers in a tile.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/blocks.c"
     prefix: str
@@ -111,7 +167,26 @@ class Blocks:
 
 @dataclass(frozen=True)
 class TwoPoints(Prefixed):
-    """c/fast/two_point.c.jinja. coordinates: whether the configuration reads q itself."""
+    """Data for the template c/fast/two_point.c: accelerations in two parts, for long accelerations.
+
+    The position-dependent part is computed at two configurations in one register, the
+    velocity-dependent part at one of them.
+
+    Attributes
+    ----------
+    extent, inline
+        Length of vectors of coordinates as C text, and the macro before inlined functions.
+    members
+        C definition of the struct with the values that the first part hands to the second one.
+    angles
+        Length of arrays of angles as C text.
+    configuration, velocity
+        The functions for the two parts.
+    constants
+        Whether there are precomputed expressions of the parameters.
+    call
+        C call of `configuration`.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/two_point.c"
     extent: str
@@ -126,7 +201,34 @@ class TwoPoints(Prefixed):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named, Laned, Driven):
-    """c/fast/rk4.c.jinja. across: angles go into registers of four together."""
+    """Data for the template c/fast/rk4.c: a step of the classical Runge-Kutta method, for a lane.
+
+    Attributes
+    ----------
+    unroll, extent, noinline
+        Macro before loops over coordinates, length of vectors of coordinates as C text, and macro
+        before functions that are not inlined.
+    constants_type
+        C type of the precomputed expressions.
+    title, source, stability
+        Title, reference and stability limits of the method, for comments.
+    angles, across, sincos
+        As in `LaneText`.
+    largest, small
+        Largest angles, in rad, by which sines and cosines are rotated from one stage to another: in
+        general, and for corrections.
+    shared_signals
+        Whether the signals depend on time only, so that they are computed once for several stages.
+    signal_call, signal_now
+        C calls of the signals at the three times of a step, and at one stage; "" for none.
+    two_point, velocity_call
+        Whether the accelerations are split into two parts, see `TwoPoints`, and the C call of the
+        velocity-dependent part.
+    stage_call
+        C call of the whole accelerations at a stage.
+    corrected
+        Whether the step returns the sines and cosines at its end for the projection.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
     unroll: str
@@ -152,7 +254,11 @@ class RungeKutta4(Named, Laned, Driven):
 
 @dataclass(frozen=True)
 class Predictions(Prefixed):
-    """c/fast/predictions.c.jinja: sines and cosines at predicted angles, and near them."""
+    """Data for the template c/fast/predictions.c: sines and cosines at predicted angles.
+
+    The angles of the next step of RK4 are extrapolated, and their sines computed in advance.
+    angles: number of angles. unroll, inline: macros before loops and before inlined functions.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/predictions.c"
     unroll: str
@@ -162,7 +268,20 @@ class Predictions(Prefixed):
 
 @dataclass(frozen=True)
 class Predicted(Named, Driven):
-    """c/fast/predicted.c.jinja. stage: the calls of the four stages."""
+    """Data for the template c/fast/predicted.c: RK4 as long as predicted angles are accurate.
+
+    Attributes
+    ----------
+    angles
+        Number of angles.
+    shared_signals
+        Whether the signals depend on time only, so that they are computed once for several stages.
+    signal_first, signal_mid, signal_end
+        C calls of the signals at the start of the first step, and at the middle and the end of a
+        step; "" for none.
+    stage
+        C calls of the four stages.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
     unroll: str
@@ -177,7 +296,11 @@ class Predicted(Named, Driven):
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of an explicit method: its node, the sums over earlier ones, its call."""
+    """C text of one stage of an explicit Runge-Kutta method.
+
+    node: the fraction of the step at which the stage lies, or "" at its start. positions,
+    velocities: the sums over accelerations of earlier stages. call: the call of the accelerations.
+    """
 
     node: str
     positions: str
@@ -187,7 +310,21 @@ class Stage:
 
 @dataclass(frozen=True)
 class Explicit(Prefixed, Laned, Driven):
-    """c/fast/explicit.c.jinja."""
+    """Data for the template c/fast/explicit.c: a step of an explicit method except RK4.
+
+    Attributes
+    ----------
+    unroll, extent
+        Macro before loops over coordinates, and length of vectors of coordinates as C text.
+    clear, constants_type
+        Initialiser for "no failure", and C type of the precomputed expressions.
+    name, title, source, order, notes, stability
+        Name of the method in C, and what comments say about it.
+    stages
+        The stages.
+    position, velocity
+        C text of the sums over the stages in the increments of position and velocity.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/explicit.c"
     unroll: str
@@ -207,7 +344,10 @@ class Explicit(Prefixed, Laned, Driven):
 
 @dataclass(frozen=True)
 class Factors(Prefixed):
-    """c/fast/lu.c.jinja."""
+    """Data for the template c/fast/lu.c: LU factorisation, and solution with the factors.
+
+    fabs: name of the C function for |x|. f: suffix of C literals.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/lu.c"
     fabs: str
@@ -216,7 +356,36 @@ class Factors(Prefixed):
 
 @dataclass(frozen=True)
 class Gauss(Tableau):
-    """c/fast/gauss.c.jinja: tableau, functions, calls. f: the suffix of literals."""
+    """Data for the template c/fast/gauss.c: one step of a Gauss method with Newton's method.
+
+    Attributes
+    ----------
+    extent, f, fabs, eps
+        Length of vectors of coordinates as C text, suffix of C literals, name of the C function,
+        and the rounding unit.
+    nudge
+        Relative step of finite differences.
+    title, source, order, notes
+        What comments say about the method.
+    stages, extrapolation
+        Number of stages, and rows of the matrix that extrapolates the accelerations of the stages
+        of one step to those of the next.
+    width
+        Length of one row [da/dq, da/dqd, da/du], as a C expression.
+    factor, factor_unread
+        Prototype of the function that computes the factors of Newton's matrix, and the names of its
+        arguments that its body does not use.
+    signal_call, follows
+        C calls of the scene's signals at the state, and at a perturbed state; "" for none.
+    slopes_call
+        C call of the derivatives of the accelerations.
+    solve
+        Prototype of the function for the step.
+    factor_now, factor_mid
+        C calls of `factor` with derivatives at the start and at the middle of the step.
+    start, stage
+        C calls of the accelerations at the start and at a stage.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/gauss.c"
     extent: str
@@ -245,10 +414,27 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Stages(Named):
-    """c/fast/stages.c.jinja: tableau, functions, calls. padded: stages, to whole registers.
+    """Data for the template c/fast/stages.c: one iteration over the stages of a Gauss method.
 
-    onto: the call that moves a stage onto constraints, where there are. extrapolated: A and A A
-    over the accelerations of the step before, where a method takes them.
+    The stages are computed side by side in vector registers.
+
+    Attributes
+    ----------
+    members
+        Names of the precomputed expressions.
+    stages, padded, c
+        Number of stages, the same rounded up to whole registers, as C text, and the nodes.
+    within
+        Rows of the transposes of A and A A, which weight the accelerations of the same step.
+    extrapolated
+        The same for the accelerations of the step before, which are extrapolated as a polynomial;
+        None for methods of adaptive steps only.
+    sweep
+        Prototype of the function for an iteration.
+    together, alone
+        C calls of the accelerations at all stages of a register, and at one stage.
+    onto
+        C call that projects a stage onto the constraints; "" without constraints.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/stages.c"
@@ -270,7 +456,34 @@ class Stages(Named):
 
 @dataclass(frozen=True)
 class Sweeps(Named):
-    """c/fast/sweeps.c.jinja: tableau, functions, calls."""
+    """Data for the template c/fast/sweeps.c: a step of a method with a fixed number of iterations.
+
+    Attributes
+    ----------
+    f, fabs, eps
+        Suffix of C literals, name of the C function, and the rounding unit.
+    enough
+        Relative error of velocities below which the iterations of `settle` have converged, unless
+        they start anew.
+    tolerance
+        Relative change of velocities in the last iteration above which the step is solved by
+        `settle` instead.
+    name, title, source, notes, stability
+        Name of the method in C, and what comments say about it.
+    stages, sweeps, b, bA
+        Number of stages and of iterations, and the weights of the method.
+    settle, settle_call
+        Prototype of the function that iterates until convergence, and its C call.
+    sweep_settling, sweep_first, sweep_back, sweep_forth
+        C calls of one iteration: in `settle`, from the step before, and between two arrays in
+        either direction.
+    start
+        C call of the accelerations at the start.
+    solve
+        Prototype of the function for the step.
+    constrained
+        Whether the scene has constraints.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/sweeps.c"
     extent: str
@@ -302,7 +515,13 @@ class Sweeps(Named):
 
 @dataclass(frozen=True)
 class State(Named):
-    """c/fast/state.c.jinja: what a run of a method carries."""
+    """Data for the template c/fast/state.c: the struct with the state of a run by one method.
+
+    predicted, newton, sweeps: whether the run predicts angles, whether the method uses Newton's
+    method, and its fixed number of iterations (0 for none); they determine the members of the
+    struct. stages: number of stages. implicit, inputs, constrained: whether the method is implicit,
+    and whether the scene has inputs and constraints.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/state.c"
     extent: str
@@ -319,9 +538,32 @@ class State(Named):
 
 @dataclass(frozen=True)
 class Loop(Named, Driven):
-    """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts.
+    """Data for the template c/fast/run.c: the functions for one step and for a run of many steps.
 
-    project: the call that ends a step on the constraints, if there are.
+    Attributes
+    ----------
+    step, run
+        Prototypes of the two functions.
+    run_once
+        C call of `run` for one step.
+    unread_p
+        Whether the parameters are an argument that the body does not use.
+    compute_constants
+        C call that precomputes expressions of the parameters; "" for none.
+    newton, implicit, predicted
+        Whether the method uses Newton's method, is implicit, and predicts angles.
+    padded
+        Whether increments are initialised, because vectors are padded to whole registers.
+    start_call, predicted_call
+        C calls of the accelerations at the start, and of the steps with predicted angles.
+    advance, otherwise
+        C calls of one step, and of the step with all sines computed anew, if the first one fails
+        ("" if there is no difference).
+    project, project_again
+        C calls that project the end of the step onto the constraints, after `advance` and after
+        `otherwise`; "" without constraints.
+    corrected
+        Whether the step returns the sines and cosines at its end for the projection.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/run.c"
@@ -347,7 +589,33 @@ class Loop(Named, Driven):
 
 @dataclass(frozen=True)
 class Batch(Named, Driven):
-    """c/fast/batch.c.jinja. own: whether instances may have constants of their own."""
+    """Data for the template c/fast/batch.c: steps of many instances in vector registers.
+
+    Attributes
+    ----------
+    batch
+        Prototype of the function.
+    rk4, angles
+        Whether the method is RK4, and whether sines of angles are computed apart.
+    shared_signals
+        Whether the signals depend on time only, so that they are computed once for several stages.
+    members
+        Names of the precomputed expressions of the parameters.
+    unread_p
+        Whether the parameters are an argument that the body does not use.
+    own
+        Whether instances may have parameters, and so precomputed expressions, of their own.
+    compute_constants, compute_own
+        C calls that compute these expressions from the first parameters and from those of instance
+        k.
+    alone
+        C call of a step of one instance, for instances whose step fails in a register.
+    project, project_alone
+        C calls that project the end of a step onto the constraints, in a register and for one
+        instance; "" without constraints.
+    corrected
+        Whether the step returns the sines and cosines at its end for the projection.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/batch.c"
     extent: str
@@ -370,12 +638,26 @@ class Batch(Named, Driven):
 
 @dataclass(frozen=True)
 class AdaptiveLanes(AdaptiveTableau):
-    """c/fast/adaptive_lanes.c.jinja: adaptive steps of many instances side by side.
+    """Data for the template c/fast/adaptive_lanes.c: adaptive steps of many instances side by side.
 
-    max_roughness: in units of sqrt(tol/2); rougher steps are rejected after two iterations.
-    accelerate: call of the accelerations of all lanes at a stage; forces: that of one instance at
-    the start; alone: call that steps one instance; store_row, look: calls that write a row at the
-    end of a step, and within it.
+    Attributes
+    ----------
+    max_roughness
+        Largest error estimate, in units of sqrt(tol/2), after two iterations; a step that exceeds
+        it is rejected.
+    loosest, tightest
+        Largest and smallest tolerance.
+    inputs, constants, members
+        Whether there are inputs and precomputed expressions, and the names of the latter.
+    compute_constants, compute_own, own
+        As in `Batch`.
+    accelerate, forces
+        C calls of the accelerations of all instances in a register at a stage, and of one instance
+        at its start.
+    batch, alone
+        Prototype of the function, and C call that steps one instance.
+    store_row, look
+        C calls that store a row of the trajectory: at the end of a step, and within it.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"

@@ -85,9 +85,9 @@ def header(
 
     slopes: data of the derivatives of the accelerations; None if the scene does not need them.
     stamp: number that the source compares with its own, to detect a header of another build. rooms:
-    the workspace size, in numbers, of each method in optimised C and then of adaptive steps; 0 for
-    the default. Portable C reserves the same space, so that a program compiled with one header runs
-    with both forms. fast: whether the header belongs to the optimised C.
+    the workspace size, in numbers, of each method in optimised C and then of adaptive steps (0: the
+    size that portable C needs). Portable C reserves the same space, so that a program compiled with
+    one header runs with both forms. fast: whether the header belongs to the optimised C.
     """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
