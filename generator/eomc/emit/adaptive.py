@@ -37,12 +37,15 @@ EVENTS_PER_STEP = 32  # without events at the same time
 
 
 def memory(functions: Functions) -> str:
-    """Return the C type of the workspace of a run."""
+    """Return the C type of the workspace of an adaptive run."""
     return f"{functions.prefix}_{METHOD.name}_adaptive_memory"
 
 
 def workspace_size(system: System, width: int) -> int:
-    """Return the length of the workspace. width: of a vector of coordinates."""
+    """Return the number of floating-point numbers in the workspace of an adaptive run.
+
+    width: length of a vector of coordinates in C, which may include padding.
+    """
     vectors, scalars = (8, 26) if has_steep_terms(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
     event_numbers = 11 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
@@ -52,27 +55,28 @@ def workspace_size(system: System, width: int) -> int:
 
 @dataclass(frozen=True)
 class SweepInterface:
-    """Code that portable and optimised C supply to the shared code of adaptive steps.
+    """C code that the portable and the optimised form supply to the shared code of adaptive steps.
 
     Attributes
     ----------
     around
-        Arguments of an iteration over the stages: q, qd, t, h and so on.
+        C arguments of an iteration over the stages: q, qd, t, h and so on, not accelerations.
     sweep
-        Call of an iteration from *a to *b.
+        C call of one iteration, which computes the stage accelerations *to from *from.
     start
-        Call of the accelerations f at q, qd.
+        C call that computes the accelerations f at q, qd.
     extent
-        Size of vectors of coordinates.
+        Length of C arrays for coordinates, which may include padding.
     constants
-        Whether precomputed expressions of the parameters are a struct c.
+        Whether expressions that depend on parameters only are precomputed and stored in a struct c.
     compute_constants
-        The call that computes it; its failure is a status.
+        C call that computes this struct and is nonzero on failure; "" if not needed.
     lanes
-        Macro before loops over stages.
-    project, whole
-        The call that projects the end of a step, and whether it takes the state rather than the
-        increment.
+        Macro before loops over the stages, by which compilers vectorise them; "" for none.
+    project
+        C call that projects the end of a step onto the constraints; "" without constraints.
+    whole
+        Whether `project` takes the state itself rather than its increment in the step.
     """
 
     around: tuple[CArgument, ...]
@@ -88,38 +92,45 @@ class SweepInterface:
 
 @dataclass(frozen=True)
 class Stepping:
-    """The functions of adaptive steps for one form of C."""
+    """The C functions of adaptive steps for one form (portable or optimised) of the C code.
+
+    Most properties are prototypes of static functions whose bodies are in templates.
+    """
 
     functions: Functions
     form: SweepInterface
 
     @property
     def method(self) -> str:
-        """The prefix of their C names."""
+        """The scene's name and the method's name, with which the C names begin."""
         return f"{self.functions.prefix}_{METHOD.name}"
 
     @property
     def constant_arguments(self) -> Sequence[CArgument]:
-        """The arguments that are constant along a run."""
+        """The C arguments of an iteration that are constant during a run: u, precomputed c, and
+        p.
+        """
         return [a for a in self.form.around if a.name in "ucp"]
 
     @property
     def workspace(self) -> CArgument:
-        """The workspace of a run."""
+        """The C argument for the workspace of a run, which keeps data between calls."""
         return c.output_array(memory(self.functions), "memory")
 
     @property
     def state(self) -> CArgument:
-        """The state of a run."""
+        """The C argument for the current state of a run: q, qd, t, step size and interpolant."""
         return c.output_array(f"{self.method}_adaptive_state", "x")
 
     def number(self, name: str) -> CArgument:
-        """Return an argument that is a number."""
+        """Return the C argument `name` for one floating-point number."""
         return CArgument(self.functions.real, name)
 
     @cached_property
     def solve_stages(self) -> CFunction:
-        """The function that solves for the accelerations at the stages of a step."""
+        """The prototype of the function that solves for the accelerations at the stages of a
+        step.
+        """
         real = self.functions.real
         out = c.output_array(f"{self.method}_stages", "a")
         measures = (c.output_array(real, name) for name in ("scale", "coarse", "rough", "beyond"))
@@ -132,15 +143,18 @@ class Stepping:
 
     @property
     def may_rest(self) -> bool:
-        """Whether time-dependent forces may hold all bodies at rest, so that only rounding errors
-        move them.
+        """Whether all bodies can be at rest although the motion depends on time.
+
+        Friction may balance time-dependent forces. Rounding errors are then the only accelerations.
         """
         target = self.functions.target
         return bool(target.system.modes) and target.driven
 
     @cached_property
     def rounding_cap(self) -> CFunction:
-        """The function for the effect of rounding errors on the accelerations of a step."""
+        """The prototype of the function for the effect of rounding errors on the accelerations of a
+        step.
+        """
         real = self.functions.real
         values = (c.input_array(f"{self.method}_stages", "a"), c.input_array(real, "scale"))
         others = (*self.form.around, *self.functions.moves_stages)
@@ -149,20 +163,24 @@ class Stepping:
 
     @cached_property
     def forces(self) -> CFunction:
-        """The function for the accelerations at a state."""
+        """The prototype of the function that computes the accelerations at a state."""
         out = c.output_array(self.functions.real, "f")
         arguments = (a for a in self.form.around if a.name != "h")
         return c.static(f"{self.method}_forces", "int", out, *arguments)
 
     @cached_property
     def slopes(self) -> CFunction:
-        """The function for the derivatives of the accelerations."""
+        """The prototype of the function that computes the derivatives of the accelerations along q
+        and qd.
+        """
         out = c.output_array(f"{self.method}_newton", "m")
         return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
-        """The function for the next step."""
+        """The prototype of the function that makes the next step, with a size chosen by the
+        tolerance.
+        """
         arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
         return c.static(
@@ -171,7 +189,9 @@ class Stepping:
 
     @cached_property
     def interpolate(self) -> CFunction:
-        """The function for the state within the last step."""
+        """The prototype of the function that computes the state at a fraction z of the last
+        step.
+        """
         out = tuple(c.output_array(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.input_array(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
@@ -179,14 +199,18 @@ class Stepping:
 
     @property
     def step_arguments(self) -> Sequence[CArgument]:
-        """The constant arguments, and those that the public functions of steps take."""
+        """The C arguments that are constant during a run, with those that step functions take (u,
+        p).
+        """
         rest = self.constant_arguments
         present = {a.name for a in rest}
         return [*rest, *(a for a in self.functions.arguments("u", "p") if a.name not in present)]
 
     @cached_property
     def fixed(self) -> CFunction:
-        """The function for the next step of fixed size."""
+        """The prototype of the function that makes the next step of fixed size, with event
+        detection.
+        """
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
         return c.static(
             f"{self.method}_fixed",
@@ -199,7 +223,11 @@ class Stepping:
 
     @cached_property
     def state_within(self) -> CFunction:
-        """The function for the state within the last step, which may be of fixed size."""
+        """The prototype of the function that computes the state within the last step, for event
+        detection.
+
+        It also handles steps of fixed size if the scene has events.
+        """
         if not self.functions.target.system.events:
             return self.interpolate
         own = self.interpolate.arguments[: -len(self.constant_arguments) - 1]
@@ -207,7 +235,10 @@ class Stepping:
 
 
 def tableau(stepping: Stepping) -> dict[str, Any]:
-    """Return the coefficients and constants that all views of adaptive steps share."""
+    """Return the template variables that all templates of adaptive steps share.
+
+    These are coefficients of the method, tolerances and names.
+    """
     m, target = METHOD, stepping.functions.target
     real = target.real
     return {
@@ -230,7 +261,7 @@ def tableau(stepping: Stepping) -> dict[str, Any]:
 
 
 def steps(stepping: Stepping) -> Adaptive:
-    """Return the view of a step and of dense output."""
+    """Return the data for the template of one adaptive step and of the states within it."""
     functions, m, form = stepping.functions, METHOD, stepping.form
     target, real = functions.target, functions.target.real
     references = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
@@ -281,7 +312,7 @@ def steps(stepping: Stepping) -> Adaptive:
 
 
 def fixed(stepping: Stepping) -> FixedSteps:
-    """Return the view of fixed steps with event detection."""
+    """Return the data for the template of steps of fixed size with event detection."""
     functions = stepping.functions
     target, real = functions.target, functions.target.real
     at = {"q": "q_at", "qd": "qd_at"}
@@ -308,18 +339,18 @@ def fixed(stepping: Stepping) -> FixedSteps:
 
 
 def max_events_per_step(system: System) -> int:
-    """Return the number of events after which a step ends."""
+    """Return the number of events in a step after which the step ends early."""
     return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
 def row_storage(stepping: Stepping) -> CFunction:
-    """Return the function that stores a state in a row."""
+    """Return the prototype of the C function that stores q and qd in the output arrays of a run."""
     arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 
 
 def tightest(real: Real) -> float:
-    """Return the smallest tolerance that the precision of numbers allows."""
+    """Return the smallest error tolerance that is possible with the C type of numbers."""
     return 1e-15 if real.epsilon < 1e-10 else 5e-7
 
 
@@ -327,14 +358,16 @@ def run(
     stepping: Stepping, happen: str = "", restart: str = "", initial_events: str = "",
     changed: str = "", values: str = "",
 ) -> AdaptiveRun:  # fmt: skip
-    """Return the view of the loop over steps.
+    """Return the data for the template of an adaptive run, the loop over steps.
 
     Parameters
     ----------
     happen, restart, initial_events
-        Calls that detect events, continue after them, and handle events at the start.
+        C calls that detect events in a step, continue the run after an event, and trigger events at
+        the start of the run; "" without events.
     changed, values
-        Calls that report whether inputs have changed the event functions, and evaluate them.
+        C calls that report whether new inputs or parameters have changed the event functions, and
+        evaluate these functions.
     """
     functions, form = stepping.functions, stepping.form
     target = functions.target
@@ -381,10 +414,10 @@ def run(
 
 
 def steps_in_parallel(target: Target) -> bool:
-    """Return True if optimised C steps many instances in parallel: small systems with smooth
-    forces.
+    """Return True if optimised C steps several instances of a batch together in vector registers.
 
-    Large systems occupy the vector registers with one instance.
+    It does so for small systems with smooth forces; a large system occupies the vector registers
+    with one instance.
     """
     s = target.system
     plain = not (s.events or s.constraints or has_steep_terms(s))
@@ -396,7 +429,7 @@ def steps_in_parallel(target: Target) -> bool:
 
 
 def call_for_instance(functions: Functions) -> str:
-    """Return the call for instance k of a batch."""
+    """Return the C call that continues the adaptive run of instance k of a batch."""
     NQ = functions.NQ
     rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
     return functions.public.adaptive(METHOD.name).call(
@@ -410,7 +443,9 @@ def call_for_instance(functions: Functions) -> str:
 
 
 def batch(functions: Functions) -> AdaptiveBatch:
-    """Return the view of a batch that steps one instance after the other."""
+    """Return the data for the template of a batch of adaptive runs, one instance after the
+    other.
+    """
     return AdaptiveBatch(
         prefix=functions.prefix,
         batch=functions.public.adaptive_batch(METHOD.name),
@@ -420,7 +455,11 @@ def batch(functions: Functions) -> AdaptiveBatch:
 
 
 def _ends() -> tuple[Row, Row]:
-    """Return weights for the values at both ends of a step of the polynomial through the stages."""
+    """Return weights of the stage values that extrapolate their polynomial to the start and the
+    end.
+
+    The polynomial has the given values at the stages of a step.
+    """
     parts = [METHOD.legendre(n) for n in range(METHOD.stages)]
     columns = list(zip(*parts, strict=True))
     start = tuple(sum(column[::2], Fraction(0)) - sum(column[1::2]) for column in columns)

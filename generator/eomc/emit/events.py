@@ -35,15 +35,19 @@ DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
 
 def nodes() -> Row:
-    """Return the extrema of Chebyshev's polynomial on [0, 1], with both ends."""
+    """Return the nodes in [0, 1], as fractions of a step, at which event functions are evaluated.
+
+    They are the extrema of a Chebyshev polynomial and include both ends.
+    """
     last = SAMPLES - 1
     return tuple(Fraction((1 - cos(pi * j / last)) / 2).limit_denominator(10**12)
                  for j in range(SAMPLES))  # fmt: skip
 
 
 def slopes(x: Row) -> Sequence[Row]:
-    """Return the matrix from values at the nodes x to derivatives of the interpolating polynomial
-    there.
+    """Return the differentiation matrix of polynomial interpolation at the nodes x.
+
+    It maps values at the nodes to the derivatives of the interpolating polynomial at the nodes.
     """
     weights = [1 / prod((a - b for b in x if b != a), start=Fraction(1)) for a in x]
     rows = [
@@ -56,7 +60,10 @@ def slopes(x: Row) -> Sequence[Row]:
 
 
 def last(count: int) -> Sequence[Row]:
-    """Return weights for the last two Chebyshev coefficients from values at the nodes."""
+    """Return two rows of weights that give the last two Chebyshev coefficients of a function.
+
+    The weights apply to its values at `count` nodes (the extrema of a Chebyshev polynomial).
+    """
     top = count - 1
     ends = [Fraction(1, 2) if j in (0, top) else Fraction(1) for j in range(count)]
     return tuple(
@@ -70,7 +77,11 @@ def last(count: int) -> Sequence[Row]:
 
 
 def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
-    """Return integrals of (2 c - 1)^n, n < count, from 0 to each of x, taken once or twice."""
+    """Return the integrals of (2 c - 1)^n over c from 0 to each x, a row for each x.
+
+    Column n is the power, n < `count`. times: 1 for the integral, 2 for the integral of the
+    integral.
+    """
     signs = [Fraction((-1) ** n) for n in range(count + 3)]
 
     def once(n: int, at: Fraction) -> Fraction:
@@ -89,7 +100,12 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
 def views(
     functions: Functions, form: SweepInterface
 ) -> Iterator[Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun]:
-    """Yield the views of adaptive steps, fixed steps, events and the loop over them."""
+    """Yield the data for the templates of adaptive steps, events and runs, in their order in the C
+    file.
+
+    form: what differs between portable and optimised C. Without events, there are only the
+    templates of adaptive steps and runs.
+    """
     stepping = Stepping(functions, form)
     yield steps(stepping)
     if not functions.target.system.events:
@@ -122,7 +138,10 @@ def views(
 
 
 def _start_events(stepping: Stepping, restart: CFunction) -> InitialEvents:
-    """Return the view of events at the start of a motion."""
+    """Return the data for the template of events that trigger at the start of a motion.
+
+    restart: the C function that continues the run after an event.
+    """
     functions, x = stepping.functions, stepping.state.name
     values, record = (
         functions.public.evaluation("begins"),
@@ -142,7 +161,7 @@ def _start_events(stepping: Stepping, restart: CFunction) -> InitialEvents:
 
 
 def _events(stepping: Stepping) -> Events:
-    """Return the view of event detection."""
+    """Return the data for the template of event detection."""
     functions, method = stepping.functions, stepping.method
     target, real, public = functions.target, functions.real, functions.public
     end, system = target.real.function_suffix, target.system
@@ -225,7 +244,12 @@ def _events(stepping: Stepping) -> Events:
 
 
 def _rounding(stepping: Stepping, extra: Sequence[CArgument]) -> dict[str, Any]:
-    """Return the function for rounding errors of an event function, its call and the call in it."""
+    """Return the template variables for the C function that estimates rounding errors of event
+    functions.
+
+    They are its prototype, its call, and the call of the event functions in it. extra: its
+    arguments besides the state.
+    """
     read, k = c.input_array(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
     function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
     state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
@@ -234,14 +258,16 @@ def _rounding(stepping: Stepping, extra: Sequence[CArgument]) -> dict[str, Any]:
 
 
 def _set(system: System) -> tuple[str, ...]:
-    """Return, for each event of the scene, flags for the entries of q and qd that its jump sets."""
+    """Return, for each event of the scene, flags in braces: which entries of [q, qd] its jump
+    sets.
+    """
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
     rows = ({name for name, _ in e.jump} for e in system.own_events)
     return c.in_braces([str(int(name in names)) for name in states] for names in rows)
 
 
 def _tables(functions: Functions) -> dict[str, Any]:
-    """Return the numbers of the nodes at which event functions are evaluated, by view field."""
+    """Return template variables: nodes for event functions, and weights for their values there."""
     target = functions.target
     x, real = nodes(), target.real
     return {

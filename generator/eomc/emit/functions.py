@@ -40,80 +40,89 @@ MAX_UNCOMMENTED_LINES = 16  # statements without comments between stages
 
 @dataclass(frozen=True)
 class Functions:
-    """The C functions of a program: arguments and bodies."""
+    """The C functions generated for a program: prototypes, arguments and bodies.
+
+    The program is the list of functions (D, bias, acceleration, ...) derived from a scene. The
+    portable and the optimised form of the C code both use these functions.
+    """
 
     target: Target
 
     @property
     def prefix(self) -> str:
-        """The prefix of all C names."""
+        """The scene's name, with which all C names begin."""
         return self.target.prefix
 
     @property
     def PREFIX(self) -> str:
-        """The prefix of all macros and enumerators."""
+        """The scene's name in upper case, with which all macros and enumerators begin."""
         return self.target.PREFIX
 
     @property
     def real(self) -> str:
-        """The C type of numbers."""
+        """The C type of floating-point numbers: "double" or "float"."""
         return self.target.real.name
 
     @property
     def names(self) -> dict[str, str]:
-        """Fields that most views have."""
+        """The template variables that most templates share: prefix, PREFIX and real."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
     def groups_angles(self, function: Function) -> bool:
-        """Return True if sines of several angles are computed in vector registers.
+        """Return True if the C code computes the sines of several angles together in vector
+        registers.
 
-        Not in D, with which selftest.c verifies the sines that steps use.
+        D is excluded, because selftest.c verifies by it the sines that the steps use.
         """
         return self.target.real.reach > 0 and function.name not in ("D", "D_column")
 
     @property
     def has_grouped_angles(self) -> bool:
-        """Whether some function computes sines of several angles in vector registers."""
+        """Whether some function computes the sines of several angles together in vector
+        registers.
+        """
         functions = self.target.program.functions.values()
         return any(self.groups_angles(f) and group_angles(f) for f in functions)
 
     @property
     def NQ(self) -> str:
-        """The number of coordinates, as C text."""
+        """The C enumerator for the number of coordinates, such as CARTPOLE_NQ."""
         return f"{self.PREFIX}_NQ"
 
     @property
     def NU(self) -> str:
-        """The number of inputs, as C text."""
+        """The C enumerator for the number of inputs, such as CARTPOLE_NU."""
         return f"{self.PREFIX}_NU"
 
     @property
     def status(self) -> str:
-        """The return type of functions that can fail."""
+        """The C type of status codes, which functions that can fail return."""
         return f"{self.prefix}_status"
 
     @property
     def ok(self) -> str:
-        """The status of success."""
+        """The status code for success, as a C enumerator."""
         return f"{self.PREFIX}_OK"
 
     @property
     def singular(self) -> str:
-        """The status where D is not positive definite."""
+        """The status code for a mass matrix D that is not positive definite, as a C enumerator."""
         return f"{self.PREFIX}_SINGULAR"
 
     @cached_property
     def public(self) -> Public:
-        """The prototypes of the functions in the header."""
+        """The prototypes of the functions that the generated C header declares."""
         return Public(self.target)
 
     @cached_property
     def supplied_names(self) -> Mapping[str, frozenset[str]]:
-        """The names of the program that each argument supplies."""
+        """For each C argument (q, qd, u, p, ...), the names of the program's variables that it
+        contains.
+        """
         return self.target.groups()
 
     def argument(self, name: str) -> CArgument:
-        """Return one of the usual arguments: q, qd, qdd, t, h, u, p."""
+        """Return the C argument with one of the usual names: q, qd, qdd, t, h, u or p."""
         if name in (*STATE, "qdd"):
             return c.input_array(self.real, name, self.NQ)
         if name == "u":
@@ -123,32 +132,37 @@ class Functions:
         return CArgument(self.real, name)
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
-        """Return those of the usual arguments that this scene has: u with inputs, p with
-        parameters.
+        """Return the C arguments with these names, without those that the scene does not have.
+
+        A scene without inputs has no u, and one without parameters no p.
         """
         there = {"u": bool(self.target.system.inputs), "p": self.target.needs_p}
         return tuple(self.argument(n) for n in names if there.get(n, True))
 
     @property
     def swept(self) -> bool:
-        """Whether some method iterates its stages."""
+        """Whether some integration method solves for its stages by fixed-point iteration."""
         run = self.target.system.run
         return run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
 
     @property
     def moves_stages(self) -> tuple[CArgument, ...]:
-        """For iterated stages of systems with constraints, the flag for projecting them."""
+        """The C argument `onto`, a flag that the stages of a step are projected onto the
+        constraints.
+
+        Empty without constraints.
+        """
         return (CArgument("int", "onto"),) if self.projection else ()
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Names of the arguments of the accelerations: q, qd, and t where the motion depends on
-        time.
-        """
+        """Names of the C arguments for the state: q, qd and, if the motion depends on time, t."""
         return (*STATE, "t") if self.target.driven else STATE
 
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
-        """The arguments that a static function needs, arrays as pointers."""
+        """Return those of the C arguments `names` that a static function reads, with arrays as
+        pointers.
+        """
         needed = [n for n in names if function.uses & self.supplied_names[n]]
         arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
         return tuple(
@@ -159,7 +173,9 @@ class Functions:
 
     @cached_property
     def signal(self) -> CFunction | None:
-        """The prototype of the signals; None without inputs."""
+        """The prototype of the C function that computes u by the scene's signals; None without
+        inputs.
+        """
         if "signal" not in self.target.program:
             return None
         state = STATE if self.target.signal_state else ()
@@ -169,8 +185,9 @@ class Functions:
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
     def signals(self, function: Function) -> tuple[Block, ...]:
-        """Return blocks that set u to the signals where it is NULL, for functions that read
-        inputs.
+        """Return C statements that set u to the scene's signals if the caller passes NULL for u.
+
+        Empty if the function does not read the inputs.
         """
         if self.signal is None or not self.reads_u(function):
             return ()
@@ -178,12 +195,14 @@ class Functions:
         return (Block("", (c.local(self.real, f"now[{self.NU}]"),)), Block("", lines))
 
     def reads_u(self, function: Function) -> bool:
-        """Return True if a function reads inputs."""
+        """Return True if a function of the program reads inputs."""
         return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
     def read(self, function: Function, follows: bool = True) -> frozenset[str]:
-        """Return the usual arguments that a function reads; with `follows`, also those of the
-        signals it reads.
+        """Return the names of the C arguments (q, qd, u, p, ...) that a function of the program
+        reads.
+
+        With `follows`, include the arguments of the scene's signals if the function reads inputs.
         """
         names = {n for n, brings in self.supplied_names.items() if function.uses & brings}
         if follows and self.reads_u(function) and self.signal is not None:
@@ -193,14 +212,19 @@ class Functions:
     # bodies
 
     def loads(self, function: Function) -> Block:
-        """Return locals for the coordinates, velocities, inputs and directions that are read."""
+        """Return definitions of C local variables for the array elements that a function reads.
+
+        For example `const double theta = q[CARTPOLE_THETA];`.
+        """
         return Block(
             "", tuple(self.target.loads(function, self.target.element, self.target.element))
         )
 
     def straight_line_body(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
-        """Return the statements of a function, with results in `out`, or returned where `out` is
-        empty.
+        """Return the C statements of a function of the program, and its results as C expressions.
+
+        out: name of the C array that the statements write the results to; "" to return the only
+        result.
         """
         body = self.target.body(function, together=self.groups_angles(function))
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
@@ -208,7 +232,11 @@ class Functions:
         return (*self.statements(function, body), last), body
 
     def statements(self, function: Function, body: Body) -> tuple[Block, ...]:
-        """Return loads and statements, by stage with comments where there are many."""
+        """Return the C statements of a function: local variables for its arguments, then
+        assignments.
+
+        Many statements are divided by stage into blocks with comments; few form one block.
+        """
         blocks = (self.loads(function), *body.early, *body.blocks)
         lines = tuple(line for b in blocks for line in b.lines)
         return blocks if len(lines) > MAX_UNCOMMENTED_LINES else (Block("", lines),)
@@ -216,10 +244,13 @@ class Functions:
     def outlined(
         self, function: Function, name: str, out: str, arguments: Sequence[str]
     ) -> tuple[str, tuple[CFunction, ...], tuple[Block, ...]]:
-        """Outline a long function. Returns the struct of values, the pieces, and the calling
-        blocks.
+        """Divide a long function into several C functions (pieces) that are called in sequence.
 
-        out: the array for the results, of which each piece writes some elements.
+        Returns the definition of a struct with the values that the pieces share ("" if there are
+        none), the pieces, and the statements that call them.
+
+        name: part of the C names. out: array for the results; each piece writes some of its
+        elements. arguments: names of the C arguments that pieces may take.
         """
         function = rename_reserved(function)
         parts = outline.split(function, outline.PIECE)
@@ -261,11 +292,15 @@ class Functions:
 
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
-        """The evaluation functions of the program, in their order."""
+        """The evaluation functions of the scene, such as D or energy, in the order of the C
+        header.
+        """
         return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
 
     def evaluation(self, name: str) -> Computed:
-        """Return the evaluation function `name`, such as D, bias, energy or signal."""
+        """Return the C function that evaluates `name`, such as D, bias, energy or signal, with its
+        body.
+        """
         kind, target = KINDS[name], self.target
         function = source(target, name)
         assert function is not None
@@ -303,8 +338,10 @@ class Functions:
         return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
 
     def _status_block(self, name: str) -> Block:
-        """Return the end of a function with a status: copy results `a` to the output and return the
-        status.
+        """Return the end of a function with a status: copy the results `a` to the output, return
+        OK.
+
+        Functions whose results may overflow return NOT_FINITE before they copy.
         """
         size = c_array_size(self.target, KINDS[name].shape)
         unfinite = [f"!{self.prefix}_finite(a, {size})"] if KINDS[name].refuses else []
@@ -314,8 +351,10 @@ class Functions:
         )
 
     def _sum_of_energies(self, energy: CFunction) -> Computed | None:
-        """Return energy as the sum of kinetic and potential energy; None where their arguments
-        differ.
+        """Return the C function `energy` as a call of kinetic_energy plus a call of
+        potential_energy.
+
+        Returns None if the two need arguments that `energy` does not have.
         """
         parts = [self.evaluation(f"{what}_energy").function for what in ("kinetic", "potential")]
         read = frozenset(a.name for part in parts for a in part.arguments)
@@ -325,8 +364,10 @@ class Functions:
         return Computed(replace(energy, body=body, reads=read, doc=energy.doc[:1]))
 
     def _by_columns(self, public: CFunction, function: Function, name: str) -> Computed:
-        """Return a matrix function as a loop over columns, which are the matrix times unit
-        vectors.
+        """Return a C function that computes a matrix by columns, in a loop.
+
+        Each column is the product of the matrix and a unit vector, which a static function
+        computes.
         """
         kind = KINDS[name]
         doc = f"{kind.out} times along. {sentence(function)}"
@@ -337,8 +378,10 @@ class Functions:
     def static(
         self, function: Function, name: str, out: str, doc: str, fails: bool = False
     ) -> Computed:
-        """Return a static function that writes `out`. With `fails`, it checks pivots and returns a
-        status.
+        """Return a static C function `name` that computes a function of the program.
+
+        out: name of the array that the results are written to. doc: its comment. fails: whether it
+        checks the pivots of a matrix factorization and returns a status.
         """
         values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
@@ -363,8 +406,9 @@ class Functions:
 
     @cached_property
     def projection(self) -> Computed | None:
-        """The static function for corrections of q and qd onto the constraints; None without
-        constraints.
+        """The static C function for the corrections that project q and qd onto the constraints.
+
+        None without constraints.
         """
         function = self.target.program.functions.get("projection")
         if function is None:
@@ -373,7 +417,11 @@ class Functions:
 
     @cached_property
     def rotation_errors(self) -> Computed | None:
-        """By what rotations loops are not closed, with the slopes; static."""
+        """The static C function for the rotation errors of closed loops and their derivatives along
+        q.
+
+        None if no loop has axis equations. See `Constraint.rotation_error` for the definition.
+        """
         function = self.target.program.functions.get("rotation_errors")
         if function is None:
             return None
@@ -381,7 +429,12 @@ class Functions:
 
     @cached_property
     def rotated(self) -> CFunction | None:
-        """The static C function that replaces the residuals of axis rows by rotation vectors."""
+        """The static C function that replaces the residuals of axis equations of loops by rotation
+        vectors.
+
+        It also replaces their rows of the Jacobian A. The body is in a template. None without such
+        loops.
+        """
         if self.rotation_errors is None:
             return None
         read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]
@@ -390,8 +443,9 @@ class Functions:
 
     @cached_property
     def rate_terms(self) -> Computed | None:
-        """The static function for rates of constraints that corrections may drop, and sums of
-        |terms|.
+        """The static C function for the rates of constraint equations that the projection may drop.
+
+        It also computes the sum of |terms| of each, as a scale. None if no equation may be dropped.
         """
         function = self.target.program.functions.get("rate_terms")
         if function is None:
@@ -400,8 +454,10 @@ class Functions:
 
     @cached_property
     def projection_along(self) -> Computed | None:
-        """The static function for the corrections and their directional derivatives; None where not
-        used.
+        """The static C function for the corrections of the projection and their directional
+        derivatives.
+
+        None if the scene does not need derivatives of steps under constraints.
         """
         function = self.target.program.functions.get("projection_along")
         if function is None:
@@ -411,27 +467,36 @@ class Functions:
 
     @cached_property
     def projected(self) -> CFunction:
-        """The static function of portable C that projects the state after a step."""
+        """The static C function of the portable form that projects the state after a step.
+
+        The prototype only; the body is in a template.
+        """
         moved, more = self._projection_arguments
         q, far = self.argument("q"), CArgument("int *", "singular")
         return c.static(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
 
     @cached_property
     def onto(self) -> CFunction:
-        """The static function that projects a stage onto the constraints to first order."""
+        """The static C function that projects the state at a stage onto the constraints to first
+        order.
+
+        The prototype only; the body is in a template.
+        """
         moved, more = self._projection_arguments
         return c.static(f"{self.prefix}_onto", "int", *moved, *more)
 
     @property
     def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
-        """The arguments of a projection: the state to be changed, and the others."""
+        """The C arguments of a projection: the state to be changed (r, v), and then t and p if
+        needed.
+        """
         arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
         state = tuple(c.output_array(self.real, n) for n in "rv")
         return state, self.arguments(*(n for n in ("t", "p") if n in arguments))
 
     @cached_property
     def acceleration(self) -> Computed:
-        """The function for qdd, which returns a status."""
+        """The C function that computes the accelerations qdd and returns a status."""
         function = self.target.program["acceleration"]
         force = "tau + A^T lambda" if self.target.system.constraints else "tau"
         doc = [
@@ -464,7 +529,10 @@ class Functions:
 
 
 def portable_functions(program: Program, real: Real | None = None) -> Functions:
-    """Return a program as portable C, with sine and cosine of libm for any element type."""
+    """Return the C functions of a program in portable form, which uses sin and cos of libm.
+
+    real: C type of the numbers; by default that of the scene.
+    """
     return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
 
 
@@ -473,13 +541,16 @@ def indexed(
     items: Sequence[Constraint | Coordinate | Event | Input | Output],
     prefix: str = "",
 ) -> tuple[Indexed, ...]:
-    """Return coordinates, inputs, outputs, constraints or events with their enumerators."""
+    """Return the enumerator, unit and note of coordinates, inputs, outputs, constraints or events.
+
+    prefix: "OUT_", "EVENT_" or "CONSTRAINT_", by which `Target.enum` distinguishes equal names.
+    """
     enum = plain.target.enum
     return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in items)
 
 
 def parameters(plain: Functions) -> tuple[Parameter, ...]:
-    """Return names, values and comments of the parameters."""
+    """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
     return tuple(
         Parameter(p.name, plain.target.literal(p.value), heading.words(p.unit, p.note))
         for p in plain.target.system.parameters
@@ -487,8 +558,10 @@ def parameters(plain: Functions) -> tuple[Parameter, ...]:
 
 
 def handshake(plain: Functions) -> str:
-    """Return a number that header and source must share. It differs in optimised C, whose memory
-    differs.
+    """Return a hexadecimal C constant by which the C source checks that it is compiled with its
+    header.
+
+    Optimised C has a different constant, because its workspaces differ in size.
     """
     digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
     return f"0x{digest[:8]}u"

@@ -44,7 +44,9 @@ OPTIONAL = {  # functions by the option that brings them
 
 
 def main(target: Target) -> Main:
-    """Return the view of main.c: the scene's own run with about two hundred rows."""
+    """Return the data for main.c, an example program that simulates the scene and prints about 200
+    lines.
+    """
     s, public = target.system, Public(target)
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
     names = [target.as_written(c.name) for c in s.coordinates]
@@ -89,7 +91,7 @@ def main(target: Target) -> Main:
 
 
 def _bound(target: Target) -> tuple[Bound, ...]:
-    """Return the bindings of the evaluation functions."""
+    """Return the evaluation functions for the Python binding, with their C calls for state k."""
     state_arguments, bindings = _rows(target), []
     for function in Public(target).evaluations():
         name = function.name.removeprefix(f"{target.prefix}_")
@@ -112,12 +114,18 @@ def _bound(target: Target) -> tuple[Bound, ...]:
 
 
 def _parameters(target: Target, place: str = "p") -> str:
-    """Return the parameters as C text: a cast of an array of numbers to the struct."""
+    """Return the C expression `place`, an array of numbers, cast to the struct of parameters.
+
+    Returns "" if the scene has no parameters.
+    """
     return cast(f"{target.prefix}_params", place) if target.needs_p else ""
 
 
 def _rows(target: Target) -> dict[str, str]:
-    """Return the arguments for state k: q, qd, and t, u, p with their strides."""
+    """Return the C arguments q, qd, t, u and p for the state with index k, by name.
+
+    The binding's arrays have one row for each state; t, u and p may be the same for all.
+    """
     NQ = f"{target.PREFIX}_NQ"
     return {
         "q": f"q + {NQ}*k",
@@ -129,7 +137,9 @@ def _rows(target: Target) -> dict[str, str]:
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
-    """Return the bindings of step, run, batch and derivative of each method."""
+    """Return the C calls for step, run, batch and derivative of each integration method in the
+    binding.
+    """
     public, p, NQ = Public(target), _parameters(target), f"{target.PREFIX}_NQ"
     memory = f"work ? &{member('work', 'memory')} : NULL"
     return tuple(
@@ -156,7 +166,7 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
 
 
 def _adaptive(target: Target) -> BoundAdaptive | None:
-    """Return the binding of adaptive steps; None where the scene has no tolerance."""
+    """Return the data for adaptive steps in the binding; None if the scene has no tolerance."""
     if target.system.run.tolerance is None:
         return None
     run = Public(target).adaptive(adaptive.METHOD.name)
@@ -169,7 +179,10 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
 
 
 def _derivative(target: Target, method: str) -> tuple[str, str, str]:
-    """Return the calls for the derivatives of a step: at state k, the step before, and after it."""
+    """Return three C calls for the derivatives of several steps from the state with index k.
+
+    They compute the derivatives of the first step, make the next step, and compute its derivatives.
+    """
     function, rows = Public(target).derivative(method), _rows(target)
     out = {a.name: f"{a.name} + {a.extent}*k" for a in function.arguments if a.name in _OF_STEPS}
     later = rows | {"q": "at", "qd": "moving"}
@@ -185,7 +198,9 @@ def _derivative(target: Target, method: str) -> tuple[str, str, str]:
 
 
 def binding(target: Target) -> Binding:
-    """Return the view of the binding: the same signature for all functions, over rows of states."""
+    """Return the data for the Python binding: C functions with one signature, for many states
+    each.
+    """
     public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
     linear = public.linearization
     matrices = {a.name: f"{a.name} + {a.extent}*k" for a in linear.arguments if a.name[0] in "AB"}
@@ -212,7 +227,7 @@ def _linearized(target: Target) -> bool:
 
 
 def declarations(bound: Binding) -> Declarations:
-    """Return the view of the declarations for cffi."""
+    """Return the data for the declarations by which cffi reads the Python binding."""
     return Declarations(
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
         bound.methods, bound.adaptive,
@@ -220,7 +235,7 @@ def declarations(bound: Binding) -> Declarations:
 
 
 def _functions(target: Target) -> tuple[str, ...]:
-    """Return the public functions of the model in the package."""
+    """Return the sorted names of the model's public functions in the Python package."""
     s, run = target.system, target.system.run
     functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
     functions += CONSTRAINED if s.constraints else ()
@@ -230,14 +245,16 @@ def _functions(target: Target) -> tuple[str, ...]:
 
 
 def stub(target: Target) -> Stub:
-    """Return the view of the type stubs."""
+    """Return the data for the type stubs of the Python package."""
     return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
 
 
 def start_formulas(target: Target) -> dict[str, str]:
-    """Return the starts and rates that are formulas of parameters, by the name of their state.
+    """Return the initial values that depend on parameters, as formulas by name of the state
+    variable.
 
-    Parameters that jumps set are replaced by their values in the scene.
+    The names are those of coordinates (`theta`) and velocities (`theta_dot`) in the scene.
+    Parameters that state jumps change are replaced by their values.
     """
     s, written = target.system, target.as_written
     set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
@@ -250,7 +267,10 @@ def start_formulas(target: Target) -> dict[str, str]:
 
 
 def face(target: Target, extension: str) -> Face:
-    """Return the view of the package's __init__.py."""
+    """Return the data for the __init__.py of the Python package.
+
+    extension: name of the compiled extension module, which it imports.
+    """
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
