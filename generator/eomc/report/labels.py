@@ -12,12 +12,17 @@ __all__ = ["html_name", "label", "mathtext", "rate_unit", "with_unit"]
 
 
 def label(coordinate: Coordinate | Output, rate: bool = False) -> str:
-    """Return the label with unit of a coordinate or output, or of its time derivative (`rate`)."""
+    """Return the axis label of a coordinate or output for matplotlib: its symbol and its unit.
+
+    rate: True for the label of its time derivative.
+    """
     return with_unit(mathtext(coordinate.name, rate), rate_unit(coordinate.unit, rate))
 
 
 def html_name(name: str, rate: bool = False) -> str:
     """Return a name as HTML: theta_1 as θ with a subscript; names of whole words stay words.
+
+    rate: True to put a dot above the symbol, for the time derivative.
 
     >>> html_name("theta_1"), html_name("wrist_1_joint")
     ('θ<sub>1</sub>', 'wrist 1 joint')

@@ -37,7 +37,11 @@ T, DQ = r"^{\mathsf{T}}", r"\dot{q}"
 
 
 def text(system: System) -> str:
-    """Return how the equations of a large system are formed, and what it costs to compute them."""
+    """Return text that describes how the equations of a large system are formed and computed.
+
+    The text contains the recursion over the joints or the energies, the constraints, and the
+    numbers of operations of the generated functions.
+    """
     write = Typesetter(system)
     parts = [
         wrap(f"{title_line(system)}: {equation_form(_driven(system), system)}"),
@@ -103,14 +107,17 @@ def _energies(system: System) -> list[tuple[str, Expr]]:
 
 
 def latex(system: System) -> str:
-    """Return amsmath environments: the form of the equations, and how they are computed."""
+    """Return LaTeX that describes how the equations of a large system are formed and computed.
+
+    It consists of align* environments of the package amsmath.
+    """
     return "\n".join(
         r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in environment_bodies(system)
     )
 
 
 def environment_bodies(system: System) -> list[str]:
-    """Return the contents of each environment."""
+    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment of `latex`."""
     write, tree, known = Typesetter(system), system.tree, _shown_definitions(system)
     parts = [_latex_form(system)]
     if tree is not None:

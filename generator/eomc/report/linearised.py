@@ -32,11 +32,13 @@ EPSILON = 2.0**-53
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of a perturbation of the initial state: `amplification` (n,) at the times `t` (n,).
+    """Growth of a small perturbation of the initial state along a motion.
 
-    rate: mean exponential rate over the second half of the motion, relative to the growth of the
-    motion itself, 1/s. wild: True if that growth is exponential (chaos). horizon: time at which
-    rounding errors have amplification to a tenth of the motion; inf if they do not.
+    t: times (n,), s. amplification: factors (n,) by which the perturbation has grown up to the
+    times `t`. rate: mean exponential growth rate over the second half of the motion, relative to
+    the growth of the motion itself, 1/s. wild: True if this growth is exponential (chaos). horizon:
+    time in s at which rounding errors have grown to a tenth of the size of the motion; inf if they
+    do not grow that far.
     """
 
     t: Vector
@@ -47,7 +49,7 @@ class Growth:
 
 
 def simulate(module: ModuleType, **options: Any) -> Any:
-    """Simulate with the module, with all warnings suppressed."""
+    """Return the run of `module.simulate(**options)`, with all its warnings suppressed."""
     # failures and advice are what is measured here
     quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
     with quiet, np.errstate(all="ignore"):
@@ -55,7 +57,11 @@ def simulate(module: ModuleType, **options: Any) -> Any:
 
 
 def at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> Vector:
-    """Evaluate a function of the module at each state and time of the reference."""
+    """Evaluate a function of a generated module at each state and time of a reference solution.
+
+    function: called as function(q, qd, t=t), or as function(q, t=t) if `velocities` is False.
+    Returns the array of the values, one for each time of the reference.
+    """
     n = reference.q.shape[1]
     x = reference.halves[0]
     states = (
@@ -66,11 +72,12 @@ def at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> 
 
 
 def stable_step(values: Complex, limits: tuple[float, float]) -> float:
-    """Return the largest stable step for eigenvalues λ: (h Im λ/limit_1)² + (h Re λ/limit_2)² <= 1.
+    """Return the largest step size h in s that is stable for all eigenvalues λ (1/s) in `values`.
 
-    `limits` are the limits of h ω for undamped and of h |λ| for decaying solutions; the ellipse
-    through both approximates the stability region of most methods. Eigenvalues with a positive real
-    part count by their imaginary part only. Returns inf if any step is stable.
+    A step is stable if (h Im λ/limits[0])² + (h Re λ/limits[1])² <= 1. limits: largest stable h ω
+    of the method for undamped solutions, and largest stable h |λ| for decaying ones; this ellipse
+    through both approximates the stability region of most methods. The real part of an eigenvalue
+    is ignored if it is positive. Returns inf if every step size is stable.
     """
     turn = np.abs(values.imag) / limits[0]
     decay = np.maximum(-values.real, 0.0) / limits[1]
@@ -81,10 +88,11 @@ def stable_step(values: Complex, limits: tuple[float, float]) -> float:
 def spectrum(
     module: ModuleType, reference: Reference
 ) -> tuple[Complex, float, tuple[float, Vector]]:
-    """Return the eigenvalues of ∂[q̇; q̈]/∂[q; q̇] along the reference.
+    """Compute eigenvalues of the linearised motion and condition numbers of the mass matrix D.
 
-    The second value is the largest condition number of D (diagonal scaled to 1), the third its (t,
-    q).
+    Returns three values: the eigenvalues (1/s) of ∂[q̇; q̈]/∂[q; q̇] at all states of the reference
+    solution, in one array; the largest condition number of D, scaled to a diagonal of ones; and the
+    time and coordinates (t, q) at which it occurs.
     """
     n, scale = reference.q.shape[1], reference.scale
     worst, place = 0.0, (0.0, reference.halves[0][0, :n])
@@ -120,10 +128,11 @@ def _project(module: ModuleType, x: Vector, t: float) -> Vector:
 
 
 def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
-    """Return the growth of a perturbation: the norm of the product of transition matrices.
+    """Return the growth of a perturbation of the initial state along a reference solution.
 
-    Each matrix is computed by differences of runs with `method` over one segment of the reference;
-    `steps` is the number of steps over the whole motion. The norm is that of `runtime.growth`.
+    It is the norm of the product of the transition matrices of segments of the motion. Each matrix
+    is computed by differences of runs with the stepper `method` over one segment; `steps` is the
+    number of steps over the whole motion. `runtime.growth` defines the norm.
     """
     n, scale = reference.q.shape[1], reference.scale
     stride = (len(reference.t) - 1) // SEGMENT_COUNT

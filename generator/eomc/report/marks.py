@@ -15,7 +15,10 @@ TRAVEL_LIMIT = 8.0  # times its own extent: how far a mechanism may move in one 
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark, drawn on some of a drawing's points. The kind determines how many points it has.
+    """One graphical symbol of a drawing, such as a line or a joint.
+
+    points: indices of the points of the drawing on which the mark is drawn; their number depends on
+    the kind. instance: index of the instance, if several are drawn over each other. The kinds are:
 
     =========  ============================================================================
     line       of a [picture], through two points or more
@@ -43,7 +46,11 @@ class Mark:
 
 @dataclass(frozen=True)
 class Path:
-    """The path of a named point."""
+    """The path of a point during the motion.
+
+    name: name of the point. point: its index among the points of the drawing. instance: index of
+    the instance, if several are drawn over each other.
+    """
 
     name: str
     point: int
@@ -54,10 +61,10 @@ class Path:
 class Drawing:
     """A drawing of a mechanism at n instants.
 
-    points: (n, points, 2 or 3), in `unit`, not finite where a formula has no value. marks: in the
-    plane in drawing order, from back to front. axes: "xy", "xz" or "yz" in the plane, "xyz" in
-    space, where the axis with index `up` points upwards. names: the scene's names of the axes, if
-    it has any.
+    points: positions (n, number of points, 2 or 3) in `unit`, not finite if a formula has no value.
+    marks: the symbols drawn on the points, in a plane drawing ordered from back to front. paths:
+    paths of points. axes: "xy", "xz" or "yz" in the plane, "xyz" in space. names: the scene's own
+    names of the axes, empty if it has none. up: index of the axis that points upwards in space.
     """
 
     points: Array
@@ -70,26 +77,32 @@ class Drawing:
 
     @property
     def is_planar(self) -> bool:
-        """True if the drawing is in a plane."""
+        """True if the drawing is in a plane, False if it is in space."""
         return len(self.axes) == 2
 
     @property
     def max_extent(self) -> float:
-        """Largest extent of all points at one instant; 0 if no position is finite."""
+        """Largest extent of the mechanism along an axis at any one instant, in `unit`.
+
+        It is 0 if the positions are finite at no instant.
+        """
         with np.errstate(invalid="ignore"):
             sizes = np.ptp(self.points, axis=1).max(axis=1, initial=0.0)
         return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
     @property
     def travels(self) -> bool:
-        """True if the mechanism moves too far for one picture of its whole motion."""
+        """True if the mechanism moves too far for one picture of its whole motion.
+
+        The limit is TRAVEL_LIMIT times its own largest extent.
+        """
         finite = self.points[np.isfinite(self.points).all(axis=(1, 2))]
         range_ = float(np.ptp(finite, axis=(0, 1)).max(initial=0.0)) if len(finite) else 0.0
         return range_ > TRAVEL_LIMIT * self.max_extent > 0
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of the axes."""
+        """Names of the axes: those of the scene, or letters of `axes` if it has none."""
         return self.names or tuple(self.axes)
 
 
@@ -99,7 +112,10 @@ _ORDER = ("rail", "inertia", "box", "circle", "arm", "line", "rod", "spring", "d
 
 @dataclass
 class Marks:
-    """Collects the points and marks of a drawing at `count` instants; merges equal points."""
+    """Collects the points, marks and paths of a drawing at `count` instants.
+
+    Points with equal positions at all instants are merged.
+    """
 
     count: int
     points: list[Array] = field(default_factory=list)
@@ -108,7 +124,10 @@ class Marks:
     _index: dict[bytes, int] = field(default_factory=dict)
 
     def point(self, at: ArrayLike) -> int:
-        """Add a moving point (n, 3) or a fixed one (3,), and return its index."""
+        """Add a point and return its index.
+
+        at: positions (count, 3) of a moving point at all instants, or (3,) of a fixed point.
+        """
         path = np.ascontiguousarray(np.broadcast_to(np.asarray(at, dtype=float), (self.count, 3)))
         path = path + 0.0  # no zero has a sign
         key = blake2b(path.tobytes()).digest()
@@ -118,7 +137,10 @@ class Marks:
         return self._index[key]
 
     def add(self, kind: str, *points: int) -> None:
-        """Add a mark, unless it exists already or has zero length."""
+        """Add a mark of the given kind on the points with these indices (see `Mark`).
+
+        Nothing is added if the mark exists already, or if all its points are the same.
+        """
         if len(points) > 1 and len(set(points)) == 1:
             return
         mark = Mark(kind, points)
@@ -126,7 +148,7 @@ class Marks:
             self.marks.append(mark)
 
     def path(self, name: str, point: int) -> None:
-        """Add the path of a point if the point moves."""
+        """Add the path of the point with index `point`, named `name`, if the point moves."""
         moves = np.ptp(self.points[point], axis=0).max(initial=0.0) > 0
         if moves and point not in [p.point for p in self.paths]:
             self.paths.append(Path(name, point))
@@ -134,7 +156,10 @@ class Marks:
     def drawing(
         self, axes: str, unit: str = "m", names: tuple[str, ...] = (), up: int = 2
     ) -> Drawing | None:
-        """Return the drawing; None if it is empty."""
+        """Return the drawing of the collected points, or None if it has no marks and no paths.
+
+        The arguments are the fields of `Drawing` with these names.
+        """
         if not self.marks and not self.paths:
             return None
         ordered = sorted(self.marks, key=lambda mark: _ORDER.index(mark.kind))
@@ -149,7 +174,11 @@ class Marks:
 
 
 def superpose(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Drawing | None:
-    """Return one drawing of several instances, with one named path each; None if all are None."""
+    """Combine the drawings of several instances into one; the first path of each is kept.
+
+    names: names of the instances, which become the names of the paths. Returns None if all drawings
+    are None.
+    """
     points, marks, paths = list[Array](), list[Mark](), list[Path]()
     nonempty = [each for each in drawings if each]
     for instance, (each, name) in enumerate(zip(drawings, names, strict=True)):

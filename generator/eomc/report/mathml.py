@@ -16,10 +16,10 @@ _SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
 
 
 def lines(derived: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool, Markup]]]:
-    """Return the lines of the equations of motion, and of all other formulas, as MathML.
+    """Convert equations to MathML; return the equations of motion, and all other formulas.
 
-    Each line comes with True if it continues the previous one. Raises EomcError if latex2mathml is
-    not installed.
+    Both are lists of pairs (continues, MathML of one line), where continues is True if the line
+    continues the equation of the previous line. Raises EomcError if latex2mathml is not installed.
     """
     first, second = (
         [_line(x) for x in lines] for lines in equations_text.latex_lines(derived.set_out)

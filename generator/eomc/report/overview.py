@@ -22,11 +22,13 @@ Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
 
 @dataclass(frozen=True)
 class Overview:
-    """Contents of the overview, escaped for HTML.
+    """Data for the overview in the template report/report.html.jinja, escaped for HTML.
 
-    equations, rest: lines of MathML, each with True if it continues the previous line. text: plain
-    text that replaces equations which are too long, or which cannot be shown as MathML. motion: a
-    figure as SVG, empty without matplotlib, and its caption.
+    note: the scene's note. coordinates, parameters, inputs, outputs: rows of tables, each with
+    name, value, unit and note. equations, rest: the equations of motion and all other formulas, as
+    pairs (True if the line continues the previous one, MathML of the line). text: plain text in
+    place of equations that are too long or can't be converted to MathML. motion: figure of the
+    motion as SVG, empty without matplotlib. caption: caption of the figure.
     """
 
     note: Markup
@@ -42,7 +44,11 @@ class Overview:
 
 
 def describe_scene(system: System, report: Report, root: Path) -> Overview:
-    """Return the overview of a scene, with the motion of the fastest run of six digits."""
+    """Return the overview of a scene: its tables, its equations and a figure of its motion.
+
+    The figure shows the fastest run of the report that has six correct digits, or else the most
+    accurate run. root: build directory.
+    """
     first, rest, text = _equations(system)
     motion, caption = _motion(system, report, root)
     return Overview(

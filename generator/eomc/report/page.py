@@ -26,7 +26,8 @@ more than the motion. Rounding from: the h below which finer steps don't help.""
 def recommendation(report: Report, digits: float, to: float | None = None) -> str:
     """Return one recommendation, such as "for 6 digits up to t = 10 s: dp8 with h = 40 ms, ...".
 
-    If `to` is given, the recommendation is for `digits` to `to` digits.
+    It names the fastest stepper of the report whose errors allow `digits` correct digits at all
+    times. If `to` is given, the text is for the range from `digits` to `to` digits.
     """
     best = report.best(digits)
     span = f"{digits:g}" if to is None or to == digits else f"{digits:g} to {to:g}"
@@ -59,7 +60,11 @@ def _step_text(p: Point) -> str:
 
 
 def recommendations(report: Report) -> list[str]:
-    """Return one recommendation for each range of digits, also for digits out of reach."""
+    """Return recommendations of steppers (see `recommendation`) for 3 to 15 correct digits.
+
+    Numbers of digits for which the same run is the fastest share one recommendation. If no stepper
+    reaches a number of digits, the text states this.
+    """
     spans: list[tuple[Point | None, list[int]]] = []
     for digits in DIGITS:
         best = report.best(digits)
@@ -70,7 +75,11 @@ def recommendations(report: Report) -> list[str]:
 
 
 def digit_rows(report: Report) -> list[tuple[str, ...]]:
-    """Return a table row per number of digits: stepper, h, steps, evaluations and time."""
+    """Return the rows of the table of the fastest run for each number of correct digits.
+
+    The cells of a row are texts: digits, stepper, step size or tolerance, number of steps, number
+    of evaluations and computing time.
+    """
     table_rows: list[tuple[str, ...]] = []
     for digits in DIGITS:
         p = report.best(digits)
@@ -83,7 +92,10 @@ def digit_rows(report: Report) -> list[tuple[str, ...]]:
 
 
 def remarks(report: Report) -> list[str]:
-    """Return remarks on chaos, the accuracy of the reference, the condition of D, and events."""
+    """Return sentences on chaos, the accuracy of the reference solution, the condition of D, etc.
+
+    Further sentences name events, non-smooth functions and steppers that can't be used.
+    """
     g = report.growth
     sentences = [
         f"A small difference at the start grows {g.amplification[-1]:.2g}-fold in "
@@ -129,7 +141,7 @@ def remarks(report: Report) -> list[str]:
 
 
 def table(report: Report) -> str:
-    """Return the table of steppers, the recommendations and the remarks as text for a terminal."""
+    """Return the report as text for a terminal: table of steppers, recommendations and remarks."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -149,7 +161,12 @@ def table(report: Report) -> str:
 
 
 def rows(report: Report) -> list[tuple[str, ...]]:
-    """Return a table row for each stepper."""
+    """Return the rows of the table of steppers, one for each stepper in the report.
+
+    The cells of a row are texts: stepper, order, observed order, usable h, stable h, smallest
+    error, step size of the run with that error, its computing time, and the h at which rounding
+    begins to limit the error.
+    """
     table_rows: list[tuple[str, ...]] = []
     for line in report.lines:
         p = min(line.points, key=lambda p: p.along)
@@ -163,7 +180,10 @@ def rows(report: Report) -> list[tuple[str, ...]]:
 
 
 def as_dict(report: Report) -> dict[str, Any]:
-    """Return the report as a dictionary for JSON, without the energies over time."""
+    """Return the report as a dictionary for JSON, without the energy errors over time.
+
+    It also contains the best run for each number of digits, the recommendations and the remarks.
+    """
     best = {str(digits): report.best(digits) for digits in DIGITS}
     fields = asdict(report) | {
         "best": {digits: asdict(p) if p else None for digits, p in best.items()},
@@ -187,8 +207,8 @@ def _for_json(value: Any) -> Any:
 def page(report: Report, overview: Overview | None = None) -> str:
     """Return the report as one HTML page with embedded figures.
 
-    `overview` describes the scene. Without matplotlib the page has no figures and states the
-    reason.
+    overview: description of the scene that the page begins with. If matplotlib is not installed,
+    the page has no figures and states the reason.
     """
     shown = report.best(6) or report.finest
     runs = [

@@ -35,7 +35,7 @@ def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve 
     """Return the picture of a run: its mechanism, a phase portrait (nq = 1) or a path (nq = 2).
 
     `t` (n,) is in s; `q` and `qd` have shape (n, nq). The mechanism is drawn if the scene describes
-    its shape. Returns None for more coordinates without a shape.
+    its shape. Returns None if it does not and nq > 2, or if `t` is empty.
     """
     if not len(t):
         return None
@@ -51,7 +51,10 @@ def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve 
 
 
 def of_run(run: Any) -> Mechanism | None:
-    """Return the mechanism of a run; None if its scene is unknown or describes no shape."""
+    """Return the picture of the mechanism of a run at its stored times.
+
+    Returns None if the scene of the run is unknown or does not describe the shape of the mechanism.
+    """
     try:
         system = system_of(run)
     except EomcError:
@@ -63,14 +66,17 @@ def of_run(run: Any) -> Mechanism | None:
 
 @dataclass(frozen=True)
 class Curve:
-    """One quantity against another: a phase portrait or a path in configuration space."""
+    """A plot of one quantity against another: a phase portrait or a path in configuration space.
+
+    values: (n, 2), horizontal and vertical. labels: of the two axes.
+    """
 
     values: Array
     labels: tuple[str, str]
     title: str
 
     def draw(self, axes: Axes) -> None:
-        """Draw the path, with a ring at its start and a dot at its end."""
+        """Draw the curve into `axes`, with a ring at its start and a dot at its end."""
         axes.plot(*self.values.T, color=COLOURS[0])
         plain(axes)
         axes.plot(*self.values[0], "o", color=COLOURS[0], markerfacecolor="white", markersize=5)
@@ -83,13 +89,16 @@ class Curve:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A mechanism at several instants of a run, from light to dark, with paths of its points."""
+    """A picture of a mechanism at several instants of a run, with the paths of its points.
+
+    t: times (n,), s. drawing: the drawing at these times. Earlier instants are drawn lighter.
+    """
 
     t: Array
     drawing: Drawing
 
     def draw(self, axes: Axes) -> None:
-        """Draw the mechanism: in the plane with axes, in space seen slightly from above."""
+        """Draw the picture into `axes`. A mechanism in space is seen slightly from above."""
         picture = self.drawing
         flat = self._near(project_points(picture))
         paths = [(p.name, flat[:, p.point]) for p in picture.paths]
@@ -155,7 +164,10 @@ def _name(name: str) -> str:
 
 
 def view_basis(up: int) -> Array:
-    """Return the unit vectors to the right, upwards and towards the viewer, one per row."""
+    """Return the unit vectors to the right, upwards and towards the viewer as rows of a 3x3 matrix.
+
+    They define the view of drawings in space. up: index (0, 1, 2) of the axis that points upwards.
+    """
     a, e = np.radians([AZIMUTH, ELEVATION])
     right = [-np.sin(a), np.cos(a), 0.0]
     above = [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]
@@ -164,12 +176,19 @@ def view_basis(up: int) -> Array:
 
 
 def project_points(picture: Drawing) -> Array:
-    """Return the points in the plane of the picture, (n, points, 2)."""
+    """Return the points of a drawing projected onto the plane of the picture.
+
+    The result has shape (n, number of points, 2), for n instants.
+    """
     return picture.points if picture.is_planar else picture.points @ view_basis(picture.up)[:2].T
 
 
 def frame(axes: Axes, picture: Drawing, flat: Array) -> None:
-    """Set equal scales for the whole motion; draw axes in the plane, three arrows in space."""
+    """Set equal scales and limits of `axes` that contain the whole motion, and draw its axes.
+
+    flat: the points projected onto the plane of the picture, (n, number of points, 2). A plane
+    drawing gets labelled axes, a drawing in space three arrows and a scale.
+    """
     low, high = _bounds(flat)
     size = max(float((high - low).max()), 1e-9)
     margin = 0.06 * size
@@ -218,9 +237,11 @@ SKIPPED = frozenset(("rail", "arm", "inertia"))  # at earlier instants
 def draw_marks(
     axes: Axes, picture: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
 ) -> list[Line2D]:
-    """Draw the marks at one instant; with `shade`, in grey and without symbols.
+    """Draw the marks of a drawing at one instant into `axes`; return the matplotlib lines.
 
-    hues: the colours of the instances, if several are drawn over each other.
+    flat: the projected points at that instant, (number of points, 2). shade: grey level such as
+    "0.8" for an earlier instant, drawn without symbols; "" for full colours. hues: the colours of
+    the instances, if several are drawn over each other.
     """
     return [
         line
@@ -232,10 +253,11 @@ def draw_marks(
 def shapes(
     picture: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
 ) -> Iterator[tuple[Array, dict[str, Any]]]:
-    """Yield the lines and symbols of the marks, (k, 2) each, with their style.
+    """Yield the lines and symbols of all marks at one instant, as pairs (points, style).
 
-    Their number does not depend on the instant. Points are not finite where a point of the mark is
-    not.
+    points: array (k, 2). style: keyword arguments for `axes.plot`. The arguments are those of
+    `draw_marks`. The number of pairs is the same at every instant, so that a film can update the
+    lines. If a point of a mark is not finite, all points of its lines are nan.
     """
     widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
     width = 0.02 * float(widest)
@@ -272,7 +294,12 @@ def shapes(
 
 
 def outline(mark: Mark, points: Array, width: float, offset: float) -> Iterator[Array]:
-    """Yield the lines of a mark, (k, 2) each. offset: sideways shift of parallel springs."""
+    """Yield the lines that draw a mark, as arrays of points (k, 2).
+
+    points: projected positions of the points of the mark, (number of points, 2). width: half the
+    width of a coil or dashpot. offset: sideways shift of a spring, and opposite shift of a damper,
+    if both are drawn between the same points. Both lengths are in the unit of `points`.
+    """
     if mark.kind in ("box", "inertia"):
         yield from _box(points)
     elif mark.kind == "circle":

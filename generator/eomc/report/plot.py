@@ -48,15 +48,17 @@ def draw(
     ----------
     system : System
     t, q, qd, energy : arrays (n,), (n, nq), (n, nq) and (n,)
-        Times in s, positions, velocities and K + P.
+        Times in s, coordinates, velocities and total energy K + P.
     path : path
         The suffix determines the format: .png, .svg or .pdf.
     jacobi : array (n,), optional
         Jacobi's integral, if it differs from the energy.
     title : str, optional
+        Heading in place of the title of the system.
     outputs, inputs : mapping from names to arrays (n,), optional
+        Outputs and inputs to plot.
     words : str, optional
-        The energy balance in words.
+        The energy balance in words, for the heading of the plot of the energy.
     wrap : bool, optional
         Show angles in the range from -pi to pi.
 
@@ -80,7 +82,7 @@ def draw(
 
 
 def without_pictures() -> str:
-    """Return why a page has no pictures and the remedy; "" if matplotlib is installed."""
+    """Return a message that pictures need matplotlib, or "" if matplotlib is installed."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
@@ -89,7 +91,7 @@ def without_pictures() -> str:
 
 
 def svg(figure: Figure) -> Markup:
-    """Return a figure as SVG text for a page; equal figures give equal text."""
+    """Return a matplotlib figure as SVG text for an HTML page; equal figures give equal text."""
     import matplotlib
 
     text = io.StringIO()
@@ -103,7 +105,10 @@ def figure(
     jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
     inputs: Outputs = _NONE, wrap: bool = False,
 ) -> Figure:  # fmt: skip
-    """Return the figure of a run; the arguments are those of `draw`."""
+    """Return the matplotlib figure of a run; the arguments are those of `draw`.
+
+    Raises EomcError if matplotlib is not installed.
+    """
     try:
         import matplotlib.figure
     except ImportError:

@@ -62,11 +62,12 @@ MIN_PLAIN_DIGITS = 26.0  # of accelerations: with fewer, the equations differ
 
 @dataclass(frozen=True)
 class Reference:
-    """Positions and velocities `q`, `qd` (n, nq) at times `t` (n,), as decimal texts of 37 digits.
+    """A reference solution: coordinates `q` and velocities `qd` (n, nq) at times `t` (n,) in s.
 
-    digits (n,): digits to which both computations agree so far, relative to the largest value of
-    each coordinate. plain: agreement with the equations evaluated in mpmath, as (digits of the
-    accelerations, digits of the motion, last compared time); None if these equations are too large.
+    q, qd: decimal texts of 37 digits. digits: (n,), number of digits to which two independent
+    computations agree up to each time, relative to the largest value of each coordinate. plain:
+    agreement with the symbolic equations evaluated with mpmath, as (digits of the accelerations,
+    digits of the motion, last compared time in s); None if these equations are too large.
     """
 
     t: Vector
@@ -77,7 +78,10 @@ class Reference:
 
     @cached_property
     def halves(self) -> tuple[Vector, Vector]:
-        """x = [q; q̇] as an unevaluated sum of doubles, (high, low), each of shape (n, 2 nq)."""
+        """The states x = [q; q̇] as two arrays of doubles (high, low), each (n, 2 nq).
+
+        The exact state is high + low; `high` is the state rounded to double precision.
+        """
         x = np.hstack([self.q, self.qd])
         high = x.astype(float)
         exact = (Fraction(text) - Fraction(h) for text, h in zip(x.flat, high.flat, strict=True))
@@ -85,12 +89,16 @@ class Reference:
 
     @property
     def scale(self) -> Vector:
-        """Largest magnitude of each component of x = [q; q̇], (2 nq,); 1 instead of 0."""
+        """Largest magnitude of each component of x = [q; q̇] over time, (2 nq,); 1 instead of 0."""
         size = np.max(np.abs(self.halves[0]), axis=0)
         return np.where(size > 0, size, 1.0)
 
     def error_of(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
-        """Return states minus the reference at the given rows, (n, 2 nq), accurate to rounding."""
+        """Return the error of the states [q; q̇] against the reference, (n, 2 nq).
+
+        q, qd: coordinates and velocities (n, nq) of a run. rows: the indices of the reference's
+        times at which these states are, all by default. The difference is accurate to rounding.
+        """
         high, low = self.halves
         return np.asarray((np.hstack([q, qd]) - high[rows]) - low[rows])
 
@@ -101,7 +109,9 @@ def solve(
     rows: int = 256,
     root: str | os.PathLike[str] = "build",
 ) -> Reference:
-    """Compute the reference solution of a scene, from its initial state and with its signals.
+    """Compute the reference solution of a scene from its initial state.
+
+    The inputs follow their default signals.
 
     Parameters
     ----------
@@ -109,8 +119,8 @@ def solve(
     duration : float, optional
         In s; the scene's duration by default.
     rows : int, optional
-        A power of two; the solution has rows + 1 rows, so that runs with h = duration/2^k meet
-        them.
+        Number of equal intervals between the rows + 1 times of the solution; a power of two, so
+        that steps of h = duration/2^k end at these times.
     root : path, optional
         Build directory. The solution is cached in `root`/<name>/.
 
@@ -243,8 +253,9 @@ def _run(
 
 @cache
 def gauss(stages: int) -> str:
-    """Return c, A, A A, b, b A and Legendre weights of the Gauss method, to 40 digits.
+    """Return the coefficients of the Gauss method with `stages` stages as text, to 40 digits.
 
+    The text contains the number of stages, c, A, A A, b, b A and weights, separated by blanks.
     Nodes are the zeros of the Legendre polynomial P_s on [0, 1], a_ij = int_0^c_i l_j, by the exact
     rule l_j = b_j sum_k (2k + 1) P_k(c_j) P_k (Hairer & Wanner, Solving ODEs II, sec. IV.5). The
     weights
@@ -367,7 +378,10 @@ class _PlainEquations:
         self.signals = compiled(symbols, list(r.signals), "mpmath")
 
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
-        """Solve D q̈ = τ - bias + Aᵀλ for q̈."""
+        """Solve D q̈ = τ - bias + Aᵀλ for the accelerations q̈ at (q, q̇, t); return them as a list.
+
+        All numbers are of mpmath.
+        """
         u = [mpmath.mpf(0)] * self.m
         if self.m:
             u = self.signals(*q, *qd, t, *u, *self.parameters)
@@ -383,7 +397,11 @@ class _PlainEquations:
         return accelerations
 
     def advance(self, x: list[Any], t: Any, span: Any, deadline: float) -> list[Any] | None:
-        """Return the state after `span` by extrapolated midpoint steps; None after the deadline."""
+        """Integrate from the state x = [q; q̇] at time `t` over `span` (s); return the final state.
+
+        The method is the extrapolated midpoint rule. Returns None if the clock `time.monotonic`
+        passes `deadline`.
+        """
         parts = 1
         while (state := self._extrapolated_step(x, t, span / parts, deadline)) is None:
             if time.monotonic() > deadline or parts > 1000:

@@ -38,9 +38,10 @@ ARRAYS: Mapping[str, Any] = {
 
 
 def draw_declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> Drawing | None:
-    """Return the drawing of what a scene declares; None if it declares nothing.
+    """Draw the bodies, joints, springs and [picture] that a scene declares, at n instants.
 
-    values: parameters by name, numbers or (n,). `t` (n,) is in s; `q` has shape (n, nq).
+    values: parameters by name, each a number or an array (n,). t: times (n,), s. q: coordinates
+    (n, nq). Returns None if the scene declares nothing that can be drawn.
     """
     with np.errstate(all="ignore"):  # what has no value is not drawn
         return _Sketch(scene, values, t, q).drawing()

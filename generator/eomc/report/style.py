@@ -14,7 +14,10 @@ INK, FAINT = "#333333", "#DDDDDD"
 
 
 def colours(count: int) -> tuple[str, ...]:
-    """Return `count` distinct colours, hues from red to violet if COLOURS has too few."""
+    """Return `count` distinct colours as texts such as "#0072B2".
+
+    They are the first of COLOURS, or hues from red to violet if COLOURS has too few.
+    """
     if count <= len(COLOURS):
         return COLOURS[:count]
     hues = (k / count * 5 / 6 for k in range(count))
@@ -23,7 +26,10 @@ def colours(count: int) -> tuple[str, ...]:
 
 
 def plain(axes: Axes, lines: bool = True) -> None:
-    """Format axes: a light grid, no box, and thin lines for the curves drawn so far."""
+    """Format matplotlib axes: a light grid, no box, and thin lines for the curves drawn so far.
+
+    lines: False to leave the width of the curves unchanged.
+    """
     axes.grid(True, color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -16,14 +16,15 @@ Source = str | os.PathLike[str] | System
 
 
 def system_of(run: Any, scene: Source | None = None) -> System:
-    """Return the system of a run, with the run's parameter values.
+    """Return the system that a run was simulated with, with the parameter values of the run.
 
     Parameters
     ----------
     run : Run or batch of runs
-        Of a batch, the parameter values are those of the first instance.
+        For a batch, the parameter values are those of the first instance.
     scene : path or System, optional
-        Needed if the module was not loaded with `eomc.load`.
+        The scene or system that the module was built from. Needed only if the module was not
+        loaded with `eomc.load`.
 
     Returns
     -------

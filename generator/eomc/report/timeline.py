@@ -26,9 +26,9 @@ MAX_KEY_PARAMETERS = 2  # that differ between the instances, in the key
 
 @dataclass(frozen=True)
 class Line:
-    """A curve: its name and its values at the rows that are shown.
+    """A curve against time: its name and its values at the stored times that are shown.
 
-    stairs: whether it is an input that is held constant from one row to the next.
+    stairs: True for an input that is held constant from one time to the next (zero-order hold).
     """
 
     name: str
@@ -38,7 +38,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves that share axes, and their unit. name: the quantity, if all curves show the same."""
+    """Curves that share one pair of axes, and their unit.
+
+    name: the quantity, if all curves show the same quantity for different instances, else "".
+    """
 
     unit: str
     lines: tuple[Line, ...]
@@ -46,7 +49,10 @@ class Panel:
 
 
 class Timeline:
-    """The drawing and the curves of one run of a system."""
+    """The data of one run for an animation: the drawing of the mechanism and curves against time.
+
+    t: times (n,) of the run's rows (stored states), s.
+    """
 
     key: tuple[str, ...] = ()  # a label for each instance of a batch
 
@@ -57,13 +63,14 @@ class Timeline:
 
     @property
     def curves(self) -> int:
-        """Approximate number of curves to draw."""
+        """Approximate number of curves in all panels."""
         return 2 * len(self.system.q) + 1
 
     def resample(self, count: int) -> bool:
-        """Replace the rows of an adaptive run by `count` equidistant, interpolated ones.
+        """Replace the stored states of an adaptive run by `count` interpolated ones.
 
-        Returns False, and changes nothing, if the run has fixed steps.
+        The new states are equidistant in time. Returns True if they were replaced; returns False
+        and changes nothing if the run has fixed steps or no duration.
         """
         run = self.run
         if not (hasattr(run, "_evenly") and len(run) > 1 and run.t[-1] > run.t[0]):
@@ -73,13 +80,17 @@ class Timeline:
         return True
 
     def drawing(self, rows: Rows) -> Drawing | None:
-        """Return the drawing at some rows; None if the scene does not describe its shape."""
+        """Return the drawing at the stored times with the indices `rows`.
+
+        Returns None if the scene does not describe the shape of the mechanism.
+        """
         return drawing(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
 
     def panels(self, rows: Rows) -> Iterator[Panel]:
-        """Yield panels of coordinates, outputs and inputs, then the energy.
+        """Yield the panels with curves of coordinates, outputs and inputs, then that of the energy.
 
-        Few curves have a panel each; otherwise all curves of a unit share one.
+        rows: indices of the stored times that the curves show. If there are few curves, each has a
+        panel of its own; otherwise all curves with the same unit share a panel.
         """
         system, run = self.system, self.run
         q = np.asarray(run.q, dtype=float)[rows]
@@ -102,7 +113,11 @@ class Timeline:
 
 
 class BatchTimeline(Timeline):
-    """The drawing and the curves of some instances of a batch, superimposed."""
+    """The data of several instances of a batch for an animation that shows them superimposed.
+
+    names: quantities to plot, by default coordinates and the energy. chosen: number of instances to
+    show, or the list of their indices.
+    """
 
     def __init__(self, system: System, batch: Any, names: Sequence[str], chosen: Any) -> None:
         numbers = instance_numbers(len(batch), chosen)
@@ -127,15 +142,21 @@ class BatchTimeline(Timeline):
 
     @property
     def curves(self) -> int:
-        """Number of curves to draw."""
+        """Number of curves in all panels: one for each quantity and instance."""
         return len(self.names) * len(self.numbers)
 
     def drawing(self, rows: Rows) -> Drawing | None:
-        """Return the drawing of all instances; one that has stopped keeps its last position."""
+        """Return the drawing of all chosen instances at the stored times with the indices `rows`.
+
+        An instance whose run has ended keeps its last position.
+        """
         return drawings(self.systems, self.t[rows], self.q[:, rows], self.numbers)
 
     def panels(self, rows: Rows) -> Iterator[Panel]:
-        """Yield one panel for each name, with a curve for each instance."""
+        """Yield one panel for each quantity in `names`, with a curve for each instance.
+
+        rows: indices of the stored times that the curves show.
+        """
         source = Source(self.run)
         for curve in map(source.curve, self.names):
             lines = (Line(n, x[rows]) for n, x in zip(self.numbers, curve.values, strict=True))
@@ -143,9 +164,10 @@ class BatchTimeline(Timeline):
 
 
 def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:
-    """Return the numbers of the instances to show, out of `count`. Raises EomcError.
+    """Return the indices of the instances to show, for a batch of `count` instances.
 
-    chosen: how many, spread over the batch, or a list of their numbers.
+    chosen: how many to show, spread evenly over the batch, or the list of their indices. Raises
+    EomcError if an index does not exist or if there are more than MAX_INSTANCES.
     """
     requested: Any = chosen
     if isinstance(chosen, (int, np.integer)) and not isinstance(chosen, bool) and chosen > 0:
@@ -168,7 +190,7 @@ def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:
 
 
 def select_instances(batch: Any, numbers: Sequence[int]) -> Any:
-    """Return a batch of the instances `numbers` only."""
+    """Return a copy of a batch that contains only the instances with the indices `numbers`."""
     fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "_codes")}
     for name in ("_params", "_row_inputs"):  # one row if all instances share it
         values = getattr(batch, name)
