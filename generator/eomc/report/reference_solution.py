@@ -94,7 +94,7 @@ class Reference:
         return np.where(size > 0, size, 1.0)
 
     def error_of(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
-        """Return the error of the states [q; q̇] against the reference, (n, 2 nq).
+        """Return the error of the states [q; q̇], states minus reference, of shape (n, 2 nq).
 
         q, qd: coordinates and velocities (n, nq) of a run. rows: the indices of the reference's
         times at which these states are, all by default. The difference is accurate to rounding.

@@ -35,7 +35,8 @@ class Body:
     joint : str
         Key of joints.JOINTS; "" if the body is placed by formulas.
     coordinates : tuple of Formula
-        One for each motion of the joint: a coordinate of the scene or a formula of coordinates.
+        Displacement of each elementary motion of the joint (see joints.Joint): a coordinate of the
+        scene, or a formula of coordinates. In rad or m.
     axes : tuple of vectors
         Unit vectors in the joint's frame.
     offset, rotation : vector in m, and tuple of Turn
@@ -79,11 +80,12 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Where a spring or damper acts: along a coordinate, between points, or between angles.
+    """Where a spring or damper acts: along a coordinate, between two points, or between two angles.
 
-    coordinate: the coordinate, "" if it acts between `bodies`. points: its ends in the frames of
-    the bodies, m. turning: True if it acts on the angle of the second body minus that of the first,
-    in the plane; then there are no points.
+    coordinate: name of the coordinate, "" if the element acts between two bodies. bodies: names of
+    the two bodies. points: end of the element in the frame of each body, m. turning: True if the
+    element acts on the angle of the second body minus that of the first, in the plane; then there
+    are no points.
     """
 
     coordinate: str = ""
@@ -94,7 +96,10 @@ class Between:
 
 @dataclass(frozen=True, kw_only=True)
 class Spring(Between):
-    """A spring. stiffness: N/m or N m/rad. length: rest length, rest angle or rest position."""
+    """A linear spring.
+
+    stiffness: N/m or N m/rad. length: rest length or rest position (m), or rest angle (rad).
+    """
 
     stiffness: Formula
     length: Formula
@@ -102,7 +107,7 @@ class Spring(Between):
 
 @dataclass(frozen=True, kw_only=True)
 class Damper(Between):
-    """A damper with the force -damping times the rate. damping: N s/m or N m s/rad."""
+    """A linear damper, whose force is -damping times the rate. damping: N s/m or N m s/rad."""
 
     damping: Formula
 
@@ -125,10 +130,11 @@ class Force:
 class Loop:
     """A joint that closes a loop in a tree of bodies, or a gear between two coordinates.
 
-    joint: key of joints.CLOSINGS. points (m) and axes (unit vectors): in the frames of the first
-    and the second of the `bodies`, one of which may be "world". rotation: of the second body's
-    frame relative to the first. length: of a distance, m. A gear keeps the second of its
-    `coordinates` at ratio times the first plus offset.
+    joint: key of joints.CLOSINGS. bodies: names of the two bodies, one of which may be "world".
+    points: position of the joint in the frame of each body, m. axes: unit vector of its axis in the
+    frame of each body. rotation: rotation of the second body's frame relative to the first one's.
+    length: distance in m that a joint of kind "distance" keeps. coordinates, ratio, offset: a gear
+    keeps the second coordinate at ratio times the first plus offset.
     """
 
     name: str
@@ -144,21 +150,33 @@ class Loop:
     note: str = ""
 
     def rows(self, plane: bool) -> dict[str, str]:
-        """Return the constraint equations and the name of each."""
+        """Return the names of the constraint equations of the joint, by kind of equation.
+
+        The kinds, such as "x" or "rz", are those of `joints.Closing`. plane: True for a plane
+        scene, False for a scene in space. A single equation has the name of the loop, several have
+        names such as "<loop>_x".
+        """
         kinds = CLOSINGS[self.joint].rows(plane)
         if len(kinds) == 1:
             return {kinds[0]: self.name}
         return {kind: f"{self.name}_{kind}" for kind in kinds}
 
     def reactions(self, plane: bool) -> tuple[str, ...]:
-        """Return the names of the reaction components for outputs; a gear has none."""
+        """Return the names of the components of the joint's reaction force and moment in outputs.
+
+        An example is "<loop>_force_x". plane: True for a plane scene. A gear has no reactions.
+        """
         parts = () if self.joint == "gear" else REACTIONS[plane]
         return tuple(f"{self.name}_{part}" for part in parts)
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The bodies, parents before children, and what acts on them; gravity in m/s^2."""
+    """The bodies of a scene and the springs, dampers, forces and loops between them.
+
+    plane: True if the scene is plane. gravity: acceleration of gravity, m/s^2. bodies: ordered so
+    that each parent precedes its children.
+    """
 
     plane: bool
     gravity: Vector

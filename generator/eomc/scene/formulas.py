@@ -112,7 +112,10 @@ _TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
 
 
 class FormulaError(ValueError):
-    """An error in a formula, at characters `column` to `column + width`."""
+    """An error in a formula.
+
+    It is in the `width` characters of the formula's text that begin at index `column`.
+    """
 
     def __init__(self, message: str, column: int = 0, width: int = 1) -> None:
         super().__init__(message)
@@ -123,24 +126,30 @@ class FormulaError(ValueError):
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula that has passed the whitelist. `tree` must not be changed."""
+    """A formula that contains only permitted syntax.
+
+    text: the formula as written. tree: its Python syntax tree, which must not be changed.
+    """
 
     text: str
     tree: ast.expr
 
     @property
     def shown(self) -> str:
-        """The text, shortened if it is long."""
+        """The text for messages, shortened to 80 characters."""
         return self.text if len(self.text) <= 80 else self.text[:79] + "…"
 
     def names(self) -> Iterator[ast.Name]:
-        """Yield the names used as values (not functions, not pi), in reading order."""
+        """Yield the syntax nodes of the names of quantities in the formula, from left to right.
+
+        Names of functions and pi are left out. A name that occurs twice is yielded twice.
+        """
         called = {id(n.func) for n in ast.walk(self.tree) if isinstance(n, ast.Call)}
         nodes = [n for n in ast.walk(self.tree) if isinstance(n, ast.Name) and id(n) not in called]
         yield from sorted((n for n in nodes if n.id != "pi"), key=lambda n: n.col_offset)
 
     def calls(self, *functions: str) -> Iterator[ast.Call]:
-        """Yield the calls of the given functions."""
+        """Yield the syntax nodes of the calls of functions with the given names."""
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 if node.func.id in functions:
@@ -148,7 +157,10 @@ class Formula:
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return the known name most similar to `name`, or ""."""
+    """Return the name in `known` that is most similar to `name`, or "" if none is similar.
+
+    cutoff: smallest similarity, from 0 to 1, as in `difflib.get_close_matches`.
+    """
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
     with_prefix = [k for k in known if k.startswith(name)] if len(name) > 2 else []  # tol, dir
@@ -161,13 +173,19 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Return `"; did you mean 'm_c'?"` if a known name is similar, else ""."""
+    """Return a suggestion for an unknown name, such as "; did you mean 'm_c'?".
+
+    known: the names that can be suggested. Returns "" if none of them is similar to `name`.
+    """
     near = nearest(name, known)
     return f"; did you mean '{texts.line(near)}'?" if near else ""
 
 
 def parse(text: str) -> Formula:
-    """Parse and check a formula. Raises FormulaError with the place of the error."""
+    """Parse the text of a formula, check that it has only permitted syntax, and return it.
+
+    Raises FormulaError, which contains the place of the error in the text, its length and a remedy.
+    """
     # newlines are layout in a multi-line TOML string, as inside parentheses
     line = text.replace("\n", " ").replace("\t", " ").strip(" ")
     if len(line) > MAX_LENGTH:
@@ -365,16 +383,17 @@ def _number(formula: Formula, node: ast.expr) -> float | None:
 
 
 def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str], Any]) -> Any:
-    """Return the value of a formula.
+    """Evaluate a formula with the given functions and values, and return its value.
 
-    `algebra` maps function names, "pi" and "number" (a function of the literal's text) to callables
-    and values; `lookup` returns the value of every other name. Exceptions of these are passed on.
+    algebra: maps the name of each function to a callable, "pi" to a value, and "number" to a
+    callable that converts the text of a number. With `NUMERIC` the values are floats. lookup:
+    returns the value of any other name. Exceptions of these callables are not caught.
     """
     return _walk(formula, formula.tree, algebra, lookup)
 
 
 def fold_values(formula: Formula, values: Mapping[str, float]) -> str:
-    """Return the formula as text, with names replaced by values."""
+    """Return the text of a formula in which the names in `values` are replaced by their values."""
 
     class Folded(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:

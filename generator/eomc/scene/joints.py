@@ -16,12 +16,13 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Joint:
-    """A kind of joint.
+    """A kind of joint, as a sequence of elementary motions with one coordinate each.
 
-    motions: "r" (rotation) or "t" (translation) for each coordinate, in the scene's order. axes:
-    the axis of each motion, or the index (0, 1) of the scene's axis that it takes. defaults: axes
-    of a scene that gives none; empty if it must give them. plane: True if plane scenes may have it.
-    order: explains the order of the coordinates. aliases: names in other programs and textbooks.
+    motions: a letter for each motion, "r" for a rotation or "t" for a translation, in the order of
+    the coordinates in the scene. axes: the axis of each motion, or the index (0 or 1) of the axis
+    in the scene that the motion takes. defaults: axes for a scene that gives none; empty if the
+    scene must give them. plane: True if the joint can be used in plane scenes. order: explanation
+    of the order of the coordinates. aliases: names of the joint in other programs and textbooks.
     """
 
     motions: str
@@ -33,11 +34,14 @@ class Joint:
 
     @property
     def axis_count(self) -> int:
-        """Number of axes that the scene chooses: 0, 1 or 2."""
+        """Number of axes that a scene can give for the joint: 0, 1 or 2."""
         return max((axis + 1 for axis in self.axes if isinstance(axis, int)), default=0)
 
     def motion_axes(self, scene_axes: Sequence[Axis]) -> tuple[Axis, ...]:
-        """Return the axis of each motion, given the axes of the scene."""
+        """Return the axis of each elementary motion.
+
+        scene_axes: the axes that the scene gives for the joint; if empty, the defaults are taken.
+        """
         chosen = scene_axes or self.defaults
         return tuple(chosen[a] if isinstance(a, int) else a for a in self.axes)
 
@@ -68,15 +72,22 @@ JOINTS = {
 
 @dataclass(frozen=True)
 class Closing:
-    """Constraints of a joint that closes a loop between two bodies of a tree.
+    """The constraint equations of a kind of joint that closes a loop between two bodies.
 
-    plane, space: the constraints in the plane and in space, empty if there is no such joint. x, y,
-    z: the vector from the first body's point to the second's, along the axes of their common
-    ancestor. u, v: the same along two directions perpendicular to the first axis. ru, rv: tilt of
-    the second axis from the first, about u and v. rx, ry, rz: rotation of the second frame relative
-    to the first. cross: the cosine between two axes. length, ratio: the only constraint of a
-    distance or gear. axes: number of axes in space; in the plane one, if u is a constraint.
-    defaults: axes of a scene that gives none.
+    plane, space: kinds of its constraint equations in plane scenes and in space; empty if the joint
+    does not exist there. axes: number of axes in space; in the plane the joint has one if "u" is a
+    constraint. defaults: axes for a scene that gives none. aliases: names of the joint in other
+    programs and textbooks.
+
+    Each kind of constraint equation keeps a quantity at zero or constant:
+
+    - x, y, z: vector from the first body's point to the second body's point, along the axes of
+      their common ancestor.
+    - u, v: the same vector along two directions perpendicular to the first axis.
+    - ru, rv: tilt of the second axis from the first, about u and v.
+    - rx, ry, rz: rotation of the second frame relative to the first.
+    - cross: cosine of the angle between two axes.
+    - length, ratio: the only constraint equation of a distance or of a gear.
     """
 
     plane: tuple[str, ...] = ()
@@ -86,7 +97,7 @@ class Closing:
     aliases: tuple[str, ...] = ()
 
     def rows(self, plane: bool) -> tuple[str, ...]:
-        """Return the constraints in the plane or in space."""
+        """Return the kinds of constraint equations, in plane scenes (True) or in space (False)."""
         return self.plane if plane else self.space
 
 

@@ -48,7 +48,12 @@ _OF_FORCES = {"body", "point", "force", "torque", "frame"}
 
 
 def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
-    """Return the intended table for [[parameter]] and the like, with its entries, or None."""
+    """Convert an array of tables that a scene should write as one table, such as [[parameter]].
+
+    name: the name of the array as written. entries: its value in the TOML tree. Returns the name of
+    the intended table, such as "parameters", and its entries by name; None if no single table is
+    meant.
+    """
     table = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
     if table is None or not isinstance(entries, list) or not entries:
         return None
@@ -67,7 +72,10 @@ def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
 
 
 def one_table_message(name: str, table: str) -> str:
-    """Return the message for [[name]] instead of a single table."""
+    """Return the error message for an array of tables [[`name`]] that must be one table [`table`].
+
+    The message contains an example of an entry.
+    """
     start = "" if name == table else f"unknown table '{name}': "
     return f"{start}write [{table}] once, and a line such as {_ONE_TABLE[table]} for each entry"
 
@@ -90,10 +98,10 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([^\s\d.+\-−].*?)\s*")
 
 
 def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
-    """Return the remedy for a number with a unit, such as `30 deg` or `1 kg`, or None.
+    """Return the remedy to show for a number that is written with a unit, such as `30 deg`.
 
-    `declared` are the names that a letter after a number may stand for: `2 m` is a product if m is
-    declared.
+    declared: names of the scene; `2 m` is a product, not a quantity, if m is declared. Returns None
+    if the text is not a number with a unit.
     """
     match = _QUANTITY.fullmatch(text) if len(text) <= MAX_QUANTITY_LENGTH else None
     if match is None or match[2] in declared:
@@ -117,17 +125,20 @@ _UNIT_OF_DEGREES = re.compile(
 
 
 def is_in_degrees(unit: str) -> bool:
-    """Whether a unit is of degrees, as `deg/s` and `N m/deg` are; of temperatures none is."""
+    """Return True if a unit contains angular degrees, such as `deg/s`; not for temperatures."""
     return bool(_UNIT_OF_DEGREES.search(unit))
 
 
 def degrees_formula(number: str) -> str:
-    """Return an angle in degrees as a formula in quotes."""
+    """Return the formula in quotes that converts an angle in degrees to rad: "30*pi/180"."""
     return f'"{number}*pi/180"'
 
 
 def number_remedy(text: object) -> str:
-    """Return the number in a text such as "1 ms", in SI units, as `: write 0.001`; else ""."""
+    """Return the remedy for a number that is written as text, such as "1 ms", in SI units.
+
+    An example is ": write 0.001, without quotes". Returns "" if the text is not a number.
+    """
     if not isinstance(text, str) or not (
         match := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
     ):
@@ -144,7 +155,11 @@ def _scaled(number: str, power: int) -> str:
 
 
 def toml_remedy(line: str) -> str | None:
-    """Return the remedy for a line of TOML with a number in a form that TOML does not have."""
+    """Return the remedy for a line that is not valid TOML, or None if its error is not common.
+
+    Known errors are a dash in place of a minus sign, a colon in place of "=", and a number followed
+    by a unit.
+    """
     line = line[:200]
     if re.search(r"[=,[]\s*−", line):
         return "this dash is not a minus sign: write '-'"
@@ -164,7 +179,10 @@ _VELOCITY = (
 
 
 def intended_velocity(name: str, tables: Mapping[str, str]) -> str:
-    """Return the velocity that `dot_theta`, `dtheta` or `thetadot` may stand for, or ""."""
+    """Return the velocity, such as `theta_dot`, that an unknown name such as `dtheta` may mean.
+
+    tables: maps each declared name of the scene to its table. Returns "" if no coordinate fits.
+    """
     match = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
     owners = (match[1] for match in match if match)
     return next((f"{owner}_dot" for owner in owners if tables.get(owner) == "coordinates"), "")
@@ -174,7 +192,10 @@ def intended_velocity(name: str, tables: Mapping[str, str]) -> str:
 
 
 def intended_file(path: Path) -> str:
-    """Return the scene that a missing path may stand for: `cartpole` is scenes/cartpole.toml."""
+    """Return the path of the existing scene file that a path which does not exist may mean.
+
+    An example is scenes/cartpole.toml for `cartpole`. Returns "" if there is no such file.
+    """
     name = path.name if path.suffix == ".toml" else f"{path.name}.toml"
     for folder in (path.parent, path.parent / "scenes", Path("scenes")):
         if path.name and (folder / name).is_file():
@@ -183,7 +204,10 @@ def intended_file(path: Path) -> str:
 
 
 def shipped_remedy(path: Path) -> str:
-    """Return how to get the scene of this name if eomc provides it, else ""."""
+    """Return the command that writes the example scene of this name, as the end of a message.
+
+    Returns "" if eomc has no example scene with the name of the file.
+    """
     name = path.name.removesuffix(".toml")
     remedy = f"; eomc new --from {name} writes the one that comes with eomc"
     return remedy if name in resources.scenes() else ""

@@ -10,7 +10,11 @@ from eomc.scene.formulas import Formula
 
 @dataclass(frozen=True)
 class PicturePlace:
-    """A point: three formulas in m, or, if `at` is None, the frame of the body or point `name`."""
+    """A position in a picture.
+
+    at: three formulas in m; if None, the position and the axes are those of the body or [[point]]
+    `name`.
+    """
 
     name: str
     at: Vector | None
@@ -20,9 +24,9 @@ class PicturePlace:
 class Shape:
     """One shape of a picture.
 
-    kind: "dot" or "path" (of one place), "line" (through places), "spring" (between two), "box" or
-    "circle" (about one). size: edges of a box or radius of a circle, m. rotation: of a box or
-    circle, from the world's axes or those of its body.
+    kind: "dot" or "path" (one place), "line" (two places or more), "spring" (two places), "box" or
+    "circle" (one place, their centre). size: edges of a box or radius of a circle, m. rotation: of
+    a box or circle, relative to the axes of the body at its place, or else to the world's axes.
     """
 
     kind: str
@@ -33,7 +37,10 @@ class Shape:
 
 @dataclass(frozen=True)
 class Picture:
-    """The shapes of a picture, and the names of its axes: two in the plane, three in space."""
+    """The shapes that a scene draws in its table [picture].
+
+    axes: letters of the axes, such as "xz" in the plane, and "xyz" in space.
+    """
 
     shapes: tuple[Shape, ...]
     axes: str
