@@ -1,8 +1,8 @@
-"""Rows of `check` about adaptive steps: their end, and rows within steps, beside the reference.
+"""Rows of `check` about adaptive steps: final states, and states within steps, from the reference.
 
-The reference goes there by steps of the tableau on its own accelerations, half as long as those of
-a tighter tolerance. What each adaptive step may err by is the tolerance,
-times what a difference at the start grows to.
+The reference's states follow from steps of the tableau on its own accelerations, half as long as
+those of a tighter tolerance. Each adaptive step may have an error of the tolerance, times the
+growth of a difference of the initial state.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene that asks for them."""
+    """Append the rows on adaptive steps to the report, if the scene has a tolerance."""
     if check.system.run.tolerance is None:
         return
     tight = 1e-13 if check.dtype == np.float64 else 1e-6
@@ -44,7 +44,10 @@ def report(check: Comparison) -> None:
 
 
 def resolves_steps(check: Comparison, s: State, h: float) -> bool:
-    """Whether times from a state on tell steps so long: in single precision they have 7 digits."""
+    """Return whether times near that of the state are precise enough for steps of h seconds.
+
+    In single precision times have 7 digits.
+    """
     return h > MIN_STEP_ROUNDINGS * check.eps * (abs(s.t) + h)
 
 

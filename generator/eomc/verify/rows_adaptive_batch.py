@@ -1,7 +1,8 @@
-"""Rows of `check` about adaptive steps of many: each beside its run alone.
+"""Rows of `check` about adaptive steps of a batch: each instance is compared with a run of its own.
 
-Side by side they are computed by another text than alone, and end within its tolerance; at another
-place, in other calls or behind others that can't go on, they have the same bits.
+A batch is computed by other C functions than a single run; the two agree within the tolerance. At
+another place in the batch, in other calls, or beside instances that fail, an instance has the same
+bits.
 """
 
 from __future__ import annotations
@@ -33,7 +34,12 @@ ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 @dataclass
 class BatchResult:
-    """Results of calls of the C function: states (n, 2 nq), times, rows, counts and statuses."""
+    """Results of the C function `adaptive_batch` for n instances.
+
+    x: final states (n, 2 nq). t: their times (n,), s. rows: q and q̇ at two times, (n, 4, nq).
+    counts: numbers of steps, rejected steps, evaluations, stiff steps and events, and a checksum of
+    the events, (n, 6). status: (n,).
+    """
 
     x: Vector
     t: Vector
@@ -46,7 +52,10 @@ class BatchResult:
 
 
 def report(check: Comparison, singular: list[State]) -> None:
-    """Add the rows of a scene that asks for both."""
+    """Append the rows on adaptive steps of batches, if the scene has a tolerance and batches.
+
+    singular: states at which D is singular, which must be refused.
+    """
     if check.system.run.tolerance is None or not check.system.run.batch:
         return
     rows = BatchRows(check, singular)
@@ -58,7 +67,11 @@ def report(check: Comparison, singular: list[State]) -> None:
 
 
 class EventRecorder:
-    """Buffers for the events of each instance, and the number and digest of all events of each."""
+    """Buffers for the events of `count` instances, and the number and checksum of the events.
+
+    digests: for each instance, the number of its events and a checksum of them. room: the buffers
+    as arguments of the C function.
+    """
 
     def __init__(self, model: Any, count: int) -> None:
         self.digests: list[list[int]] = [[0, 0] for _ in range(count)]
@@ -73,7 +86,7 @@ class EventRecorder:
         self.room = (each, *places, model._pointer(self.rows))
 
     def record(self) -> None:
-        """Add the events of the last call."""
+        """Add the events of the last call to the numbers and checksums of the instances."""
         for k, n in enumerate(self.counts if self.room else ()):
             number, digest = self.digests[k]
             for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
@@ -82,7 +95,11 @@ class EventRecorder:
 
 
 class BatchRows:
-    """Instances near a sampled state, with its inputs and time."""
+    """Checks of adaptive runs of COUNT instances that start near one state, at its time.
+
+    singular: states at which D is singular. module: that of one form of the C code; by default the
+    optimised form.
+    """
 
     def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
         self.check, self.module, self.singular = check, module or check.module, singular
@@ -100,20 +117,29 @@ class BatchRows:
         ]  # fmt: skip
 
     def single_run(self, s: State, **span: Any) -> Any:
-        """Return the run of one instance from a state."""
+        """Return the adaptive run of one instance from the state `s`.
+
+        span: its `duration` or `times`, as arguments of the module's `simulate`.
+        """
         return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
     def span(self, s: State) -> float:
-        """Return the duration of some steps; 0 if there is none."""
+        """Return the duration of the first STEPS adaptive steps from a state, s.
+
+        0 if there is no step.
+        """
         run = self.single_run(s, duration=self.check.system.run.duration)
         return float(run.t[min(STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
 
     def resolves_steps(self, s: State) -> bool:
-        """True if times near the state are precise enough to resolve steps."""
+        """Return whether times near that of the state are precise enough for its adaptive steps."""
         return resolves_steps(self.check, s, self.span(s) / STEPS)
 
     def compare_with_single_runs(self) -> float | Measurement:
-        """Return the largest difference of ends and rows from those of single runs."""
+        """Return the largest difference of the batch's states from those of single runs.
+
+        The states are those at two times. The unit is the tolerance, times the number of steps.
+        """
         s, T = self.state, self.span(self.state)
         if not self.resolves_steps(s):
             return Measurement(math.nan, "times tell no steps")
@@ -129,7 +155,11 @@ class BatchRows:
         )
 
     def end_error(self, many: Any, k: int, times: Vector) -> float | None:
-        """Return how far an instance is from its single run; None if that stops."""
+        """Return the difference of instance k of a batch run from its single run.
+
+        many: the batch run, which has stored the states at `times`, as the single run does. The
+        unit is the tolerance, times the number of steps. None if the single run stops early.
+        """
         one = self.single_run(self.starts[k], times=times)
         if one.status != "ok" or len(one) < len(times):
             return None
@@ -142,7 +172,13 @@ class BatchRows:
         self, starts: list[State], span: float, steps: int, *, stiff: bool = False,
         longest: float = 0.0,
     ) -> BatchResult:  # fmt: skip
-        """The C function called until none is left, `steps` of each at once."""
+        """Return the results of a run by the C function `adaptive_batch`.
+
+        The run lasts `span` seconds from the time of the checked state, with the initial states
+        `starts`. The function is called until no instance is left, with at most `steps` steps of
+        each per call. stiff: the option of `simulate`. longest: limit of the step size, s; 0 for
+        none.
+        """
         model, n, s = self.model, len(starts), starts[0]
         new = model._ffi.new
         q, qd = (np.array([getattr(x, k) for x in starts], model.dtype) for k in ("q", "qd"))
@@ -176,7 +212,11 @@ class BatchRows:
         )
 
     def differing_instances(self) -> float:
-        """Return the number of instances that differ in other places, calls or neighbours."""
+        """Return the number of instances whose bits depend on the other instances or on the calls.
+
+        Each is compared with itself at another place in the batch, in calls of fewer steps and, for
+        some, alone.
+        """
         wrong, T = 0, self.span(self.state)
         for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
             how: Any = {"stiff": stiff, "longest": longest}
@@ -189,7 +229,11 @@ class BatchRows:
         return float(wrong)
 
     def wrong_refusals(self) -> float:
-        """Return the number of instances that do not refuse, or that disturb others."""
+        """Return the number of errors in a batch of which some instances must be refused.
+
+        These start with nan or at a singular D. It is an error if one is not refused, or if it
+        changes the result of another instance.
+        """
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
         known = self.singular[:: max(1, len(self.singular) // SINGULAR_STATE_COUNT)]

@@ -1,6 +1,6 @@
-"""Rows of `check` about what adaptive steps refuse, their longest step, and runs in pieces.
+"""Rows of `check` about what adaptive steps refuse, their longest step, and runs in several calls.
 
-A run that can't go on says so, and leaves the last good state in place.
+A run that can't go on returns a status, and the state is the last good one.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ class _RunResult:
 
 
 def report(check: Comparison, refusals: Refusals) -> None:
-    """Add the rows of a scene that asks for a tolerance."""
+    """Append the rows on refusals and longest step of adaptive runs, if the scene has a tolerance.
+
+    refusals: the checks of refusals by fixed steps, which have found states with a singular D.
+    """
     if check.system.run.tolerance is None:
         return
     rows = _Adaptive(check, refusals)
@@ -56,7 +59,11 @@ class _Adaptive:
         self, s: State, span: float, tol: float, h_most: float = 0.0, stiff: bool = False,
         each: int = MAX_STEPS,
     ) -> _RunResult:  # fmt: skip
-        """A run of at most ROOM steps, `each` of them in a call."""
+        """Return an adaptive run of `span` seconds by the C function, of at most MAX_STEPS steps.
+
+        s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff: the
+        option of `simulate`. each: number of steps in each call of the C function.
+        """
         model, many = self.model, 2 * MAX_STEPS
         x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)
         rows, times = np.full((2, many, model.nq), np.nan, model.dtype), np.zeros(many, model.dtype)
@@ -77,7 +84,11 @@ class _Adaptive:
         return _RunResult(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
 
     def wrong_refusals(self) -> float:
-        """From where D is singular, or numbers are none, or too large for a step."""
+        """Return the number of runs that are not refused correctly, or store nan or inf.
+
+        They start where D is singular, with nan or inf, or with numbers so large that a step
+        overflows.
+        """
         h, tol = self.check.system.run.h, COARSE_TOLERANCE
         wrong = 0
         for s in self.refusals.singular[
@@ -93,7 +104,10 @@ class _Adaptive:
         return float(wrong + self.overflow_errors())
 
     def overflow_errors(self) -> int:
-        """How many runs keep states that are not finite, of those that start almost there."""
+        """Return the number of runs that store states that are not finite.
+
+        Their initial states are so large that a step may overflow.
+        """
         wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
         for unit in np.eye(len(self.state.q)):
             for size in (TURNS, huge):
@@ -104,12 +118,19 @@ class _Adaptive:
         return wrong
 
     def longest(self) -> float | Measurement:
-        """No step is longer than asked for, the last ends at the end, and calls leave no trace."""
+        """Return the number of errors in runs with a limit of the step size.
+
+        No step may exceed the limit, the last one must end at the given time, and a run in several
+        calls must equal that in one call.
+        """
         errors = (self.step_limit_errors(e.state) for e in self.check.few(2))
         return largest(errors, "time tells no parts of a first step")
 
     def step_limit_errors(self, s: State) -> float | None:
-        """Return the number of errors in steps of limited length; None if not resolved."""
+        """Return the number of errors in a run from `s` with a limit of the step size.
+
+        None if times are not precise enough for such steps.
+        """
         first = self.drive(s, self.check.system.run.duration, COARSE_TOLERANCE)
         later = first.times[first.times > s.t]  # the state may jump at once
         span = float(later[0]) - s.t if len(later) else 0.0

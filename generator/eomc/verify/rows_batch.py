@@ -1,7 +1,8 @@
-"""Rows of `check` about batches: places, counts, shared and own parameters, failing instances.
+"""Rows of `check` about batches: order, size, shared and own parameters, instances that fail.
 
-No bit of an instance's motion depends on the others, so that the batch is compared with batches of
-one, and these with single runs, from which they differ by rounding.
+A batch is a run of many instances side by side. No bit of an instance's motion depends on the other
+instances. So batches are compared with one another bit by bit, and with single runs, from which
+they differ by rounding.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ DRAWS = 2  # of starts that are a rounding off
 
 
 class Batches:
-    """Rows on batches."""
+    """Checks of batches: runs of COUNT instances by fixed steps, computed side by side.
+
+    runs: the checks of single runs. singular: states at which D is singular.
+    """
 
     def __init__(self, runs: Runs, singular: list[State]) -> None:
         self.check, self.model, self.h = runs.check, runs.model, runs.h
@@ -43,7 +47,7 @@ class Batches:
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
     def report(self) -> None:
-        """Append the rows on batches."""
+        """Append the rows on batches to the report: for each method, values, bits and failures."""
         row = self.check.row
         for method in self.check.methods:
             row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
@@ -55,7 +59,11 @@ class Batches:
                     partial(self.failures, method))  # fmt: skip
 
     def sample_instances(self) -> list[State]:
-        """Random starts and parameters, some of them far out, some in haste, all regular."""
+        """Return COUNT initial states with parameters of their own, all with a regular D.
+
+        Some have angles of many turns, some velocities so high that sines can't be predicted in a
+        step.
+        """
         sampler, instances = self.check.sampler, []
         t = self.runs.states[-1].t
         own = [e.state for e in self.check.expected]
@@ -73,7 +81,11 @@ class Batches:
         return instances
 
     def projected(self, s: State, near: State) -> State:
-        """The state put onto constraints, or else one near it, or the start."""
+        """Return the state `s` projected onto the constraints.
+
+        If that fails, return the projection of the state `near` or else the initial state of the
+        scene.
+        """
         if not self.check.system.constraints:
             return s
         sampler = self.check.sampler
@@ -85,7 +97,12 @@ class Batches:
         self, method: str, states: list[State], u: Vector | None, *, own: bool = True,
         every: int = 1, h: float = 0.0,
     ) -> Any:  # fmt: skip
-        """The batch of these states; own: each with its own parameters."""
+        """Return the run of a batch with these initial states, by STEPS steps of `method`.
+
+        u: inputs for each instance, (n, nu) or (n, STEPS, nu), or None for the scene's signals.
+        own: each instance has its state's parameters; otherwise all share those of the first state.
+        every: only each `every`-th state is stored. h: step size, s; 0 for the scene's.
+        """
         names = self.check.sampler.defaults
         params: Any = states[0].params
         if own:
@@ -99,7 +116,11 @@ class Batches:
             )  # fmt: skip
 
     def tables(self) -> list[Vector | None]:
-        """No inputs, constant ones, and a row a step, of every instance."""
+        """Return the kinds of inputs to be tried: None, (COUNT, nu) and (COUNT, STEPS, nu).
+
+        None stands for the scene's signals, the second are constant inputs and the third have
+        values for each step. For a scene without inputs only None is returned.
+        """
         if not self.model.nu:
             return [None]
         shape = (COUNT, STEPS, self.model.nu)
@@ -107,9 +128,11 @@ class Batches:
         return [None, rows[:, 0], rows]
 
     def compare_with_single_steps(self, method: str) -> float | Measurement:
-        """Each step of each instance beside a single step from where the batch had it.
+        """Return the largest difference of steps in a batch from single steps, in roundings.
 
-        Runs of seven steps may part as far as they go, where steps are too long for the motion.
+        Each single step starts at the state that the instance had in the batch before that step.
+        Whole runs are not compared: where steps are too long for the motion, they diverge by
+        rounding alone.
         """
         errors: list[float | None] = []
         for u in self.tables():
@@ -124,7 +147,11 @@ class Batches:
         return largest(errors, "no step of an instance has digits to compare")
 
     def step_off(self, method: str, s: State, end: Vector) -> float | None:
-        """The end of a step beside that of a single one, in units; None where it has no digits."""
+        """Return the difference of a step in a batch from a single step, in units of rounding.
+
+        s: the state before the step. end: q and q̇ after it in the batch, (2, nq). None if rounding
+        leaves no digit to compare.
+        """
         x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
         spread = self.runs.sampler.scale
         wide = float(np.max(1 + np.abs(x) / spread))  # the last digit, of what would be 1 elsewhere
@@ -141,7 +168,12 @@ class Batches:
         return self.check.units(end, alone.rows[:, 1], size)
 
     def places(self, method: str) -> float:
-        """How many batches are not to the bit what their instances are elsewhere."""
+        """Return the number of batches in which an instance has other bits than in the whole batch.
+
+        The others are permuted batches, small ones, batches that store fewer states, single steps,
+        and batches beside instances with long steps. A batch with shared parameters may differ from
+        one with own parameters by rounding.
+        """
         wrong = 0
         for u in self.tables():
             whole = self.simulate(method, self.instances, u)
@@ -174,7 +206,7 @@ class Batches:
         )
 
     def rounded(self, states: list[State]) -> list[State]:
-        """The states with each number a rounding off."""
+        """Return copies of the states in which each number of q and q̇ is off by one rounding."""
         eps, n = self.check.eps, len(states[0].q)
         signs = self.random.choice([-eps, eps], (len(states), 2, n))
         moved = [
@@ -184,10 +216,10 @@ class Batches:
         return [replace(s, q=x[0], qd=x[1]) for s, x in zip(states, moved, strict=True)]
 
     def near(self, one: Any, other: Any, rounded: Sequence[Any]) -> bool:
-        """Whether batches with shared and with own parameters are alike but for rounding.
+        """Return whether batch runs with shared and with own parameters differ by rounding only.
 
         A compiler takes products of shared parameters out of its loop, and rounds them there.
-        rounded: the batch from starts that are a rounding off.
+        rounded: batch runs from initial states that differ by one rounding.
         """
         spread = self.runs.sampler.scale[:, None, None]
         rows, others, *near = (np.array([x.q, x.qd], float) for x in (one, other, *rounded))
@@ -201,7 +233,11 @@ class Batches:
         return bool(np.all(alike) and np.all(codes))
 
     def long_step_cases(self) -> Iterator[tuple[list[State], float]]:
-        """Instances that all go too far in a step for sines to be rotated, by speed or by force."""
+        """Yield initial states of a batch with a step size h, s, with which steps are long.
+
+        In a step some angle moves too far for its sine to be predicted, by velocity or by
+        acceleration.
+        """
         sampler, first = self.check.sampler, self.instances[0]
         fast = [replace(s, qd=s.qd + 0.7 * sampler.spread / self.h) for s in self.instances]
         yield fast, self.h
@@ -210,13 +246,20 @@ class Batches:
             yield rest, self.runs.large_step(replace(first, qd=0 * first.qd), part)
 
     def differs_with_neighbours(self, method: str, states: list[State], h: float) -> int:
-        """Whether they go otherwise where they have others beside them."""
+        """Return whether runs from `states` have other bits in a batch with other neighbours.
+
+        In that batch, an instance with short steps is beside each of them.
+        """
         mixed = [s for pair in zip(states, self.instances, strict=True) for s in pair]
         alone, other = (self.simulate(method, x, None, h=h) for x in (states, mixed))
         return not _are_permuted(alone, other, 2 * np.arange(COUNT))
 
     def first_step_agrees(self, method: str, whole: Any, u: Vector | None) -> bool:
-        """Whether one step of each in place is the first of the batch."""
+        """Return whether `step_batch` gives the same bits as the first step of a batch run.
+
+        whole: the batch's run by `method`. u: its inputs. `step_batch` overwrites q and qd in
+        place.
+        """
         q, qd = (np.array(x[:, 0]) for x in (whole.q, whole.qd))
         names = self.check.sampler.defaults
         params = {x: np.array([(s.params or names)[x] for s in self.instances]) for x in names}
@@ -231,7 +274,11 @@ class Batches:
         )
 
     def failures(self, method: str) -> float:
-        """Among good instances some that fail: the others' bits, and how those end."""
+        """Return the number of errors in batches in which some instances fail.
+
+        Instances that do not fail must keep their bits, and those that fail must end as in single
+        runs.
+        """
         states, bad = list(self.instances), [0, *range(5, COUNT, 11)]
         fast = 1e-3 * float(np.finfo(self.model.dtype).max)
         for n, k in enumerate(bad):
@@ -257,7 +304,7 @@ class Batches:
         return float(wrong + self.singular_starts_that_move(method))
 
     def singular_starts_that_move(self, method: str) -> int:
-        """How many instances go on that start where D is singular."""
+        """Return the number of instances with a singular D that are not refused as such."""
         starts = self.singular[:: 1 + len(self.singular) // COUNT]
         states = [replace(self.instances[0], q=s.q, qd=s.qd, params=s.params) for s in starts]
         if not states:
@@ -266,7 +313,10 @@ class Batches:
         return int(np.sum((batch._codes != SINGULAR) | (batch.steps != 0)))
 
     def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
-        """Whether a failing instance ends otherwise than a single run does."""
+        """Return whether a failing instance of a batch run ends otherwise than a single run.
+
+        whole: the batch run. k: index of the instance in it. s: the initial state of the instance.
+        """
         alone = run_in_c(self.model, method, s, self.h, STEPS)
         steps, status = int(whole.steps[k]), int(whole._codes[k])
         rows = np.stack([whole.q[k], whole.qd[k]])
@@ -291,9 +341,11 @@ class Batches:
     def differs_beyond_rounding(
         self, method: str, s: State, stored: Vector, alone: RunResult
     ) -> bool:
-        """Whether the last row of an instance is another than alone, by more than rounding does.
+        """Return whether an instance's last state differs from its single run beyond rounding.
 
-        That is seen beside the start: the cosine of 1e304 is another at the next double.
+        stored: q and q̇ of the instance, (2, n, nq). alone: its single run. The effect of rounding
+        follows from runs with slightly changed initial velocities: the cosine of 1e304 changes from
+        one double to the next.
         """
         known, far = alone.rows[:, stored.shape[1] - 1], 1e-3
         near = [
