@@ -21,7 +21,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> object:
-    """Import names that need SymPy on first use, since the import takes half a second."""
+    """Import System, dot or equations on first use, since importing SymPy takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 

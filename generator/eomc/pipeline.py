@@ -50,9 +50,10 @@ def _without_garbage_collection() -> Iterator[None]:
 
 @_without_garbage_collection()
 def read(scene: ScenePath) -> System:
-    """Read and check a scene; return a SymPy system with consistent initial values.
+    """Read a scene file and return it as a System of SymPy expressions.
 
-    Raises SceneError with all problems.
+    If the system has constraints, its initial values are adjusted to satisfy them. `scene`: path
+    of the TOML file. Raises SceneError, which lists all problems of the scene.
     """
     from eomc.model.from_scene import from_scene
     from eomc.scene import read as scenes
@@ -79,7 +80,11 @@ def sources(
     *,
     warn: Callable[[Problem], None] | None = None,
 ) -> Sources:
-    """Return the generated files of a system as text. warn is called with each warning."""
+    """Generate the C and Python files of a system's module and return them as text.
+
+    extension: name of the compiled extension that the Python files import. warn: function that is
+    called with each warning; by default warnings are discarded.
+    """
     from eomc.emit import render
 
     return render.render(_program(system, warn), extension)
@@ -105,7 +110,11 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
 
 @_without_garbage_collection()
 def unit(system: System, fmi: int = 2, *, warn: Callable[[Problem], None] | None = None) -> Unit:
-    """Return the files of an FMU (FMI 2 or 3) as text. warn is called with each warning."""
+    """Generate the files of an FMU (Functional Mock-up Unit) of a system, return them as text.
+
+    fmi: version of the FMI standard, 2 or 3. warn: function that is called with each warning; by
+    default warnings are discarded. Raises EomcError for another version.
+    """
     from eomc.emit import render
 
     if fmi not in (2, 3):
@@ -121,11 +130,29 @@ def export_fmu(
     binary: bool = True,
     warn: Callable[[Problem], None] | None = None,
 ) -> Exported:
-    """Export a scene file or a System as an FMU (FMI 2 or 3) to `out`, by default NAME.fmu.
+    """Export a scene file or a System as an FMU file; return its path and what it contains.
 
-    The FMU contains sources and, unless `binary` is false or there is no compiler, a binary for
-    this machine. An existing file is replaced. warn is called with each warning.
-    Raises SceneError for a faulty scene, EomcError for what else fails.
+    Parameters
+    ----------
+    scene
+        Path of the TOML file, or a System.
+    out
+        File to write; an existing file is replaced. By default <name of the scene>.fmu in the
+        current folder.
+    fmi
+        Version of the FMI standard, 2 or 3.
+    binary
+        Whether to add a binary for this machine to the C sources. Without a compiler, the FMU
+        contains the sources only.
+    warn
+        Function that is called with each warning; by default warnings are discarded.
+
+    Raises
+    ------
+    SceneError
+        If the scene is invalid.
+    EomcError
+        If anything else fails.
     """
     from eomc.toolchain import fmu
 
@@ -143,12 +170,27 @@ def build(
     form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> Built:
-    """Build the compiled module of a scene file or a System in `root`/<name>/.
+    """Build the compiled Python module of a scene and return the name and folder of the build.
 
-    If nothing has changed, nothing is derived or compiled, and no compiler is needed. form: of the
-    generated C; "plain" is for comparison, in `root`/<name>/.plain/.
-    warn is called with each warning.
-    Raises SceneError for a faulty scene, EomcError for what else fails.
+    A build that is up to date is returned as it is, without a compiler.
+
+    Parameters
+    ----------
+    scene
+        Path of the TOML file, or a System.
+    root
+        Folder of all builds. The module of the scene is written to `root`/<name of the scene>/.
+    form
+        "fast": optimised C. "plain": portable C, for comparison, in the subfolder .plain/.
+    warn
+        Function that is called with each warning; by default warnings are discarded.
+
+    Raises
+    ------
+    SceneError
+        If the scene is invalid.
+    EomcError
+        If anything else fails.
     """
     from eomc.toolchain import cache
 
@@ -189,10 +231,11 @@ def write_c(
     *,
     warn: Callable[[Problem], None] | None = None,
 ) -> dict[str, str]:
-    """Write the C of a scene file into `folder`, and return its files' texts by name.
+    """Write the C files of a scene into `folder`; return a dict from file name to text.
 
-    No compiler is called. prefix: what names and files begin with, by default the scene's name.
-    Raises SceneError for a faulty scene, EomcError for what else fails.
+    No compiler is called. prefix: beginning of all C names and file names, by default the name of
+    the scene. warn: function that is called with each warning. Raises SceneError if the scene is
+    invalid and EomcError if anything else fails.
     """
     from dataclasses import replace
 
@@ -211,9 +254,10 @@ def write_c(
 def write_wheel(
     scene: ScenePath, folder: ScenePath, *, warn: Callable[[Problem], None] | None = None
 ) -> Path:
-    """Write a wheel of the compiled module of a scene file into `folder`; its path.
+    """Compile the module of a scene file into a wheel in `folder`; return the path of the wheel.
 
-    Raises SceneError for a faulty scene, EomcError for what else fails.
+    warn: function that is called with each warning. Raises SceneError if the scene is invalid and
+    EomcError if anything else fails.
     """
     from eomc.toolchain import wheel
 
@@ -226,7 +270,7 @@ def write_wheel(
 
 
 def _tell_preparing(warn: Callable[[Problem], None] | None) -> None:
-    """Issue a note if the compiler's first call takes long."""
+    """Call `warn` with a note if the first call of the compiler takes long."""
     from eomc.base.errors import Problem
     from eomc.toolchain.compiler import first_call_note
 
@@ -235,7 +279,7 @@ def _tell_preparing(warn: Callable[[Problem], None] | None) -> None:
 
 
 def _refuse_other(scene: object, root: object) -> None:
-    """Raise EomcError where one is neither a path nor a System."""
+    """Raise EomcError if `scene` is neither a path nor a System, or `root` is not a path."""
     paths = (str, os.PathLike)
     if not isinstance(root, paths):
         raise EomcError(f"root: give the path of a folder, here {root!r}")
@@ -252,7 +296,9 @@ def load(
     form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> ModuleType:
-    """Import the compiled module of a scene, built first if necessary. Arguments as in `build`.
+    """Build the compiled module of a scene if necessary, import it and return it.
+
+    The arguments are those of `build`.
 
     >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
     >>> cartpole.simulate(duration=1.0).q[-1]       # doctest: +SKIP
@@ -266,17 +312,32 @@ def load(
         except cache.ReplacedError:
             if tries == LOADS:
                 raise
-    # what pictures are made from
+    # the model draws pictures of its scene
     own = Path(os.path.abspath(scene)) if isinstance(scene, (str, os.PathLike)) else scene
     module._model.source = own
     return module
 
 
 def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleType:
-    """Return the module of a model's scene or System with additional events, built in `folder`.
+    """Build and import the module of a model with additional events; return the module.
 
-    events: formulas by name, or dicts as in [[event]]; for a System also as in System.make.
-    Raises SceneError for invalid events, EomcError if the scene is missing or has changed.
+    Parameters
+    ----------
+    model
+        Model of an imported module; its attribute `source` is the path of its scene or its System.
+    events
+        Mapping from the name of each new event to its event function as a formula, or to a dict
+        with the keys of [[event]] in a scene. For a System, as the argument `events` of
+        System.make.
+    folder
+        The build is written below its subfolder .events/.
+
+    Raises
+    ------
+    SceneError
+        If an event is invalid.
+    EomcError
+        If the scene is missing or has changed since the model was built.
     """
     from eomc.base.errors import SceneError, writing
     from eomc.runtime.atomic_write import atomic_write
@@ -356,7 +417,10 @@ def _renamed(key: str, names: Mapping[str, str]) -> str:
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:
-    """Return the name of a scene and the digest of its text, without checks and without SymPy."""
+    """Return the name of a scene file and the digest of its text, without checking the scene.
+
+    If the file cannot be read, both are ""; if its name is not an identifier, the name is "".
+    """
     from eomc.scene.toml_text import tree_and_digest
 
     try:

@@ -14,7 +14,7 @@ MOST = 50  # problems shown, at most
 
 
 class EomcError(Exception):
-    """An error that the user can correct; its text is complete without a traceback."""
+    """An error that the user can correct. Its message is meant to be shown without a traceback."""
 
     def __str__(self) -> str:
         return texts.lines(super().__str__())
@@ -25,24 +25,31 @@ class EomcError(Exception):
 
 
 class FolderError(EomcError):
-    """A folder of builds that can't be written; the remedy is Python's, the command has its own."""
+    """Error for a folder of builds that can't be written.
+
+    The message advises to pass another `root`, as Python code does. The command line shows `what`
+    with advice of its own.
+    """
 
     def __str__(self) -> str:
         return f"{super().__str__()}: choose another folder, root=..."
 
     @property
     def what(self) -> str:
-        """The fault alone."""
+        """The message without the advice."""
         return super().__str__()
 
 
 class NoCompilerError(EomcError):
-    """There is no C compiler."""
+    """Error for a build that needs a C compiler where none is found."""
 
 
 @contextmanager
 def writing(where: object) -> Iterator[None]:
-    """Raise an EomcError that names `where` in place of an OSError."""
+    """Return a context manager that converts an OSError raised in its block to an EomcError.
+
+    where: the file or folder that is written, for the message.
+    """
     try:
         yield
     except OSError as fault:
@@ -51,7 +58,24 @@ def writing(where: object) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Problem:
-    """One fault. `column` counts from 0; `line` from 1, 0 where there is no line to show."""
+    """A fault in a user's input, or a warning or note on it; `str` formats it for the terminal.
+
+    Attributes
+    ----------
+    message
+        What is wrong, and the remedy.
+    key
+        The place in the scene, such as "parameters.m", or the argument of System.make.
+    file, line, column
+        Where the fault is. `line` counts from 1 and is 0 if unknown; `column` counts from 0 and is
+        -1 if unknown.
+    width
+        Number of characters to underline from `column`.
+    source
+        Text of the line to show; "" for none.
+    severity
+        "error", "warning" or "note".
+    """
 
     message: str
     key: str = ""
@@ -96,7 +120,11 @@ def _shown(text: str) -> str:
 
 
 class SceneError(EomcError):
-    """An invalid scene; `problems` are all problems found, in the order of the file."""
+    """Error for an invalid scene.
+
+    `problems` contains all problems that were found, sorted by line and column. The message shows
+    the first 50.
+    """
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda p: (p.line, p.column)))

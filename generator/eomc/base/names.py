@@ -60,7 +60,9 @@ GREEK = {
 
 
 def plain(name: str) -> str:
-    """Return a valid C name: Greek written out, LaTeX removed, keywords extended.
+    """Convert a name to a valid name in C and return it.
+
+    Greek letters are written out, LaTeX syntax is removed and "_1" is appended to keywords.
 
     >>> plain("θ₁"), plain(r"\\theta_{1}"), plain("lambda")
     ('theta_1', 'theta_1', 'lambda_1')
@@ -76,7 +78,11 @@ def plain(name: str) -> str:
 
 
 def fault(name: str) -> str | None:
-    """Return the reason why `name` is not allowed in a scene, with a remedy; None if it is."""
+    """Return the reason why `name` is not allowed in a scene, and a remedy; None if it is allowed.
+
+    A name is allowed if it is valid in C, C++ and Python, is not part of the formula language and
+    has at most 40 characters, without "__" and without "_" at either end.
+    """
     if len(name) > 10 * MAX_LENGTH:
         shown = f"{name[:MAX_LENGTH]}..."
         return f"'{shown}' has {len(name)} characters: {MAX_LENGTH} are the most, for readable C"
@@ -93,7 +99,10 @@ def fault(name: str) -> str | None:
 
 
 def module_fault(name: str) -> str | None:
-    """Return the reason why a scene cannot have `name`, also a Python module and a C prefix."""
+    """Return the reason why `name` cannot be the name of a scene, or None if it can.
+
+    The name of a scene is also the name of its Python module and the prefix of its C names.
+    """
     if why := fault(name):
         return why
     if name in sys.stdlib_module_names or name in ("numpy", "cffi", "eomc", "sympy", "test"):

@@ -9,25 +9,26 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def folder(kind: str) -> Path:
-    """Return the folder `templates`, `csrc` or `scenes`."""
+    """Return the path of a folder that comes with eomc. kind: "templates", "csrc" or "scenes"."""
     installed = PACKAGE / kind
     return installed if installed.is_dir() else PACKAGE.parent.parent / kind
 
 
 def text(kind: str, name: str) -> str:
-    """Return the text of a file of such a folder."""
+    """Return the text of the file `name` in the folder "templates", "csrc" or "scenes" (`kind`)."""
     return (folder(kind) / name).read_text(encoding="utf-8")
 
 
 def scenes() -> dict[str, Path]:
-    """Return the files of the scenes that come with eomc, by name."""
+    """Return a dict from the name of each scene that comes with eomc to the path of its file."""
     return {file.stem: file for file in sorted(folder("scenes").glob("*.toml"))}
 
 
 def runtime(batch: bool) -> dict[str, str]:
-    """Return the text of each file of runtime/, by its path in the folder of a built module.
+    """Return the Python files of eomc's runtime package, which are copied into each built module.
 
-    The modules of batches are included only if `batch` is true.
+    The result is a dict from the path in the folder of the built module to the text. The files
+    for batches of simulations are included only if `batch` is true.
     """
     files = sorted((PACKAGE / "runtime").glob("*.py"))
     return {
@@ -38,7 +39,10 @@ def runtime(batch: bool) -> dict[str, str]:
 
 
 def parts() -> Iterator[tuple[str, Path]]:
-    """Yield all files on which a build depends: name relative to the installation, path."""
+    """Yield a pair (name, path) for each file of eomc on which the result of a build depends.
+
+    The name is relative to the installation, such as "csrc/sincos/sincos.h".
+    """
     for kind, root, suffix in (
         ("eomc", PACKAGE, ".py"),
         ("templates", folder("templates"), ".jinja"),

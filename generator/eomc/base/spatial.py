@@ -20,54 +20,57 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of a tensor, in an
 
 
 def plus(a: Sequence[T], b: Sequence[T]) -> Vector[T]:
-    """a + b"""
+    """Return the sum a + b of two vectors."""
     x, y, z = (_sum(p, q) for p, q in zip(a, b, strict=True))
     return x, y, z
 
 
 def scaled(a: Sequence[T], factor: T) -> Vector[T]:
-    """factor a"""
+    """Return the vector `a` multiplied by the scalar `factor`."""
     x, y, z = (_product(p, factor) for p in a)
     return x, y, z
 
 
 def dot(a: Sequence[T], b: Sequence[T]) -> T:
-    """a . b"""
+    """Return the scalar product a . b of two vectors."""
     terms: list[T] = [_product(p, q) for p, q in zip(a, b, strict=True) if p and q]
     return reduce(_sum, terms) if terms else _product(a[0], b[0])
 
 
 def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector[Any]:
-    """a x b"""
+    """Return the vector product a x b."""
     (x, y, z), (u, v, w) = a, b
     return y * w - z * v, z * u - x * w, x * v - y * u
 
 
 def apply(R: Matrix[T], v: Sequence[T]) -> Vector[T]:
-    """R v"""
+    """Return the product R v of a matrix and a vector."""
     x, y, z = (dot(row, v) for row in R)
     return x, y, z
 
 
 def transposed(R: Matrix[T]) -> Matrix[T]:
-    """Return the transposed matrix."""
+    """Return the transpose of a matrix."""
     one, two, three = zip(*R, strict=True)
     return one, two, three
 
 
 def product(A: Matrix[T], B: Matrix[T]) -> Matrix[T]:
-    """A B"""
+    """Return the product A B of two matrices."""
     return transposed(matrix(apply(A, column) for column in transposed(B)))
 
 
 def matrix(rows: Any) -> Matrix[Any]:
-    """Return an iterable of three rows as a matrix."""
+    """Return a matrix, a tuple of three rows, from an iterable of three rows."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     return (a, b, c), (d, e, f), (g, h, i)
 
 
 def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
-    """Return the rotation about a coordinate axis, from the rotated frame to the original one."""
+    """Return the matrix of a rotation about the coordinate axis `k` (0, 1 or 2).
+
+    It takes vectors from the rotated frame to the original one. cosine, sine: of the angle.
+    """
     zero = 0 * cosine
     i, j = (k + 1) % 3, (k + 2) % 3
     rows = [[zero] * 3 for _ in range(3)]
@@ -77,7 +80,10 @@ def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
 
 
 def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
-    """Return the rotation about a unit axis (Rodrigues)."""
+    """Return the matrix of a rotation about a unit vector `axis`, by the formula of Rodrigues.
+
+    It takes vectors from the rotated frame to the original one. cosine, sine: of the angle.
+    """
     x, y, z = axis
     c, s = cosine, sine
     r = 1 - c
@@ -89,19 +95,29 @@ def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
 
 
 def tensor(inertia: Sequence[T]) -> Matrix[T]:
-    """Return the symmetric matrix of an inertia."""
+    """Return the inertia tensor as a symmetric matrix, from its six entries.
+
+    inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
+    """
     xx, yy, zz, xy, xz, yz = inertia
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
 def rotated_inertia(R: Matrix[T], inertia: Sequence[T]) -> Inertia[T]:
-    """Return R I R^T: an inertia in the axes to which R rotates its own."""
+    """Return R I R^T, the inertia of a body in other axes, as six entries.
+
+    R: rotation that takes vectors from the axes of `inertia` to the other axes. inertia: Ixx, Iyy,
+    Izz, Ixy, Ixz, Iyz.
+    """
     rotated = product(product(R, tensor(inertia)), transposed(R))
     return six(rotated[i][j] for i, j in ENTRIES)
 
 
 def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
-    """Return the inertia of a point mass about the origin."""
+    """Return the inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) of a point mass about the origin.
+
+    at: position of the mass.
+    """
     x, y, z = at
     return (
         mass * (y * y + z * z), mass * (x * x + z * z), mass * (x * x + y * y),
@@ -110,12 +126,15 @@ def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
 
 
 def moved_inertia(inertia: Sequence[Any], mass: Any, center: Sequence[Any]) -> Inertia[Any]:
-    """Return an inertia about the origin from that about the centre of mass (parallel axes)."""
+    """Return the inertia of a body about the origin, by the parallel axis theorem.
+
+    inertia: six entries about the centre of mass. center: position of the centre of mass.
+    """
     return six(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
 
 
 def six(values: Any) -> Inertia[Any]:
-    """Return an iterable of six values as an inertia."""
+    """Return an inertia, a tuple of six entries, from an iterable of six values."""
     xx, yy, zz, xy, xz, yz = values
     return xx, yy, zz, xy, xz, yz
 

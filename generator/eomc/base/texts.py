@@ -28,14 +28,22 @@ _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\
 
 
 def checked_line(text: str) -> str:
-    """Return the text of a title or unit. Raises ValueError for hidden characters."""
+    """Return `text`, a title or unit, unchanged.
+
+    Raises ValueError if it has a hidden character: a control character (line breaks and tabs too),
+    a mark of writing direction or a line separator.
+    """
     if match := _HIDDEN.search(text):
         raise ValueError(_fault(text, match))
     return text
 
 
 def checked_lines(text: str) -> str:
-    """Return the text of a note, with line breaks and tabs allowed. Raises ValueError likewise."""
+    """Return `text`, a note that may have line breaks and tabs, unchanged.
+
+    Raises ValueError if it has another control character, a mark of writing direction or a line
+    separator.
+    """
     if match := _HIDDEN_IN_LINES.search(text):
         raise ValueError(_fault(text, match))
     return text
@@ -60,7 +68,9 @@ def _fault(text: str, match: re.Match[str]) -> str:
 
 
 def line(text: str) -> str:
-    r"""A text in one line, for a terminal or a comment of TOML; hidden characters escaped.
+    r"""Return `text` with control characters and other hidden characters escaped, as one line.
+
+    The result is safe to print to a terminal and into a comment of a TOML file.
 
     >>> line("θ\x1b]0;x")
     'θ\\x1b]0;x'
@@ -69,7 +79,7 @@ def line(text: str) -> str:
 
 
 def lines(text: str) -> str:
-    """Return a text of several lines with hidden characters escaped."""
+    """Return `text` with hidden characters escaped, except for line breaks and tabs."""
     return _HIDDEN_IN_LINES.sub(_escaped, text)
 
 
@@ -78,26 +88,29 @@ def _escaped(match: re.Match[str]) -> str:
 
 
 def flat(text: str) -> str:
-    """Return a note in one line, with white space collapsed."""
+    """Return `text` as one line: white space collapsed to spaces, hidden characters escaped."""
     return line(" ".join(re.split(r"[ \t\r\n]+", text.strip(" \t\r\n"))))
 
 
 def listed(names: Collection[str], most: int = 12) -> str:
-    """Return names as a list in one line, abbreviated if there are many."""
+    """Return names separated by commas; "none" if there are none.
+
+    Only the first `most` names are written out, followed by "and <number> more".
+    """
     shown = ", ".join([*names][:most]) or "none"
     return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def plural(word: str, n: int) -> str:
-    """Return the singular or plural of a word for n things."""
+    """Return the noun `word` in the singular if n is 1, else in the plural ("-s" or "-es")."""
     return word if n == 1 else word + ("es" if word.endswith(("x", "sh")) else "s")
 
 
 def comment(text: str) -> str:
-    r"""Return a text for the inside of a C comment, in one line.
+    r"""Return `text` as one line that is safe inside a C comment.
 
-    It neither ends the comment nor begins another, and no line ends in a backslash or in the
-    trigraph of one, which would join it to the next.
+    The result neither ends the comment nor begins another. It does not end in a backslash or in
+    the trigraph of a backslash, which would join the line to the next one.
 
     >>> comment("*/ a ??/ b \\")
     '* / a ? ?/ b \\x5c'
@@ -108,58 +121,74 @@ def comment(text: str) -> str:
 
 
 def python(value: str | Mapping[str, str]) -> str:
-    """Return a text, or texts by name, as a Python literal. Raises TypeError for other types."""
+    """Return a string, or a dict of strings, as the source text of a Python literal.
+
+    Raises TypeError for values of other types.
+    """
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{python(k)}: {python(v)}" for k, v in value.items()) + "}"
     return str.__repr__(value)
 
 
 def docstring(text: str) -> str:
-    """Return a text escaped for a docstring."""
+    """Return `text` with backslashes, quotes and hidden characters escaped for a Python docstring.
+
+    The result goes between triple quotes.
+    """
     return re.sub(r'"(?="|\Z)', r"\"", lines(text).replace("\\", "\\\\"))
 
 
 def html(text: str) -> str:
-    """Return a text escaped for HTML, as Markup, which is not escaped again."""
+    """Return `text` as one line that is escaped for HTML.
+
+    The result is a markupsafe.Markup, which Jinja templates do not escape again.
+    """
     from markupsafe import escape
 
     return escape(line(text))
 
 
 def xml(text: str) -> str:
-    """Return a text escaped for an attribute of XML."""
+    """Return `text` as one line that is escaped for the value of an XML attribute."""
     from markupsafe import escape
 
     return str(escape(line(text)))
 
 
 def toml(text: str) -> str:
-    """Return a text as a quoted TOML string."""
+    """Return `text` as one line in quotes, a TOML string."""
     return json.dumps(line(text), ensure_ascii=False)
 
 
 def figure(text: str) -> str:
-    """Return a text for a figure, with dollar signs escaped."""
+    """Return `text` as one line for a Matplotlib figure.
+
+    Dollar signs, which would begin a formula, are escaped.
+    """
     return line(text).replace("$", r"\$")
 
 
 def name(text: str) -> str:
-    """Return an identifier for generated code. Raises ValueError for any other text."""
+    """Return `text` unchanged if it is an identifier (ASCII letters, digits, underscores).
+
+    Raises ValueError otherwise; generated code contains such names unescaped.
+    """
     if not re.fullmatch(r"[A-Za-z_][0-9A-Za-z_]*", text):
         raise ValueError(f"{text!r} is not a plain name and can't stand in code")
     return text
 
 
 def command(file: str) -> str:
-    """Return a file name quoted for the shell."""
+    """Return a file name as one line that is quoted for a command of the shell."""
     return shlex.quote(line(file))
 
 
 @dataclass(frozen=True)
 class FreeText:
-    """Free text on its way into a template, or texts by name.
+    """Free text for a Jinja template: a string that a user wrote, or a dict of such strings.
 
-    It can't be printed as it stands (TypeError): the template says for what, `{{ title.comment }}`.
+    A template prints it by a property that escapes it for the surrounding language, such as
+    `{{ title.comment }}`. Printing it without one raises TypeError.
     """
 
     text: str | Mapping[str, str]
@@ -175,22 +204,22 @@ class FreeText:
 
     @property
     def line(self) -> str:
-        """For a docstring, which is escaped as a whole."""
+        """The text as one line, for a docstring; the docstring is escaped as a whole later."""
         return line(self._one())
 
     @property
     def comment(self) -> str:
-        """For a C comment."""
+        """The text as one line that is escaped for a C comment."""
         return comment(self._one())
 
     @property
     def xml(self) -> str:
-        """For an attribute of XML."""
+        """The text as one line that is escaped for the value of an XML attribute."""
         return xml(self._one())
 
     @property
     def python(self) -> str:
-        """As a Python literal."""
+        """The text, or the dict of texts, as the source text of a Python literal."""
         return python(self.text)
 
     def _one(self) -> str:
