@@ -25,23 +25,25 @@ Row = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class Method:
-    """A Runge-Kutta or Nystrom method with fixed steps.
+    """The coefficients and properties of a Runge-Kutta or Nystrom method with fixed steps.
 
     Attributes
     ----------
     name, title, order, source
         Identifier, description, order of convergence and reference.
     limits
-        Largest h omega of an undamped oscillation, and h lambda of a decaying motion.
+        Limits of the step size h, beyond which a step is unstable or its stages do not converge:
+        the largest h omega of an undamped oscillation (omega in rad/s), and the largest h lambda
+        of a decaying motion exp(-lambda t).
     a, b
-        Matrix A (only below the diagonal for explicit methods) and weights.
+        Matrix A (rows of an explicit method end before the diagonal) and weights b.
     notes
-        Further properties, as lines of a comment.
+        Further properties, as lines of a comment in the generated C.
     nodes, end
-        Nodes c and b A, where they do not follow from A.
+        Nodes c and row vector b A of a Nystrom method; empty if they follow from `a` and `b`.
     sweeps
-        Fixed number of iterations for the stages of an implicit method; 0 where Newton's method is
-        used.
+        Fixed number of iterations for the stages of an implicit method; 0 if Newton's method is
+        used or the method is explicit.
     """
 
     name: str
@@ -58,64 +60,75 @@ class Method:
 
     @property
     def stages(self) -> int:
-        """Number of accelerations per step."""
+        """Number of stages, at each of which one step evaluates the accelerations once."""
         return len(self.b)
 
     @cached_property
     def implicit(self) -> bool:
-        """Whether the stages depend on one another."""
+        """Whether the method is implicit: A has nonzero entries on or above the diagonal."""
         return any(any(row[i:]) for i, row in enumerate(self.a))
 
     @property
     def newton(self) -> bool:
-        """Whether the stages are solved for by Newton's method, which is stable for stiff
-        motions.
+        """Whether the stages are solved for by Newton's method, which converges for stiff systems
+        too.
         """
         return self.implicit and not self.sweeps
 
     @cached_property
     def c(self) -> Row:
-        """The nodes, c_i = sum_k a_ik."""
+        """The nodes c: times of the stages as fractions of the step, by default the row sums of A."""
         return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
     @cached_property
     def a_squared(self) -> tuple[Row, ...]:
-        """A A: the effect of accelerations on the positions of the stages, over h^2."""
+        """Matrix A A. Its product with the stage accelerations, times h^2, is their contribution
+        to the positions at the stages.
+        """
         return tuple(_times(row, self.a) for row in self.a)
 
     @cached_property
     def b_a(self) -> Row:
-        """b A: the effect of accelerations on the position at the end, over h^2."""
+        """Row vector b A (or `end`). Its product with the stage accelerations, times h^2, is their
+        contribution to the position at the end of the step.
+        """
         return self.end or _times(self.b, self.a)
 
     @cached_property
     def extrapolation(self) -> tuple[Row, ...]:
-        """E: extrapolates accelerations to the next step's nodes by the polynomial through this
-        step's.
+        """Matrix E that extrapolates the stage accelerations of one step to the stages of the next.
+
+        The extrapolation evaluates the polynomial through the accelerations at the nodes of the
+        step at the nodes of the next step, which has the same size.
         """
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
     @cached_property
     def powers(self) -> tuple[Row, ...]:
-        """Matrix from accelerations at the nodes to coefficients of their polynomial in powers of 2
-        c - 1.
+        """Matrix that converts values at the nodes c to the coefficients of their interpolation
+        polynomial in powers of 2 c - 1, lowest power first.
         """
         return tuple(zip(*_lagrange(tuple(2 * x - 1 for x in self.c)), strict=True))
 
     def legendre(self, n: int) -> Row:
-        """Return weights that give the coefficient of P_n(2 c - 1) from values at Gauss nodes, n <
-        stages.
+        """Return the weights, one for each stage, of the coefficient of P_n(2 c - 1).
+
+        The sum of the weights times values at the nodes is the coefficient of the Legendre
+        polynomial P_n in the polynomial through these values. Valid for Gauss methods and
+        n < stages.
         """
         p = _legendre(n)
         return tuple((2 * n + 1) * b * _value(p, x) for b, x in zip(self.b, self.c, strict=True))
 
     @cached_property
     def eigen(self) -> tuple[tuple[Row, ...], tuple[Row, ...], tuple[Row, ...]]:
-        """Eigendecomposition of A, for an even number of stages without real eigenvalues.
+        """Eigendecomposition of A as a tuple (eigenvalues, forward, back).
 
-        Returns the eigenvalues with positive imaginary part as (real, imaginary), the rows that
-        transform values to eigenvector coordinates (real and imaginary part for each), and the rows
-        that transform back.
+        eigenvalues: those with positive imaginary part, as pairs (real, imaginary). forward: two
+        rows for each eigenvalue, which transform values at the stages to the real and imaginary
+        part of the coordinate along its eigenvector. back: two rows for each eigenvalue; the
+        values at the stages are the sum of these rows times the coordinates. Valid if A has an
+        even number of stages and no real eigenvalues.
         """
         from mpmath import matrix, mp, mpf
 
@@ -141,12 +154,16 @@ class Method:
 
     @cached_property
     def a_extrapolated(self) -> tuple[Row, ...]:
-        """A E: A applied to accelerations that are extrapolated from the previous step."""
+        """Matrix product A E, which applies A to stage accelerations extrapolated from the
+        previous step by E (`extrapolation`).
+        """
         return tuple(_times(row, self.extrapolation) for row in self.a)
 
     @cached_property
     def a_squared_extrapolated(self) -> tuple[Row, ...]:
-        """A A E: A A applied to accelerations that are extrapolated from the previous step."""
+        """Matrix product A A E, which applies A A to stage accelerations extrapolated from the
+        previous step by E (`extrapolation`).
+        """
         return tuple(_times(row, self.extrapolation) for row in self.a_squared)
 
 
