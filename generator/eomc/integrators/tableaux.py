@@ -77,7 +77,7 @@ class Method:
 
     @cached_property
     def c(self) -> Row:
-        """The nodes c: times of the stages as fractions of the step, by default the row sums of A."""
+        """The nodes c, the times of the stages as fractions of the step (default row sums of A)."""
         return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
     @cached_property
