@@ -32,7 +32,11 @@ UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
 
 def expression(formula: Formula, known: Mapping[str, Expr]) -> Expr:
-    """Return the expression of a formula. Raises FormulaError unless it is real and finite."""
+    """Convert a parsed formula to a SymPy expression and return it.
+
+    known: expression of each name that the formula may use. Raises FormulaError unless the value
+    is real and finite.
+    """
     try:
         value = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))
     except (ArithmeticError, ValueError, TypeError) as fault:

@@ -45,12 +45,19 @@ _REPLACEMENTS = {
 
 
 def fault(role: str, message: str) -> EomcError:
-    """Return the error to raise for an argument."""
+    """Return the EomcError for an invalid argument of System.make.
+
+    role: description of the argument for the message, such as "start of theta".
+    """
     return EomcError(f"System.make: {role}: {message}")
 
 
 def called(name: object, role: str) -> str:
-    """Return a name as text. Raises EomcError where it is not a valid name in C and Python."""
+    """Return a name, given as text or a Symbol, as text.
+
+    role: description of the argument for the message. Raises EomcError if the name is not valid in
+    C and Python.
+    """
     if not isinstance(name, (str, Symbol)):
         raise fault(role, f"{name!r} is not a name")
     if why := names.fault(str(name)):
@@ -73,7 +80,11 @@ LAGRANGIAN = (
 
 
 def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
-    """Raise TypeError for an argument that System.make does not have, with the closest name."""
+    """Raise TypeError if `unknown` has a name; the message suggests the closest name in `known`.
+
+    unknown: names of keyword arguments that System.make does not have. known: names of its
+    arguments.
+    """
     for name in unknown:
         known = [*known]
         if name in ("L", "lagrangian", "Lagrangian"):
@@ -85,7 +96,11 @@ def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collection[str]) -> None:
-    """Raise EomcError for the unit of an unknown name, or in degrees for what is no output."""
+    """Check the units of quantities, given by the names of the quantities.
+
+    Raises EomcError for a name that is not in `known`, and for a unit in degrees except for
+    `outputs` (their names), since all other angles are in radians.
+    """
     known = [*known]
     for name, unit in units.items():
         if name not in known:
@@ -103,7 +118,24 @@ def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collect
 
 
 def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "") -> Expr:
-    """Parse a formula as in scenes. rule: allowed names, for the message. Raises EomcError."""
+    """Parse a formula in the syntax of scenes and return it as a SymPy expression.
+
+    Parameters
+    ----------
+    text
+        The formula.
+    role
+        Description of the argument for messages, such as "start of theta".
+    known
+        Symbol of each name that the formula may use.
+    rule
+        Rule on the names that are allowed, for the message about another name.
+
+    Raises
+    ------
+    EomcError
+        If the formula is invalid or uses another name.
+    """
     try:
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
@@ -118,7 +150,11 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
 def undeclared(
     role: str, strange: Sequence[str], known: Iterable[str], rule: str = ""
 ) -> EomcError:
-    """Return the error for names that are not declared, or that a rule forbids."""
+    """Return the EomcError for names in an expression that are not declared or not allowed.
+
+    role: description of the argument for the message. strange: the names. known: declared names,
+    for a suggestion. rule: the rule that forbids the names, or "" if they are not declared.
+    """
     known = [*known]
     suggestion = formulas.suggest(strange[0], known)
     if strange[0] in known:
@@ -130,7 +166,10 @@ def undeclared(
 
 
 def expression(value: Any, role: str) -> Expr:
-    """Return the value as a SymPy expression. Raises EomcError where that is not possible."""
+    """Convert a value to a scalar SymPy expression and return it.
+
+    role: description of the argument for the message. Raises EomcError if the conversion fails.
+    """
     try:
         expr = sympy.sympify(value)
     except (sympy.SympifyError, TypeError, AttributeError, ValueError, RecursionError):
@@ -144,7 +183,10 @@ def expression(value: Any, role: str) -> Expr:
 
 
 def check_functions(expr: Expr, role: str) -> None:
-    """Raise EomcError where `expr` has a function that C code cannot evaluate."""
+    """Raise EomcError if `expr` contains a function that the generated C cannot evaluate.
+
+    role: description of the argument for the message.
+    """
     queue, visited = [expr], {expr}
     while queue:
         part = queue.pop()
@@ -166,10 +208,20 @@ def check_functions(expr: Expr, role: str) -> None:
 def check_smooth(
     expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixed: Any, what: str
 ) -> None:
-    """Raise EomcError where `expr`, which is differentiated, has a function that jumps.
+    """Raise EomcError if `expr`, which will be differentiated, is discontinuous.
 
-    fixed: constant symbols, of which such functions are constant. what: a name of the expression
-    for the message.
+    Parameters
+    ----------
+    expr
+        The expression; sign(...) and Heaviside(...) in it are discontinuous.
+    role
+        Description of the argument for the message.
+    definitions
+        Expressions of the symbols in `expr`, which are checked too.
+    fixed
+        Constant symbols. Discontinuous functions of these alone are allowed.
+    what
+        Name of the expression for the message, such as "the kinetic energy".
     """
     queue, visited = [expr], {expr}
     while queue:
@@ -189,7 +241,11 @@ def check_smooth(
 
 
 def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
-    """Return a finite number, also from a formula of numbers. Raises EomcError."""
+    """Convert a value, also a formula or expression without symbols, to a finite float.
+
+    role: description of the argument for messages. rule: text of the message about a value with
+    symbols. Raises EomcError for other values.
+    """
     if isinstance(value, str):
         value = from_text(value, role, {}, rule)
     if isinstance(value, Expr) and value.free_symbols:
@@ -204,7 +260,11 @@ def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
 
 
 def start(value: Any, role: str) -> tuple[Any, Any]:
-    """Return the initial value and velocity; None where none is given."""
+    """Split the entry of a coordinate in System.make into (initial value, initial velocity).
+
+    value: the initial value alone, or the pair; parts that are not given are None. role:
+    description of the argument for the message.
+    """
     pair = value if isinstance(value, (tuple, list)) else (value, None)
     if len(pair) != 2:
         raise fault(role, f"give a start, or a pair (start, rate), here {value!r}")
@@ -212,29 +272,41 @@ def start(value: Any, role: str) -> tuple[Any, Any]:
 
 
 def mapping(value: Any, role: str, example: str) -> Mapping[Any, Any]:
-    """Return a mapping with symbols as keys. Raises EomcError."""
+    """Return the mapping `value` with keys that are names converted to symbols.
+
+    role, example: description of the argument and a valid value for messages. Raises EomcError if
+    `value` is not a mapping or a key is not a symbol.
+    """
     if not isinstance(value, Mapping):
         raise fault(role, f"give a dict, such as {example}, here {value!r}")
     return {symbol_of(key, role): entry for key, entry in value.items()}
 
 
 def by_name(value: Any, role: str, example: str) -> dict[str, Any]:
-    """Return a mapping with the names of its symbols as keys. Raises EomcError."""
+    """Return the mapping `value` with keys that are symbols converted to their names.
+
+    role, example: description of the argument and a valid value for messages. Raises EomcError if
+    `value` is not a mapping or a key is not a symbol.
+    """
     return {name_of(one): entry for one, entry in mapping(value, role, example).items()}
 
 
 def name_of(one: Any) -> str:
-    """Return the name of a symbol or of a function of time."""
+    """Return the name of `one`, a Symbol, a function of time such as theta(t), or text."""
     return str(one.func.__name__ if isinstance(one, AppliedUndef) else one)
 
 
 def or_empty(value: Any) -> Any:
-    """Return the value, or an empty dict in place of None."""
+    """Return `value`, or an empty dict if it is None."""
     return {} if value is None else value
 
 
 def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
-    """Return a dict with symbols as keys; a list of symbols gives each the default."""
+    """Convert a mapping or a collection of symbols or names to a dict from symbols to values.
+
+    role: description of the argument for messages. default: value of each symbol of a collection.
+    Raises EomcError for other types.
+    """
     if isinstance(value, Mapping):
         return dict(mapping(value, role, ""))
     if not isinstance(value, (list, tuple, set, frozenset)):
@@ -243,7 +315,10 @@ def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
 
 
 def symbol_of(value: Any, role: str) -> Any:
-    """Return a symbol or a function of time (dynamicsymbols) as it is, or a name as a symbol."""
+    """Return `value` if it is a Symbol or a function of time (dynamicsymbols), or a name's symbol.
+
+    role: description of the argument for the message. Raises EomcError for other types.
+    """
     if not isinstance(value, (str, Symbol, AppliedUndef)):
         raise fault(role, f"{value!r} is not a symbol")
     return symbol(value) if isinstance(value, str) else value
@@ -253,7 +328,12 @@ def run(
     h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
     tolerance: Any, events: bool, inverse_dynamics: Any,
 ) -> Run:  # fmt: skip
-    """Return the settings of a run. Raises EomcError for invalid ones."""
+    """Return the settings of simulations and generated code from the arguments of System.make.
+
+    h, duration: step size and length of a run in s. methods: names of fixed-step methods, or
+    "auto" for adaptive steps. real: C type of numbers. events: whether the system has events or
+    friction, for which steps are adaptive too. Raises EomcError for invalid settings.
+    """
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:
             raise fault(name, f"must be greater than zero, here {value!r}")

@@ -27,10 +27,17 @@ _RANGE = f"is not between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size, as numbers m
 
 @dataclass(frozen=True)
 class Bound:
-    """A bound on the digits of a value.
+    """An upper bound on the number of decimal digits of an exact number.
 
-    value: the number in double precision, None if it varies. digits: upper bound on the digits of
-    the number, or of the coefficient.
+    Arithmetic on bounds gives the bound of the result and raises FormulaError if that has too many
+    digits, overflows or is not real.
+
+    Attributes
+    ----------
+    value
+        The number in double precision; None for an expression that varies.
+    digits
+        Upper bound on the digits of the number, or of the coefficient of an expression.
     """
 
     value: float | None = None
@@ -123,9 +130,10 @@ _ALGEBRA: Mapping[str, Any] = {
 
 
 def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
-    """Return the bound of a formula's value; names that are not in `known` vary.
+    """Return an upper bound on the digits of the value of a formula, without computing it exactly.
 
-    Raises FormulaError where the value is out of the range of doubles or has too many digits.
+    known: bounds of names in the formula; all other names stand for variables. Raises FormulaError
+    if the value is out of the range of doubles, is not real or has too many digits.
     """
     result = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
     assert isinstance(result, Bound)

@@ -35,7 +35,7 @@ from eomc.scene.scope import ENERGIES
 
 
 class _Formulas:
-    """A scene's formulas as expressions, over the names known so far; faults collected."""
+    """Converter of the formulas of a scene to SymPy expressions; it collects their problems."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -49,7 +49,10 @@ class _Formulas:
         self.sizes: dict[str, digit_bound.Bound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
-        """Return the expression of the formula at a key; zero where it is invalid."""
+        """Return a formula as a SymPy expression; record a problem and return 0 if it is invalid.
+
+        key: place of the formula in the scene, such as "energy.kinetic".
+        """
         name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
             self.sizes[name] = digit_bound.VARIES
@@ -61,7 +64,10 @@ class _Formulas:
             return sympy.S.Zero
 
     def definitions(self) -> tuple[list[tuple[Symbol, Expr]], Terms]:
-        """Evaluate constants; return the definitions in their order, and the terms of bodies."""
+        """Return all definitions, in order, and the terms that bodies add to the system.
+
+        Constants of the scene are evaluated on the way.
+        """
         scene, known = self.scene, self.known
         for constant in scene.constants:
             known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
@@ -85,7 +91,7 @@ class _Formulas:
         return made, builder.terms if builder else Terms()
 
     def potential(self, definitions: Sequence[tuple[Symbol, Expr]]) -> tuple[Expr, Expr]:
-        """Return the potential energy of [energy] and its part that is linear in the velocities."""
+        """Return the potential of [energy] as (part without velocities, part linear in them)."""
         key, formula = "energy.potential", self.scene.potential
         whole = self.value(key, formula)
         if self.problems:  # a formula without a value is 0
@@ -98,14 +104,17 @@ class _Formulas:
             return whole, sympy.S.Zero
 
     def inputs(self) -> Iterator[Input]:
-        """Yield the inputs with their signals and limits."""
+        """Yield the inputs of the scene with signals and limits as SymPy expressions."""
         for i in self.scene.inputs:
             signal = self.value(f"inputs.{i.name}.signal", i.signal)
             ends = (f and self.value(f"inputs.{i.name}.limits", f) for f in i.limits)
             yield Input(i.name, i.unit, signal, i.note, tuple(ends))
 
     def frictions(self, more: Terms) -> tuple[dict[str, Expr], list[Friction]]:
-        """Return friction along coordinates and in joints: smooth forces or stick-slip."""
+        """Return the smooth friction force of each coordinate by name, and all stick-slip friction.
+
+        more: terms that the bodies add, with the friction in joints.
+        """
         smooth, sticks = dict[str, Expr](), list[Friction]()
         for c in self.scene.coordinates:
             if c.friction is not None and c.friction_width is not None:
@@ -128,7 +137,7 @@ class _Formulas:
         return smooth, sticks
 
     def events(self) -> Iterator[Event]:
-        """Yield the events with their jump maps."""
+        """Yield the events of the scene; their jumps are pairs (name, new value)."""
         for k, e in enumerate(self.scene.events):
             when = self.value(f"event.{k}.when", e.when)
             jump = ((name, self.value(f"event.{k}.{name}", formula)) for name, formula in e.jump)
@@ -140,7 +149,10 @@ class _Formulas:
         definitions: Sequence[tuple[Symbol, Expr]],
         closed: Iterable[Closed],
     ) -> tuple[tuple[Constraint, ...], tuple[Reaction, ...]]:
-        """Return all constraints, holonomic ones first, and the reactions of loops."""
+        """Return all constraints, holonomic ones first, and the reactions of the loops.
+
+        closed: constraints and reaction of each loop.
+        """
         written = {c.name: c.formula for c in self.scene.constraints}
 
         def problem(row: Constraint, message: str, severity: str) -> Problem:
@@ -172,7 +184,10 @@ class _Formulas:
     def outputs(
         self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
     ) -> Iterator[Output]:
-        """Yield the outputs, which may use accelerations, energies and `forces` of constraints."""
+        """Yield the outputs of the scene; they may use accelerations, energies and `forces`.
+
+        forces: expressions of the multipliers and the reactions, by their names in outputs.
+        """
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
         energies = (kinetic, potential, kinetic + potential)
         self.known = {
@@ -210,7 +225,10 @@ def _forces(
 
 
 def from_scene(scene: Scene) -> System:
-    """Convert a scene to a system of SymPy expressions. Raises SceneError."""
+    """Convert a checked scene to a System of SymPy expressions and return it.
+
+    Raises SceneError, which lists all problems of the formulas.
+    """
     scene_formulas = _Formulas(scene)
     value = scene_formulas.value
     definitions, more = scene_formulas.definitions()

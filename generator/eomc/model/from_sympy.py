@@ -1,4 +1,4 @@
-"""What System.make makes of a user's symbols and expressions, whatever their assumptions."""
+"""Conversion of a user's symbols and expressions, whatever their assumptions, for System.make."""
 
 from __future__ import annotations
 
@@ -52,7 +52,11 @@ def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: It
 
 
 class Maker:
-    """Takes a user's symbols, of whatever assumptions and spelling, for ours."""
+    """Converter of the arguments of System.make to a system with symbols of its own.
+
+    Symbols of the user may have any assumptions and names; the symbols of the system are real and
+    have names that are valid in C. name: name of the system.
+    """
 
     def __init__(self, name: str) -> None:
         if not isinstance(name, str):
@@ -137,7 +141,11 @@ class Maker:
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
     ) -> AnySystem:  # fmt: skip
-        """Return the system, of the class `of`."""
+        """Return the system as an instance of the class `of`.
+
+        The other arguments are those of System.make, but for `rows` (constraints) and `run`
+        (settings of runs and generated code). Raises EomcError for invalid arguments.
+        """
         declarations = (coordinates, parameters, inputs, definitions)
         starts = api_arguments.symbols(coordinates, "coordinates", None)
         parameters = api_arguments.mapping(parameters, "parameters", "{m: 2.0}")

@@ -21,16 +21,30 @@ NOT_LINEAR = (
 
 
 class NotLinearError(ValueError):
-    """A potential that is not linear in the velocities."""
+    """Error for a potential energy that is nonlinear in the velocities."""
 
 
 def split(
     potential: Expr, definitions: Sequence[tuple[Symbol, Expr]], velocities: Iterable[Symbol]
 ) -> tuple[Expr, Expr]:
-    """Return P and a.qd of the potential P + a.qd. Raises NotLinearError.
+    """Split a generalized potential U = P(q, t) + a(q, t).qd and return the pair (P, a.qd).
 
-    dot(y) is a velocity too: where y depends on t explicitly, it is the whole velocity of y that
-    the linear part contains. Definitions stay as they are, but for those that contain velocities.
+    Derivatives dot(y) count as velocities and are not expanded; a term with dot(y) belongs to a.qd
+    even if y depends on t explicitly. Definitions that contain velocities are substituted.
+
+    Parameters
+    ----------
+    potential
+        The generalized potential U.
+    definitions
+        Pairs (symbol, expression), each expression over the symbols before it.
+    velocities
+        Symbols of the generalized velocities.
+
+    Raises
+    ------
+    NotLinearError
+        If U is nonlinear in the velocities.
     """
     moving = {*velocities}
     for name, e in definitions:
