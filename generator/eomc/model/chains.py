@@ -14,14 +14,25 @@ from eomc.model import rational
 from eomc.model.rational import ONE, ZERO, Matrix, Vector
 from eomc.scene.assembly import WORLD
 
-Named = Callable[[str, Vector, Matrix], tuple[Vector, Matrix]]  # a body's place, by names
+# (name of a body, its position and rotation) -> the same pose in symbols defined for it
+Named = Callable[[str, Vector, Matrix], tuple[Vector, Matrix]]
 
 
 @dataclass(frozen=True)
 class Step:
-    """From a parent's frame to a body's: where the joint is, and what it moves by.
+    """The transformation from the frame of a parent body to the frame of a body.
 
-    angle: of the rotation, in the plane. motions: of each what it is, its axis, by how much.
+    Attributes
+    ----------
+    parent
+        Name of the parent body.
+    offset, rotation
+        Position (m) and rotation matrix of the joint's frame in the parent's frame.
+    angle
+        Angle of `rotation` in rad, for a planar scene.
+    motions
+        Motions of the joint, as tuples (kind, axis, amount). kind: "t" for a translation, "r" for
+        a rotation. axis: in the joint's frame. amount: in m or rad.
     """
 
     parent: str
@@ -33,22 +44,27 @@ class Step:
 
 @dataclass
 class Chains:
-    """The steps to all bodies that are held by joints."""
+    """Kinematic chains of the bodies with joints.
+
+    plane: whether the scene is planar. steps: transformation from the parent's frame to the
+    body's frame, by the name of the body.
+    """
 
     plane: bool
     steps: dict[str, Step] = field(default_factory=dict)
 
     def path(self, name: str) -> list[str]:
-        """Return the body and its ancestors connected by joints, then the world."""
+        """Return the names of a body and its ancestors, from the body to "world"."""
         path = [name]
         while path[-1] in self.steps:
             path.append(self.steps[path[-1]].parent)
         return path if path[-1] == WORLD else [*path, WORLD]
 
     def common(self, one: str, other: str) -> str:
-        """Return the closest common ancestor of two bodies, or the world if that does not move.
+        """Return the name of the closest common ancestor of two bodies.
 
-        The relative pose of the two bodies does not depend on the motion of the ancestor.
+        The result is "world" if this ancestor does not move. The relative pose of the two bodies
+        does not depend on the motion of the ancestor.
         """
         others = self.path(other)
         ancestor = next(name for name in self.path(one) if name in others)
@@ -56,7 +72,12 @@ class Chains:
         return ancestor if moves else WORLD
 
     def relative_pose(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
-        """Return the position and rotation of a body in the frame of one of its ancestors."""
+        """Return the position (m) and rotation matrix of a body in the frame of an ancestor.
+
+        name, base: names of the body and the ancestor. named: function that is called with the
+        name, position and rotation of each body on the path and returns the pose with which to
+        continue, such as one in symbols that are defined for long expressions.
+        """
         at, R, angle, path = ZERO, ONE, S.Zero, self.path(name)
         for body in reversed(path[: path.index(base)]):
             step = self.steps[body]
@@ -78,5 +99,8 @@ class Chains:
 
 
 def rotation_about(axis: int, angle: Expr) -> Matrix:
-    """Return the rotation about a coordinate axis, from the rotated frame to the original one."""
+    """Return the matrix of a rotation by `angle` (rad) about the coordinate axis 0, 1 or 2.
+
+    It takes vectors from the rotated frame to the original one.
+    """
     return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))

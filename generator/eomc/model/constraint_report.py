@@ -10,7 +10,10 @@ from eomc.base.texts import listed, plural
 
 @dataclass(frozen=True)
 class Move:
-    """A coordinate or velocity whose assembled initial value differs from its guess."""
+    """A coordinate or velocity whose initial value was changed to satisfy the constraints.
+
+    guess, value: before and after, in `unit`.
+    """
 
     name: str
     guess: float
@@ -24,18 +27,40 @@ class Move:
 
 @dataclass(frozen=True)
 class ConstraintSummary:
-    """Properties of the constraints of a system, computed near its assembled configuration.
+    """Properties of the constraints of a system, computed near its initial configuration.
 
-    rows: names of the constraint equations. rank: of their Jacobian, almost everywhere on the
-    constraint manifold. redundant: equations that the others imply, which are not solved for.
-    shared: equations whose multipliers are not unique. start_sigma, least_sigma: ratio of the
-    smallest nonzero singular value of the scaled Jacobian to the largest, at the start and at the
-    worst of `positions` sampled configurations; 0 at a singular configuration. weights: if D is
-    singular, weights with which D + sum_r weights[r] A_r^T A_r is regular; else empty. slopes:
-    largest A D^-1 A^T of each equation among these configurations. sums: weights of the linear
-    combinations of equations that are solved for in place of `shared`, where no subset of the
-    equations is independent everywhere. moves, rate_moves: changes of initial values by assembly.
-    remarks: messages. computed_from: the data of the system that all this depends on.
+    D is the mass matrix and A the Jacobian of the constraint equations, with one row A_r for each.
+
+    Attributes
+    ----------
+    rows
+        Names of the constraint equations.
+    coordinates
+        Number of coordinates.
+    rank
+        Rank of A almost everywhere on the constraint manifold.
+    redundant
+        Names of the equations that the others imply; they are not solved for.
+    shared
+        Names of the equations whose Lagrange multipliers are not unique.
+    start_sigma, least_sigma
+        Ratio of the smallest nonzero singular value of the scaled Jacobian to the largest, at the
+        start and at the worst of the sampled configurations; 0 at a singular configuration.
+    positions
+        Number of sampled configurations.
+    weights
+        If D is singular, weights with which D + sum_r weights[r] A_r^T A_r is regular; else empty.
+    slopes
+        Largest value of A_r D^-1 A_r^T for each equation among the sampled configurations.
+    sums
+        Weights of linear combinations of the equations that are solved for in place of `shared`;
+        used if no subset of the equations is independent everywhere.
+    moves, rate_moves
+        Coordinates and velocities whose initial values were changed to satisfy the constraints.
+    remarks
+        Messages for the user.
+    computed_from
+        The data of the system on which all this depends.
     """
 
     rows: tuple[str, ...]
@@ -56,12 +81,12 @@ class ConstraintSummary:
 
     @property
     def freedoms(self) -> int:
-        """Degrees of freedom: number of coordinates minus rank."""
+        """The number of degrees of freedom: the number of coordinates minus the rank."""
         return self.coordinates - self.rank
 
     @property
     def ranks(self) -> str:
-        """The rank as text, with redundant equations and multipliers that are not unique."""
+        """Text that states the rank, the redundant equations and the multipliers not unique."""
         text = f"rank {self.rank} of {len(self.rows)}"
         if self.redundant:
             text += (
@@ -78,7 +103,7 @@ class ConstraintSummary:
         return text
 
     def table(self) -> str:
-        """Return the summary as text."""
+        """Return the summary as text of several lines for the terminal."""
         n = len(self.rows)
         lines = [
             f"{n} {plural('row', n)} of constraints on {self.coordinates} "

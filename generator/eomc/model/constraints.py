@@ -16,10 +16,10 @@ from eomc.model.loops import Closed
 from eomc.model.numeric import compiled
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
-NEAR = 1e-9  # m, or rad: smaller residuals count as zero
-ROUNDING = 1e-13  # relative to the loop's length (1 for axis equations): smaller changes
+NEAR = 1e-9  # m or rad; smaller residuals count as zero
+ROUNDING = 1e-13  # relative to the loop's length (1 for axis equations); smaller changes count as 0
 NONSMOOTH = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
-SAMPLES = 4  # at which loop equations are compared
+SAMPLES = 4  # random configurations at which loop equations are evaluated
 MAX_FORMULA_LENGTH = 80  # characters of a formula in a message
 
 NOTHING_MOVES = (
@@ -36,11 +36,17 @@ _DRIFTS = "is the rate of a position, and where rates alone are held, the positi
 
 @dataclass(frozen=True)
 class Degree:
-    """Degree of an expression in the velocities.
+    """How an expression depends on velocities, coordinates and time.
 
-    degree: 0, 1, or 2 for any nonlinear expression. moves: other dependence: 0 constant, 1 on
-    time, 2 on coordinates. exact: whether it is the time derivative of a position: a sum of
-    velocities and dot(...) with constant factors and functions of time.
+    Attributes
+    ----------
+    degree
+        Degree in the velocities: 0, 1, or 2 for any nonlinear expression.
+    moves
+        Other dependence: 0 if constant, 1 if on time alone, 2 if on coordinates or velocities.
+    exact
+        Whether the expression is recognised as the time derivative of a position: a sum of
+        velocities and dot(...) with constant factors, and functions of time.
     """
 
     degree: int = 0
@@ -53,7 +59,10 @@ _NONLINEAR = Degree(2, 2)
 
 
 class VelocityDegree:
-    """Degrees of expressions in the velocities, with definitions substituted."""
+    """Classifier of expressions by their dependence on the velocities (see `Degree`).
+
+    definitions: (symbol, expression) pairs in order; their symbols count as their expressions.
+    """
 
     def __init__(
         self, coordinates: Iterable[Coordinate], definitions: Iterable[tuple[Symbol, Expr]]
@@ -65,7 +74,7 @@ class VelocityDegree:
             self.known[name] = self.degree(e)
 
     def degree(self, e: Expr) -> Degree:
-        """Return the degree of an expression over symbols of the system."""
+        """Return the dependence of an expression in symbols of the system on the velocities."""
         degree = self.known.get(e)
         if degree is None:
             degree = self._combine(e, [self.degree(part) for part in e.args])
@@ -96,10 +105,16 @@ class VelocityDegree:
 
 
 class Rows:
-    """Classification and checks of constraints over a system's coordinates and definitions.
+    """Checker and classifier of the constraint equations of a system.
 
-    values: of the parameters. fault, doubt: called with a constraint and a message, an error or a
-    warning.
+    Parameters
+    ----------
+    coordinates, definitions
+        Those of the system; definitions are (symbol, expression) pairs in order.
+    values
+        Values of the parameters.
+    fault, doubt
+        Functions that are called with a constraint and a message for each error and each warning.
     """
 
     def __init__(
@@ -118,7 +133,10 @@ class Rows:
         self.velocity_degree = VelocityDegree(coordinates, definitions)
 
     def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
-        """Return the constraints with `holonomic` set, holonomic ones first."""
+        """Return the valid constraints with their attribute `holonomic` set, holonomic ones first.
+
+        Invalid constraints are reported by `fault` and doubtful ones by `doubt`.
+        """
         holonomic, others = [], []
         for row in rows:
             degree = self.velocity_degree.degree(row.formula)
@@ -135,7 +153,11 @@ class Rows:
         return (*holonomic, *others)
 
     def without_constant_rows(self, closed: Closed) -> Closed:
-        """Return a loop without its constant equations, each of which is reported."""
+        """Return a loop without the constraint equations that are constant.
+
+        A constant equation that is zero is reported by `doubt`; it is reported by `fault` if it is
+        not zero or if no equation is left.
+        """
         fixed = [self._fixed(row.formula) for row in closed.rows]
         if closed.points and None in fixed:
             hardly = self._hardly_moved(closed)

@@ -1,4 +1,4 @@
-"""Forward kinematics of a scene's bodies in plain numbers, and what moves nothing at a state."""
+"""Numerical forward kinematics of a scene's bodies, and motions that move no body or no mass."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ SAMPLES = 3  # random states; the largest rank holds almost everywhere
 
 @dataclass(frozen=True)
 class Jacobian:
-    """Jacobians with one column for each coordinate.
+    """Jacobians of the motion of all bodies, with one column for each coordinate.
 
-    moves: of the velocities (m/s) and angular velocities (rad/s) of all bodies. weighs: the same
-    times the square roots of the inertias, so that D = weighs^T weighs.
+    moves: derivatives of the velocities (m/s) and angular velocities (rad/s) of all bodies with
+    respect to the generalized velocities. weighs: the same multiplied by the square roots of
+    masses and inertias, so that the mass matrix is weighs^T weighs.
     """
 
     moves: Array
@@ -42,14 +43,18 @@ class Jacobian:
 
 @dataclass(frozen=True)
 class Null:
-    """Null spaces: motions that move no body, and motions without kinetic energy, as rows."""
+    """Null spaces of a `Jacobian`, as arrays whose rows are generalized velocities (n, nq).
+
+    moves: basis of the motions that move no body. weighs: basis of the motions without kinetic
+    energy.
+    """
 
     moves: Array
     weighs: Array
 
 
 class Kinematics:
-    """Numerical kinematics of the bodies of a scene."""
+    """Numerical kinematics of the bodies of a scene, at the values of parameters in the scene."""
 
     def __init__(self, scene: Scene, assembly: Assembly) -> None:
         self.coordinates = [c.name for c in scene.coordinates]
@@ -65,7 +70,11 @@ class Kinematics:
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
 
     def states(self) -> Iterator[Null]:
-        """Yield null spaces at random states near the start where all formulas have values."""
+        """Yield the null spaces at random configurations near the initial one.
+
+        Configurations where a formula has no value are left out. The iteration ends after three
+        configurations, or at the first one without a motion that has no kinetic energy.
+        """
         random = np.random.default_rng(0)
         for _ in range(SAMPLES):
             q = self.start + random.uniform(-0.7, 0.7, len(self.start))
@@ -75,18 +84,19 @@ class Kinematics:
                     return
 
     def null(self, q: Array, t: float) -> Null | None:
-        """Return the null spaces at a state; None where a formula has no value."""
+        """Return the null spaces at coordinates q and time t, or None if a formula has no value."""
         if self.is_regular(q):
             return Null(*np.zeros((2, 0, len(q))))
         jacobian = self.jacobian(q, t)
         return Null(_null(jacobian.moves), _null(jacobian.weighs)) if jacobian else None
 
     def is_regular(self, q: Array) -> bool:
-        """Return True if every joint of a tree has articulated inertia, without its armature.
+        """Return True if the mass matrix at `q` is certainly regular without the armatures.
 
-        The joints are eliminated from the last one inwards (articulated bodies; Featherstone,
-        *Rigid Body Dynamics Algorithms*, ch. 7), in linear time. False also if a pivot may be
-        rounding.
+        The joints of the tree are eliminated from the last one inwards in linear time (articulated
+        bodies; Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7). The result is False if a
+        pivot may be rounding error, if a body is placed by formulas, or if the joints do not have
+        one coordinate of the scene for each of their motions.
         """
         by = [formula.text for body in self.tree for formula in body.coordinates]
         if self.placed or sorted(by) != sorted(self.coordinates):
@@ -115,9 +125,10 @@ class Kinematics:
         return True
 
     def poses(self, q: Array) -> dict[str, Pose] | None:
-        """Return the pose of each body's frame, or centre if placed by formulas.
+        """Return the position (3,) and rotation (3, 3) of each body in the world, by name.
 
-        None where a formula has no value.
+        The position is that of the body's frame, or that of the centre of mass (at time 0) if the
+        body is placed by formulas. The result is None if a formula has no value.
         """
         try:
             by_name = {name: pose for name, (pose, _) in self._frames(q).items()}
@@ -165,7 +176,7 @@ class Kinematics:
         return slopes
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
-        """Return the Jacobians at a state; None where a formula has no value."""
+        """Return the Jacobians at coordinates q and time t, or None if a formula has no value."""
         try:
             velocities = [*self._tree_rates(q), *self._placed_rates(q, t)]
             rotors = [*self._armatures(q)]
@@ -232,12 +243,15 @@ class Kinematics:
         }
 
     def joint_frame(self, body: Body) -> Pose:
-        """Return the pose of the joint's frame in the parent's."""
+        """Return position and rotation of the frame of a body's joint in the parent's frame."""
         offset = self.vector(body.offset, self.values) if body.offset else np.zeros(3)
         return offset, self._rotation(body.rotation, self.values)
 
     def axes(self, body: Body) -> list[Array]:
-        """Return the axis of each coordinate of a joint, in the frame moved by those before it."""
+        """Return a unit vector for each motion of a body's joint.
+
+        Each is given in the joint's frame as moved by the motions before it.
+        """
         axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
 
@@ -258,7 +272,7 @@ class Kinematics:
                 yield math.sqrt(max(self._number(armature, self.values), 0)) * row
 
     def vector(self, formulas_: Iterable[Formula], known: dict[str, float]) -> Array:
-        """Return the values of formulas, with values of names from `known`."""
+        """Return the values of formulas as an array, given the values of names in `known`."""
         return np.array([self._number(formula, known) for formula in formulas_])
 
     def _rotation(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:

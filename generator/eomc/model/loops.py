@@ -36,7 +36,11 @@ from eomc.scene.assembly import Loop
 
 @dataclass(frozen=True)
 class End:
-    """A body at a joint: the point, and its frame's rotation, in the frame both are seen from."""
+    """One of the two bodies of a loop joint: its joint point and its rotation.
+
+    point: position of the joint on the body, in m. R: rotation matrix of the body's frame. Both
+    are in the frame of the common ancestor of the two bodies, or in the world.
+    """
 
     point: Vector
     R: Matrix
@@ -57,7 +61,11 @@ class _Pull:
 
 @dataclass
 class Closed:
-    """The constraints of a loop, its reaction (none for a gear) and the points that it joins."""
+    """The constraint equations of a loop joint and what belongs to them.
+
+    rows: constraint equations. reactions: the reaction on the second body; empty for a gear.
+    points: joint points of the two bodies; empty for a gear.
+    """
 
     rows: list[Constraint]
     reactions: list[Reaction] = field(default_factory=list)
@@ -67,10 +75,22 @@ class Closed:
 def close(
     loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, to_world: Matrix
 ) -> Closed:
-    """Return the constraints of a loop between two bodies, and its reaction in world axes.
+    """Return the constraint equations of a loop joint between two bodies, and its reaction.
 
-    turned: rotation of the second frame relative to the first when closed. length: of a distance,
-    m. to_world: rotation from the frame of `ends` to the world.
+    Parameters
+    ----------
+    loop
+        The joint in the scene.
+    plane
+        Whether the scene is planar.
+    ends
+        Point and rotation of each of the two bodies.
+    turned
+        Rotation of the second body's frame relative to the first body's when the joint is closed.
+    length
+        Distance in m for a joint that keeps the distance of the two points; 0 for others.
+    to_world
+        Rotation from the frame of `ends` to the world; the reaction is in world axes.
     """
     first, second = ends
     R = (product(first.R, turned), second.R)
@@ -155,7 +175,10 @@ def _unit(axis: Sequence[float]) -> Vector:
 
 
 def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
-    """Return a right-handed triad (u, v, axis); in the plane u lies in the plane."""
+    """Return a right-handed triad of unit vectors (u, v, axis) for a given axis.
+
+    plane: whether the scene is planar; the axis and u then lie in the plane.
+    """
     along = _unit(axis)
     if plane:
         return (-along[1], along[0], S.Zero), (S.Zero, S.Zero, S.One), along
@@ -165,7 +188,10 @@ def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vect
 
 
 def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
-    """Return the constraint of a gear: second coordinate - ratio * first - offset = 0."""
+    """Return the constraint equation of a gear between two coordinates, without a reaction.
+
+    The equation is second coordinate - ratio * first coordinate - offset = 0.
+    """
     first, second = (symbol(name) for name in loop.coordinates)
     row = second - ratio * first - offset
     return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])
@@ -174,9 +200,11 @@ def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
 def find_wrong_rotations(
     system: Mechanics,
 ) -> Callable[[Sequence[float], float, Mapping[str, float]], list[str]]:
-    """Return a function of q, t and parameters: names of loops with a wrong relative rotation.
+    """Return a function that lists the loops whose bodies have a wrong relative rotation.
 
-    The axis equations of such loops may be satisfied.
+    The function takes coordinates q, time t and a dict of parameter values by name (defaults for
+    the others), and returns names of loops. The axis equations of these may be satisfied, since
+    they have more than one solution.
     """
     cosines = [(r.name, branch) for r in system.reactions for branch in r.branches]
     if not cosines:
@@ -198,9 +226,11 @@ def find_wrong_rotations(
 def without_constant_rows(
     closed: Closed, values: Sequence[float | None]
 ) -> tuple[Closed, list[tuple[Constraint, float]]]:
-    """Return a loop without its constant equations, whose multipliers are zero, and these.
+    """Remove constant constraint equations of a loop; return the loop and the removed equations.
 
-    values: of each constant equation, None for others.
+    The multipliers of the removed equations are replaced by zero in the reaction. values: for each
+    equation of the loop its constant value, or None if it is not constant. The removed equations
+    are returned as pairs (constraint, value).
     """
     rows, constant = [], []
     for row, fixed in zip(closed.rows, values, strict=True):
