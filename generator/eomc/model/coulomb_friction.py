@@ -26,7 +26,11 @@ NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
 
 @dataclass(frozen=True)
 class Friction:
-    """Coulomb friction of size `force` >= 0 (N or N m) along a coordinate, from a scene key."""
+    """Coulomb friction that opposes the motion of a coordinate.
+
+    coordinate: name of the coordinate. force: size of the friction, >= 0, in N or N m. key: place
+    of the friction in the scene, for messages.
+    """
 
     coordinate: str
     force: Expr
@@ -34,9 +38,11 @@ class Friction:
 
 
 def add_stick_slip(system: AnySystem, frictions: Sequence[Friction]) -> AnySystem:
-    """Return the system with stick-slip friction; forces along the same coordinate are added.
+    """Return the system with friction that switches between sticking and sliding.
 
-    Raises SceneError where a name that is needed is in use.
+    For each coordinate with friction, a discrete coordinate (its friction mode), a constraint and
+    two events are added; frictions along the same coordinate are summed. Raises SceneError if the
+    name of an added quantity is already in use.
     """
     if not frictions:
         return system
@@ -126,7 +132,11 @@ def _set_modes(event: Event, sliding: Mapping[str, str]) -> Event:
 
 
 def without_modes(system: AnySystem) -> AnySystem:
-    """Return the system without friction modes, as where all joints slide."""
+    """Return the system without stick-slip friction: without its modes, constraints and events.
+
+    All other events are removed too. Inverse of `add_stick_slip` for the assembly of initial
+    values, which then uses `with_modes`.
+    """
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
     sticking = dict.fromkeys((c.q for c in system.coordinates[n:]), S.Zero)
@@ -145,8 +155,10 @@ def without_modes(system: AnySystem) -> AnySystem:
 
 
 def with_modes(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return the system with initial values and constraints of `core`, its assembled form without
-    friction modes.
+    """Return the system, which has friction modes, with the initial values and constraints of
+    `core`.
+
+    core: result of `without_modes` for the system, with consistent initial values.
     """
     modes = [
         replace(system.coordinates[m.at], start=_side(core.coordinates[m.of].rate))

@@ -15,10 +15,11 @@ from eomc.model.symbols import Coordinate, Parameter
 
 
 def add_discrete_coordinates(system: AnySystem) -> AnySystem:
-    """Return the system with parameters that jumps set as additional, discrete coordinates.
+    """Convert parameters that events change into discrete coordinates; return the new system.
 
-    Raises SceneError where a name that is needed is in use, an input limit depends on such a
-    parameter, or an event function depends on nothing else.
+    A discrete coordinate is constant between events. Raises SceneError if the name of its velocity
+    or acceleration is already in use, if the limit of an input depends on such a parameter, or if
+    an event function depends on such parameters and constant ones only.
     """
     jumped = {name for event in system.events for name, _ in event.jump}
     jumped_parameters = [p for p in system.parameters if p.name in jumped]
@@ -91,7 +92,11 @@ def _idle(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem
 
 
 def with_constant_parameters(system: AnySystem) -> AnySystem:
-    """Return the system without events, with parameters in place of its discrete variables."""
+    """Return the system without events, with its discrete coordinates converted to parameters.
+
+    The value of each parameter is the initial value of the discrete coordinate. A system without
+    discrete coordinates is returned unchanged.
+    """
     if not system.discrete:
         return system
     own = [c for c in system.coordinates if c.name not in system.discrete]
@@ -115,8 +120,10 @@ def with_constant_parameters(system: AnySystem) -> AnySystem:
 
 
 def with_parameters_as_states(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return the system with initial values and constraints of `core`, its assembled form with
-    parameters in place of discrete variables.
+    """Return the system, which has discrete coordinates, with the initial values and constraints
+    of `core`.
+
+    core: result of `with_constant_parameters` for the system, with consistent initial values.
     """
     variables = [c for c in system.coordinates if c.name in system.discrete]
     return replace(

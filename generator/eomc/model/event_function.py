@@ -10,7 +10,11 @@ from eomc.model.mechanics import AnySystem
 
 
 def check_event_functions(system: AnySystem) -> AnySystem:
-    """Return the system. Raises SceneError for an event function that is piecewise constant."""
+    """Return the system unchanged if all its event functions can cross zero continuously.
+
+    Raises SceneError for an event function that is piecewise constant, such as sign(x), whose
+    jump over zero is no root.
+    """
     if not system.events:
         return system
     smooth: dict[

@@ -30,7 +30,7 @@ from eomc.model.symbols import (
 from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
 
-LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
+LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of C's float, in full precision
 
 
 _TABLES = "constants constraints coordinates definitions energy forces inputs outputs parameters"
@@ -38,7 +38,7 @@ _TABLE = re.compile(rf"\[({_TABLES.replace(' ', '|')})\]")
 
 
 def in_words_of_python(message: str) -> str:
-    """Return a message about tables of a scene with the arguments of System.make in their place.
+    """Replace the names of TOML tables in a message by the corresponding arguments of System.make.
 
     >>> in_words_of_python("split it with [definitions]")
     'split it with definitions'
@@ -60,24 +60,58 @@ def argument_of(key: str) -> str:
 
 @dataclass(frozen=True)
 class Mechanics:
-    """d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd, over named definitions.
+    """A mechanical system in symbols: d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd.
 
-    `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `linear_potential` is a(q, t).qd, the part of a generalized potential
-    that is linear in the velocities (generalized_potential.py), no part of the energy. `forces`:
-    Q, one expression for each coordinate. `applied`: forces F at positions y, as pairs (y, F), each
-    of which adds F dy/dq to Q. `constraints`: expressions that are zero, holonomic ones first; with
-    their Jacobian A (with respect to q, or to qd if nonholonomic) and the multipliers lambda,
-    A^T lambda is added to Q. `reactions`: of the loops. `tree`: the bodies with joints, whose
-    energies are part of K and P. `frames`: of bodies and points, in space or in the `plane`.
-    `digest`: hash of the source of the system. `renamed`: names that C does not allow, as (given,
-    used) pairs. `scene`: the scene from which the system was read, if any. `picture_scene`: for a
-    system made in Python with a picture, a scene of its names and the picture only. `closure`:
-    properties of the constraints, once initial values are assembled. `modes`: stick-slip friction
-    modes, the last coordinates. `discrete`: names of discrete coordinates, placed before the modes;
-    no derivative with respect to them is taken. `again`: `make` with its arguments, any of which
-    can be replaced. `own_symbols`: the symbols, functions of time and their derivatives that the
-    user gave to `make`, by their names in the system.
+    Expressions are SymPy's; `dot(e)` in them stands for de/dt.
+
+    Attributes
+    ----------
+    coordinates
+        Generalized coordinates q, with initial values; then discrete coordinates.
+    kinetic, potential, dissipation
+        Kinetic energy K, potential energy P and Rayleigh's dissipation function R.
+    linear_potential
+        The part a(q, t).qd of a generalized potential, which is not part of the energy
+        (generalized_potential.py).
+    forces
+        Generalized forces Q, one for each coordinate.
+    applied
+        Forces F at positions y, as pairs (y, F). Each adds F dy/dq to Q.
+    definitions
+        Pairs (symbol, expression); each expression may use t and the symbols before it.
+    constraints
+        Equations formula = 0, holonomic ones first. With their Jacobian A (with respect to q, or
+        to qd if nonholonomic) and the multipliers lambda, A^T lambda is added to Q.
+    reactions
+        Forces and moments in loop joints.
+    tree
+        The bodies with joints; their energies are part of K and P.
+    frames, plane
+        Frames of bodies and points, and whether the scene is planar.
+    run
+        Settings of runs and generated code.
+    digest
+        Hash of the source of the system.
+    renamed
+        Names that C does not allow, as pairs (given name, name in the system).
+    place
+        Function that returns a Problem at a key of the scene; None for a system made in Python.
+    scene
+        The scene from which the system was read, if any.
+    picture_scene
+        For a system made in Python with a picture, a scene with its names and picture only.
+    closure
+        Summary of the constraints, once the initial values are consistent with them.
+    modes
+        Stick-slip friction modes, which are the last coordinates.
+    discrete
+        Names of the discrete coordinates for variables that jumps set. They are placed before the
+        modes; no derivative with respect to them is taken.
+    again
+        `System.make` with the arguments of the system, any of which can be replaced.
+    own_symbols
+        Symbols, functions of time and derivatives of these that the user passed to `System.make`,
+        by their names in the system.
     """
 
     name: str
@@ -120,29 +154,33 @@ class Mechanics:
 
     @property
     def q(self) -> tuple[Symbol, ...]:
-        """The coordinates' symbols, in scene order."""
+        """The symbols of the coordinates, in the order of `coordinates`."""
         return tuple(c.q for c in self.coordinates)
 
     @property
     def qd(self) -> tuple[Symbol, ...]:
-        """The velocities' symbols, in scene order."""
+        """The symbols of the velocities, in the order of `coordinates`."""
         return tuple(c.qd for c in self.coordinates)
 
     @property
     def qdd(self) -> tuple[Symbol, ...]:
-        """The accelerations' symbols, in scene order."""
+        """The symbols of the accelerations, in the order of `coordinates`."""
         return tuple(c.qdd for c in self.coordinates)
 
     @property
     def rates(self) -> dict[Symbol, Symbol]:
-        """The velocities by coordinate, without discrete coordinates."""
+        """A dict from the symbol of each coordinate to that of its velocity.
+
+        The coordinates in `discrete` are left out.
+        """
         return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
 
     @property
     def solved(self) -> tuple[tuple[tuple[int, float], ...], ...]:
-        """The equations to solve with: sums of constraints, as (index, weight) pairs.
+        """The constraint equations that are solved for, as weighted sums of `constraints`.
 
-        Those of `closure.sums` come first; the others are single constraints.
+        Each is a tuple of pairs (index of the constraint, weight). The sums of `closure.sums` come
+        first, then the single constraints that are neither redundant nor part of a sum.
         """
         sums = self.closure.sums if self.closure else ()
         mixed = {k for row in sums for k, w in enumerate(row) if w}
@@ -154,53 +192,68 @@ class Mechanics:
 
     @property
     def rotations(self) -> tuple[tuple[int, ...], ...]:
-        """The indices of the constraints with a rotation error, for each loop that has some."""
+        """Indices of the constraints with a `rotation_error`, one tuple for each loop that has any."""
         rows = [(k, c.loop) for k, c in enumerate(self.constraints) if c.rotation_error is not None]
         return tuple(tuple(k for k, _ in some) for _, some in groupby(rows, key=lambda row: row[1]))
 
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
-        """Return a problem at a key such as `energy.kinetic`, with its line if there is a scene."""
+        """Return the Problem with a message on the entry `key`, such as "energy.kinetic".
+
+        It contains file and line if the system was read from a scene. severity: "error", "warning"
+        or "note".
+        """
         if self.place is None:
             message, key = in_words_of_python(message), argument_of(key)
             return Problem(message, key, f"System {self.name}", severity=severity)
         return self.place(key, message, severity=severity)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
-        """Return the system with other values for some of its parameters."""
+        """Return the system with other values of the parameters that are named in `parameters`."""
         changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
         return replace(self, parameters=changed)
 
     @property
     def output_frames(self) -> tuple[Frame, ...]:
-        """The frames whose poses, velocities and Jacobians are generated, in the order of [run]."""
+        """The frames of bodies and points for which the C code computes poses and Jacobians.
+
+        They are in the order of the setting `frames` in the table [run] of the scene.
+        """
         names, known = self.run.frames, {f.name: f for f in self.frames}
         return self.frames if names is True else tuple(known[name] for name in names or ())
 
     @property
     def own_events(self) -> tuple[Event, ...]:
-        """The events of the scene, without the two transitions of each friction mode."""
+        """The events that the user defined, without the two transitions of each friction mode."""
         return self.events[: len(self.events) - 2 * len(self.modes)]
 
     @property
     def reads_qdd(self) -> bool:
-        """Whether functions may read accelerations."""
+        """Whether generated functions may read the accelerations.
+
+        True for a system with outputs, events, frames in the C code or inverse dynamics.
+        """
         return bool(self.outputs or self.events or self.output_frames or self.run.inverse_dynamics)
 
     @property
     def names(self) -> frozenset[str]:
-        """Names that no other value may have: coordinates, velocities, inputs, parameters, and
-        accelerations if functions may read them.
+        """The names that no other quantity may have.
+
+        They are the names of coordinates, velocities, inputs and parameters, and of accelerations
+        if `reads_qdd`.
         """
         variables = (*self.q, *self.qd, *self.u, *(self.qdd if self.reads_qdd else ()))
         return frozenset([*(x.name for x in variables), *(p.name for p in self.parameters)])
 
     @property
     def u(self) -> tuple[Symbol, ...]:
-        """The inputs' symbols, in scene order."""
+        """The symbols of the inputs, in the order of `inputs`."""
         return tuple(i.symbol for i in self.inputs)
 
     def beyond_float(self) -> list[Problem]:
-        """Report numbers that are out of range in single precision."""
+        """Return a Problem for each number that is out of range in single precision.
+
+        The list is empty unless the C code computes in single precision.
+        """
         if self.run.real != "float":
             return []
         faults = []
