@@ -192,7 +192,7 @@ class Mechanics:
 
     @property
     def rotations(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the constraints with a `rotation_error`, one tuple for each loop that has any."""
+        """Indices of the constraints with a `rotation_error`, as one tuple for each loop."""
         rows = [(k, c.loop) for k, c in enumerate(self.constraints) if c.rotation_error is not None]
         return tuple(tuple(k for k, _ in some) for _, some in groupby(rows, key=lambda row: row[1]))
 
