@@ -40,10 +40,20 @@ _STAGE_COMMENTS = {
 
 @dataclass(frozen=True)
 class Real:
-    """A floating-point type: its C and NumPy names, and the suffixes of literals and functions.
+    """A floating-point type of C and NumPy.
 
-    reach: the largest angle for which the sincos of csrc/ is valid; 0 where there is none for the
-    type. lane: for vectors of numbers, the suffix of function names.
+    Attributes
+    ----------
+    name, dtype
+        Name in C and name in NumPy.
+    suffix, function_suffix
+        Suffix of C literals, and of functions of the C mathematics library.
+    epsilon
+        Distance from 1 to the next larger number.
+    reach
+        Largest angle (rad) for which the project's own sincos is valid; 0 if there is none.
+    lane
+        For vectors of numbers in a register, the suffix of C functions for them; otherwise "".
     """
 
     name: str
@@ -64,14 +74,17 @@ QUAD = Real("__float128", "q", "q", "", 2.0**-112, 0.0)
 
 @dataclass(frozen=True)
 class Block:
-    """Statements with one comment above them."""
+    """C statements, in lines, with one comment above them ("" for none)."""
 
     comment: str
     lines: tuple[str, ...]
 
 
 def number(value: Expr, real: Real = DOUBLE) -> str:
-    """A literal that rounds to the nearest `real`: 0.5, 9.81, (8.0/3.0), 3.1415926535897931.
+    """Return a C literal that rounds to the nearest number of the type `real`.
+
+    Fractions without an exact decimal form become quotients, if numerator and denominator are
+    small.
 
     >>> number(sympy.Rational(8, 3)), number(sympy.Rational(1, 100)), number(sympy.pi)
     ('(8.0/3.0)', '0.01', '3.141592653589793')
@@ -118,7 +131,11 @@ def _decimal(value: float) -> str:
 
 
 class Printer:
-    """Prints values of one function. `where`: the C expression of each name from outside."""
+    """Prints the values of one function of a program as C expressions.
+
+    where: the C expression of each variable that the function does not compute. in_order: whether
+    to keep the order of terms in sums.
+    """
 
     def __init__(
         self, prefix: str, real: Real, where: Mapping[str, str], in_order: bool = False
@@ -130,14 +147,19 @@ class Printer:
         self.inline: dict[str, tuple[str, int]] = {}
 
     def name(self, name: str, binding: int = 4) -> str:
-        """Return the text of a name, in parentheses where it binds less strongly than `binding`."""
+        """Return the C text of a variable, in parentheses if it binds less strongly than `binding`.
+
+        Binding strengths are 1 for sums, 2 for products and 4 for names.
+        """
         if name in self.inline:
             text, strength = self.inline[name]
             return text if strength >= binding else f"({text})"
         return self.where.get(name, name)
 
     def operand(self, o: Operand, binding: int = 1) -> str:
-        """Return the text of a number times a name."""
+        """Return the C text of a number times a variable, in parentheses if it binds less than
+        `binding`.
+        """
         if not o.name:
             return number(o.coefficient, self.real)
         if o.coefficient == 1:
@@ -145,8 +167,10 @@ class Printer:
         return self.value(Product(o.coefficient, (o.name,)), binding)[0]
 
     def value(self, value: Value, binding: int = 1) -> tuple[str, int]:
-        """Return the text of a right-hand side and its binding strength: 1 sums, 2 products, 4
-        names.
+        """Return the C text of a right-hand side and its binding strength.
+
+        The strength is 1 for sums, 2 for products and 4 for names; text that binds less strongly
+        than `binding` is put in parentheses.
         """
         if isinstance(value, Sum):
             text, strength = self._sum(value), 1
@@ -218,8 +242,8 @@ class Printer:
         return f"({self.real.name})(({x} > 0) - ({x} < 0))"
 
     def in_lane(self, o: Operand) -> str:
-        """Return the text of an operand; a number alone is broadcast to all elements of a
-        vector.
+        """Return the C text of an operand; numbers are broadcast to a vector if values are
+        vectors.
         """
         text = self.operand(o, 1)
         if self.real.lane and not o.name:
@@ -229,7 +253,19 @@ class Printer:
 
 @dataclass(frozen=True)
 class Body:
-    """Statements of a function in blocks, with its results and checks as C expressions."""
+    """The C statements of a function in blocks, with its results as C expressions.
+
+    Attributes
+    ----------
+    early, blocks
+        Statements that depend on parameters only, and all others.
+    results
+        The results of the function.
+    failures
+        Conditions under which a factored matrix, such as D, is singular.
+    sincos
+        Whether the statements call the project's own sincos.
+    """
 
     early: tuple[Block, ...]
     blocks: tuple[Block, ...]
@@ -239,7 +275,7 @@ class Body:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """All statements without comments."""
+        """All C statements in lines, without comments."""
         return tuple(line for block in (*self.early, *self.blocks) for line in block.lines)
 
 
@@ -254,22 +290,22 @@ def body(
     reserved: frozenset[str] = frozenset(),
     together: bool = False,
 ) -> Body:
-    """Return the statements of a function.
+    """Return a function of a program as C statements.
 
     Parameters
     ----------
     where
-        The C expression of each name from outside (`m_c` -> `p->m_c`).
+        The C expression of each variable that is not computed here (`m_c` -> `p->m_c`).
     stored
-        Where values are stored that are not local variables.
+        C expressions for values that are stored there rather than in local variables.
     pivots
-        The number of pivots of the whole function, if this is a part of it.
+        The number of pivots of the whole function, if `function` is a part of it.
     in_order
         Keep the order of the terms of sums.
     reserved
-        Names that no value may have.
+        Names that no local variable may have.
     together
-        Compute the sines of several angles in vector registers.
+        Compute the sines of several angles together in vector registers.
     """
     stored = stored or {}
     inline = _inlined(function)
@@ -373,7 +409,11 @@ def _sincos(
 
 
 def group_angles(function: Function) -> Mapping[Operand, Sequence[Operand]]:
-    """Group the angles that come from outside by stage, in groups of at least MIN_SIMD_ANGLES."""
+    """Return groups of angles whose sines can be computed together, by each angle in a group.
+
+    The angles are arguments of the function, of the same stage (time, position or velocity). A
+    group has at least MIN_SIMD_ANGLES.
+    """
     computed = {a.name for a in (*function.early, *function.body)}
     by_stage: dict[Stage, dict[Operand, None]] = {}
     for a in function.body:
@@ -412,8 +452,9 @@ def _sincos_several(
 
 
 def _inlined(function: Function) -> frozenset[str]:
-    """Return values to inline: short, read once in their own stage, and without a meaningful
-    name.
+    """Return the names of values that are inserted into the expression that uses them.
+
+    These are short, used once in their own stage, and have no name that is meaningful to readers.
     """
     uses: Counter[str] = Counter()
     stage_of_reader: dict[str, Stage] = {}
@@ -445,7 +486,10 @@ def _inlined(function: Function) -> frozenset[str]:
 def _numbered(
     function: Function, inline: frozenset[str], reserved: frozenset[str]
 ) -> dict[str, str]:
-    """Renumber the values without meaningful names as w1, w2, ..."""
+    """Return new names of values by their present names.
+
+    Values without meaningful names become w1, w2, ...; inlined values get a leading "_".
+    """
     assignments = (*function.early, *function.body)
     plain = [a.name for a in assignments if not a.named and a.name not in inline]
     used = function.uses | reserved | {a.name for a in assignments if a.named}
@@ -454,13 +498,16 @@ def _numbered(
 
 
 def indent(lines: Iterable[str], width: int = 4) -> str:
-    """Indent the lines of a block and break long ones after operators."""
+    """Return the lines as indented text, with long lines broken after operators.
+
+    width: number of spaces.
+    """
     all_lines = [line for text in lines for line in broken(text, 100 - width)]
     return "\n".join((" " * width + line).rstrip() for line in all_lines)
 
 
 def broken(text: str, width: int = 100) -> Sequence[str]:
-    """Break a statement or prototype into lines of at most `width` characters where possible."""
+    """Return a C statement or prototype as lines of at most `width` characters, if possible."""
     lines = []
     while len(text) > width:
         separators = (", ", " + ", " - ", " || ", "*", " | ", "; ", " = ", "(")

@@ -17,7 +17,10 @@ WIDTH = 100  # of a line
 
 @dataclass(frozen=True)
 class CArgument:
-    """An argument such as `const double q[CARTPOLE_NQ]`: type, name and array size, if any."""
+    """An argument of a C function, such as `const double q[CARTPOLE_NQ]`.
+
+    extent: array size as C text; "" for numbers and pointers.
+    """
 
     type: str
     name: str
@@ -25,31 +28,35 @@ class CArgument:
 
     @property
     def declaration(self) -> str:
-        """The declaration in a prototype."""
+        """The declaration of the argument in a prototype."""
         gap = "" if self.type.endswith("*") else " "
         return f"{self.type}{gap}{self.name}" + (f"[{self.extent}]" if self.extent else "")
 
 
 def input_array(type: str, name: str, extent: str = "") -> CArgument:
-    """Return an argument for an array that is read; without a size, a pointer that may be NULL."""
+    """Return the argument for a C array that is only read; without an extent, a pointer."""
     return CArgument(f"const {type}" if extent else f"const {type} *", name, extent)
 
 
 def output_array(type: str, name: str, extent: str = "") -> CArgument:
-    """Return an argument for an array that is written."""
+    """Return the argument for a C array that is written; without an extent, a pointer."""
     return CArgument(type if extent else f"{type} *", name, extent)
 
 
 @dataclass(frozen=True)
 class CFunction:
-    """A C function.
+    """A C function as data, from which its prototype, definition and calls are printed.
 
     Attributes
     ----------
+    result
+        C type of the result.
     body
-        Statements, with a blank line between blocks. Empty where a template contains them.
+        Statements, with a blank line between blocks. Empty if a template contains them.
     reads
         Names of the arguments that the body reads.
+    qualifier
+        "static", or "" for public functions.
     doc
         Paragraphs of the comment above the function.
     """
@@ -64,14 +71,14 @@ class CFunction:
 
     @property
     def prototype(self) -> str:
-        """Result type, name and arguments in one line."""
+        """Qualifier, result type, name and arguments as C text in one line, without a semicolon."""
         listed = ", ".join(a.declaration for a in self.arguments) or "void"
         words = (self.qualifier, self.result, f"{self.name}({listed})")
         return " ".join(w for w in words if w)
 
     @property
     def comment(self) -> str:
-        """The comment above the function, in one line where it fits."""
+        """The C comment above the function, in one line if it fits."""
         if len(whole := " ".join(self.doc)) <= WIDTH - 6:
             return f"/* {whole} */"
         lines = [line for part in self.doc for line in textwrap.wrap(part, WIDTH - 3)]
@@ -79,33 +86,40 @@ class CFunction:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Arguments that the body does not read."""
+        """Names of the arguments that the body does not read."""
         return tuple(a.name for a in self.arguments if a.name not in self.reads)
 
     @property
     def inside(self) -> str:
-        """The indented body, after void casts of the unused arguments."""
+        """The indented statements of the body as C text, after `(void)` casts of the unused
+        arguments.
+        """
         unread = Block("", tuple(f"(void){name};" for name in self.unused))
         return "\n\n".join(block_text(b) for b in (unread, *self.body) if b.lines)
 
     @property
     def definition(self) -> str:
-        """Prototype and body, with the comment above if the function is static."""
+        """Prototype and body as C text; for functions with a qualifier (static), the comment comes
+        first.
+        """
         head = [self.comment] if self.doc and self.qualifier else []
         return "\n".join([*head, self.prototype, "{", self.inside, "}"])
 
     def call(self, **passed: str) -> str:
-        """Return a call in which some arguments are replaced by expressions; no semicolon."""
+        """Return a C call of the function, without a semicolon.
+
+        passed: C expressions of arguments by name; other arguments are variables of the same name.
+        """
         return f"{self.name}({', '.join(passed.get(a.name, a.name) for a in self.arguments)})"
 
 
 def static(name: str, result: str, *arguments: CArgument) -> CFunction:
-    """Return a static function whose body a template contains."""
+    """Return a static C function without a body, which a template contains."""
     return CFunction(name, result, arguments, qualifier="static")
 
 
 def block_text(block: Block) -> str:
-    """Return the indented statements of a block under its comment."""
+    """Return the statements of a block as indented C text, after its comment if it has one."""
     lines = [f"/* {block.comment} */"] if block.comment else []
     return "\n".join(f"    {line}" for line in (*lines, *block.lines))
 
@@ -114,79 +128,90 @@ def block_text(block: Block) -> str:
 
 
 def constant(type: str, name: str, value: str) -> str:
-    """Return the definition of a constant local variable."""
+    """Return the C definition of a constant local variable."""
     return f"const {type} {name} = {value};"
 
 
 def local(type: str, name: str) -> str:
-    """Return the declaration of a local variable."""
+    """Return the C declaration of a local variable."""
     return f"{type} {name};"
 
 
 def assign(place: str, value: str) -> str:
-    """Return an assignment."""
+    """Return a C statement that assigns `value` to `place`."""
     return f"{place} = {value};"
 
 
 def do(call: str) -> str:
-    """Return a call as a statement."""
+    """Return a C call as a statement, with its semicolon."""
     return f"{call};"
 
 
 def result(value: str) -> str:
-    """Return a return statement."""
+    """Return a C return statement."""
     return f"return {value};"
 
 
 def note(conditions: Iterable[str]) -> tuple[str, ...]:
-    """Return statements that add conditions to the mask `failed`."""
+    """Return C statements that combine conditions into the mask `failed` by "or"."""
     return tuple(f"failed |= {text};" for text in conditions)
 
 
 def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
-    """Return "return value" if one of the conditions holds; no statements without conditions."""
+    """Return a C statement, in lines, that returns `value` if one of the conditions holds.
+
+    Returns no lines if there are no conditions.
+    """
     text = " || ".join(conditions)
     return (f"if ({text})", f"    return {value};") if text else ()
 
 
 def otherwise_signal(array: str, call: str) -> tuple[str, ...]:
-    """Return statements that set u to the scene's signals where it is NULL."""
+    """Return C statements that set u to the scene's signals if u is NULL.
+
+    call: C call that stores the signals in `array`.
+    """
     return ("if (!u) {", f"    {call};", f"    u = {array};", "}")
 
 
 def listed(type: str, name: str, extent: str, values: Sequence[str]) -> str:
-    """Return the definition of a constant array."""
+    """Return the C definition of a constant array with these values."""
     return f"const {type} {name}[{extent}] = {{ {', '.join(values)} }};"
 
 
 def member(of: str, name: str) -> str:
-    """Return a member of a struct behind a pointer."""
+    """Return the C expression `of->name`, a member of a struct behind a pointer."""
     return f"{of}->{name}"
 
 
 def cast(type: str, name: str) -> str:
-    """Return a pointer cast to a pointer to another constant type."""
+    """Return a C expression: the pointer `name` cast to a pointer to constant `type`."""
     return f"(const {type} *){name}"
 
 
 def struct(type: str, real: str, members: Sequence[str]) -> str:
-    """Return the definition of a struct of numbers."""
+    """Return the C definition of a struct `type` with members of the number type `real`."""
     return f"typedef struct {{\n    {real} {', '.join(members)};\n}} {type};"
 
 
 def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
-    """Return a loop that copies elements of an array, from `first` on."""
+    """Return a C loop, in lines, that copies `count` elements of `array`, from index `first` on, to
+    `to`.
+    """
     index = f"{first} + k" if first else "k"
     return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{index}];")
 
 
 def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:
-    """Return the rows of a matrix as initialisers."""
+    """Return the rows of a matrix as lines of a C initialiser, such as "{ 1.0, 2.0 },"."""
     return tuple("{ " + ", ".join(row) + " }," for row in rows)
 
 
 def narrowed(text: str) -> str:
-    """Break long comments of a finished text. A comment after code is moved above it."""
+    """Return finished C text with comments broken to at most WIDTH characters in a line.
+
+    A long comment behind code is moved above the code if possible.
+    """
     lines, result_lines, inside = text.split("\n")[::-1], list[str](), False
     while lines:
         line = lines.pop()
@@ -229,7 +254,10 @@ def _split_comment(line: str) -> tuple[str, str]:
 
 
 def laid_out(text: str) -> str:
-    """Break all long lines of a finished text except directives."""
+    """Return finished C text with long comments and statements broken to at most WIDTH characters.
+
+    Preprocessor directives stay as they are.
+    """
     result_lines: list[str] = []
     for line in narrowed(text).split("\n"):
         inside = line.lstrip(" ")

@@ -40,9 +40,10 @@ Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -
 
 @dataclass(frozen=True)
 class Target:
-    """A program to be written as C with numbers of one type.
+    """A program together with the C type of its numbers, and the names that it has in C.
 
-    written: the author's name by C name, where they differ.
+    The program is the list of functions derived from a scene. Scene names that C cannot use are
+    renamed in it; `written` maps each new name to the name in the scene.
     """
 
     program: Program
@@ -50,28 +51,32 @@ class Target:
     written: Mapping[str, str] = field(default_factory=dict)
 
     def as_written(self, name: str) -> str:
-        """Return the author's name of a coordinate, parameter or input."""
+        """Return the name in the scene of a coordinate, parameter or input with the C name
+        `name`.
+        """
         return self.written.get(name, name)
 
     @property
     def system(self) -> System:
-        """The system of the program."""
+        """The mechanical system that the program computes."""
         return self.program.system
 
     @property
     def prefix(self) -> str:
-        """The prefix of all C names."""
+        """The scene's name, with which all C names begin."""
         return self.system.name
 
     @property
     def PREFIX(self) -> str:
-        """The prefix of all macros and enumerators."""
+        """The scene's name in upper case, with which all macros and enumerators begin."""
         return self.prefix.upper()
 
     @cached_property
     def enum(self) -> dict[str, str]:
-        """Enumerators by name: coordinates, inputs, OUT_output, EVENT_event, CONSTRAINT_row,
-        FRAME_frame.
+        """The C enumerator of each coordinate, input, output, event, constraint and frame.
+
+        The keys are names of coordinates and inputs, and `OUT_`, `EVENT_`, `CONSTRAINT_` or
+        `FRAME_` with the name of another item.
         """
         reserved = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
@@ -84,44 +89,48 @@ class Target:
 
     @property
     def input_names(self) -> list[str]:
-        """Names of the inputs in the order of u."""
+        """The C names of the inputs, in the order of u."""
         return [i.name for i in self.system.inputs]
 
     @property
     def names(self) -> list[str]:
-        """Names of the coordinates in the order of q."""
+        """The C names of the coordinates, in the order of q."""
         return [c.name for c in self.system.coordinates]
 
     @cached_property
     def wrenches(self) -> list[Symbol]:
-        """Symbols of the forces and moments at the frames."""
+        """The symbols of the forces and moments that act at the frames (N, N m), in the order of
+        the C array.
+        """
         return wrenches(self.system)
 
     @property
     def multipliers(self) -> list[str]:
-        """Names of the Lagrange multipliers, which reactions read."""
+        """The names of the Lagrange multipliers, one for each constraint equation."""
         return [c.multiplier.name for c in self.system.constraints]
 
     @property
     def needs_p(self) -> bool:
-        """Whether there are parameters."""
+        """Whether the scene has parameters, so that C functions take the argument p."""
         return bool(self.system.parameters)
 
     @cached_property
     def signal_state(self) -> bool:
-        """Whether the scene's signals depend on the state."""
+        """Whether the signals, by which the scene defines its inputs, depend on q or qd."""
         signal = self.program.functions.get("signal")
         state = {x.name for x in (*self.system.q, *self.system.qd)}
         return signal is not None and bool(signal.uses & state)
 
     @cached_property
     def signal_t(self) -> bool:
-        """Whether the scene's signals depend on time."""
+        """Whether the signals, by which the scene defines its inputs, depend on time."""
         return "signal" in self.program and TIME in self.program["signal"].uses
 
     @cached_property
     def driven(self) -> bool:
-        """Whether the motion depends on time, directly or through signals."""
+        """Whether the motion depends on time, directly or through the scene's signals for the
+        inputs.
+        """
         functions = [
             f for n in ("acceleration", "projection") if (f := self.program.functions.get(n))
         ]
@@ -129,7 +138,7 @@ class Target:
 
     @cached_property
     def sincos(self) -> bool:
-        """Whether sines and cosines are computed by the generated code."""
+        """Whether the generated C computes sines and cosines itself rather than by libm."""
         return self.real.reach > 0 and any(
             isinstance(a.value, Call) and a.value.function in ("sin", "cos")
             for f in self.program.functions.values()
@@ -138,11 +147,11 @@ class Target:
 
     @property
     def zero(self) -> str:
-        """The literal 0."""
+        """The C literal of 0 in the type of numbers, such as 0.0f."""
         return "0.0" + self.real.suffix
 
     def literal(self, value: float) -> str:
-        """Return a number as a literal of the element type."""
+        """Return a number as a C literal of the type of numbers, such as 0.5f."""
         text = repr(value)
         return (
             text if "." in text or "e" in text or "n" in text else text + ".0"
@@ -151,8 +160,10 @@ class Target:
     # bodies
 
     def where(self) -> dict[str, str]:
-        """Return the C expression of each name: p->m_c for parameters, theta_ where theta is
-        reserved.
+        """Return the C expression of each coordinate, velocity, input and parameter, by name.
+
+        For example `p->m_c` for the parameter m_c. Other variables are local variables in C, with
+        "_" appended to reserved names.
         """
         s = self.system
         expressions = {x.name: c_function.member("p", x.name) for x in s.parameters}
@@ -162,7 +173,10 @@ class Target:
     def body(
         self, function: Function, where: Mapping[str, str] | None = None, **options: Any
     ) -> Body:
-        """Return the statements of a function. Options: see `c_expression.body`."""
+        """Return the C statements of a function of the program.
+
+        where: C expressions of further names. options: keyword arguments of `c_expression.body`.
+        """
         known = self.where() | dict(where or {})
         reserved = self.system.names
         return c_expression.body(
@@ -170,8 +184,10 @@ class Target:
         )
 
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:
-        """Return definitions of locals for the coordinates, velocities, inputs and directions that
-        are read.
+        """Return definitions of C local variables for the array elements that a function reads.
+
+        state, inputs: functions (array, name) that return the C expression of an element of q, qd,
+        qdd and along (a direction), and of u.
         """
         s, real, uses = self.system, self.real.name, function.uses
         NQ = f"{self.PREFIX}_NQ"
@@ -192,12 +208,17 @@ class Target:
         ]
 
     def element(self, array: str, name: str) -> str:
-        """Return an array element, such as q[CARTPOLE_THETA]."""
+        """Return the C expression of an array element, such as q[CARTPOLE_THETA].
+
+        name: of a coordinate or input.
+        """
         return f"{array}[{self.enum[name]}]"
 
     def groups(self) -> dict[str, frozenset[str]]:
-        """Return the names that each argument supplies: q, qd, qdd, wrenches, lambda, t, u, p,
-        along.
+        """Return, for each C argument, the names of the variables that it supplies.
+
+        The arguments are q, qd, qdd, wrenches, lambda, t, u, p and along (a direction in q, qd and
+        u).
         """
         s = self.system
         return {
@@ -214,7 +235,7 @@ class Target:
 
 
 def rename_reserved(function: Function) -> Function:
-    """Rename values of a function whose names are reserved."""
+    """Return the function with "_" appended to the names of values that the C templates reserve."""
     clash = {
         a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in RESERVED_NAMES
     }
@@ -222,19 +243,21 @@ def rename_reserved(function: Function) -> Function:
 
 
 def local(name: str) -> str:
-    """Return the name of the local variable of a coordinate, velocity or input."""
+    """Return the C name of the local variable for a coordinate, velocity or input `name`."""
     return name + "_" if name in RESERVED_NAMES else name
 
 
 def sentence(function: Function) -> str:
-    """Return a sentence with the operations of one call."""
+    """Return a sentence for comments with the numbers of operations of one call of a function."""
     cost = str(function.cost)
     return cost[0].upper() + cost[1:] + "."
 
 
 def _unique(preferred: Iterable[str], reserved: set[str]) -> list[str]:
-    """Return unique enumerators: upper case, or the author's case where that would not be
-    unique.
+    """Return distinct C enumerators for the preferred ones, none of which is reserved.
+
+    They are in upper case; names that would then coincide keep their case. Clashes get a trailing
+    "_".
     """
     enumerators = []
     preferred = list(preferred)

@@ -14,7 +14,7 @@ from eomc.program.program import TIME
 
 @dataclass(frozen=True)
 class Kind:
-    """Properties of an evaluation function that do not depend on the scene.
+    """Properties of an evaluation function (D, energy, ...) that are the same for all scenes.
 
     Attributes
     ----------
@@ -23,15 +23,15 @@ class Kind:
     shape
         Shape of the output, a key of `c_array_size`.
     takes
-        Arguments besides q, t and p: qd, u, qdd, wrenches, lambda. "qdd?" where it depends on the
-        scene.
+        Arguments besides q, t and p, separated by spaces: qd, u, qdd, wrenches, lambda. "qdd?" if
+        only some scenes need the accelerations.
     doc
-        The comment in the header.
+        The comment in the C header.
     symmetric
-        Whether the matrix is symmetric.
+        Whether the output is a symmetric matrix.
     refuses
-        Whether the function returns a status in every scene, which also reports results that are
-        not finite.
+        Whether the C function returns a status in every scene. The status then also reports
+        results that are not finite.
     """
 
     out: str
@@ -48,7 +48,9 @@ class Kind:
 
     @property
     def extra_argument(self) -> str:
-        """The additional argument that the function has in every scene: qdd, wrenches or lambda."""
+        """The argument qdd, wrenches or lambda, if the function takes it in every scene; otherwise
+        "".
+        """
         return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
 
 
@@ -126,7 +128,9 @@ _SPACE = {
 
 
 def doc(target: Target, name: str) -> str:
-    """Return the comment of a function for a planar or a spatial system."""
+    """Return the comment of the evaluation function `name`, as worded for a planar or a spatial
+    system.
+    """
     text = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
     if name == "inverse_dynamics" and target.system.constraints:
         text = text.replace("tau =", "tau + A^T lambda =")
@@ -134,7 +138,11 @@ def doc(target: Target, name: str) -> str:
 
 
 def c_array_size(target: Target, shape: str) -> str:
-    """Return the number of elements of a shape, as C text."""
+    """Return the number of elements of a shape as a C expression.
+
+    shape: sizes and products of them, as in `Kind.shape`: n coordinates, m inputs, y outputs, and
+    so on. Returns "" for other shapes.
+    """
     s, NQ, NU = target.system, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
     NY, NF, NE, NC = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE", "NC"))
     pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
@@ -160,30 +168,40 @@ def c_array_size(target: Target, shape: str) -> str:
 
 
 def source(target: Target, name: str) -> Function | None:
-    """Return the function that computes `name`: the function itself, or one that gives one
-    column.
+    """Return the function of the program from which the C function `name` is generated; None if
+    there is none.
+
+    It computes all results, or the product of a matrix with a direction, which gives one column.
     """
     functions = target.program.functions
     return functions.get(name) or functions.get(f"{name}_column")
 
 
 def refuses(target: Target, name: str) -> bool:
-    """Return True if a function returns a status, since it factors a matrix that may be
-    singular.
+    """Return True if the C function `name` returns a status, because it factors a matrix that may
+    be singular.
     """
     function = source(target, name)
     return KINDS[name].refuses or bool(function and function.checks)
 
 
 def takes_qdd(target: Target, name: str) -> bool:
-    """Return True if a function reads accelerations."""
+    """Return True if the evaluation function `name` reads accelerations although not all scenes
+    need them.
+
+    Functions that take accelerations in every scene have them as `Kind.extra_argument`.
+    """
     function = source(target, name)
     optional = "qdd?" in KINDS[name].takes
     return bool(optional and function and function.uses & target.groups()["qdd"])
 
 
 def takes_t(target: Target, name: str) -> bool:
-    """Return True if a function depends on time, directly or through signals."""
+    """Return True if the evaluation function `name` depends on time, directly or through the
+    signals.
+
+    The signals are the functions by which the scene defines its inputs.
+    """
     function = source(target, name)
     assert function is not None
     takes_u = KINDS[name].takes_u and target.system.inputs

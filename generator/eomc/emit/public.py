@@ -14,12 +14,19 @@ LIMITS = ("t_end", "tol", "h_most")  # of adaptive steps
 
 @dataclass(frozen=True)
 class Public:
-    """Prototypes of the functions in the header of a scene."""
+    """Prototypes of the functions that the generated C header declares.
+
+    Both forms of the C code, portable and optimised, implement them.
+    """
 
     target: Target
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
-        """Return those of the usual arguments q, qd, t, h, u, p that this scene has."""
+        """Return the C arguments with these names, without those that the scene does not have.
+
+        A scene without inputs has no u, one without parameters no p, and one whose motion does not
+        depend on time no t.
+        """
         target, real = self.target, self.target.real.name
         arguments = {
             "q": input_array(real, "q", f"{target.PREFIX}_NQ"),
@@ -35,11 +42,11 @@ class Public:
         return tuple(a for name in names if (a := arguments[name]))
 
     def evaluations(self) -> tuple[CFunction, ...]:
-        """Return the prototypes of all evaluation functions of the scene."""
+        """Return the prototypes of all evaluation functions of the scene, such as D and energy."""
         return tuple(map(self.evaluation, (n for n in KINDS if source(self.target, n) is not None)))
 
     def evaluation(self, name: str) -> CFunction:
-        """Return the prototype of the evaluation function `name`."""
+        """Return the prototype of the evaluation function `name`, such as D or energy."""
         kind, target, real = KINDS[name], self.target, self.target.real.name
         signal = name == "signal"
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
@@ -65,14 +72,18 @@ class Public:
 
     @property
     def acceleration(self) -> CFunction:
-        """The function for qdd, which returns a status."""
+        """The prototype of the function that computes qdd and returns a status."""
         target = self.target
         qdd = output_array(target.real.name, "qdd", f"{target.PREFIX}_NQ")
         return self._status("acceleration", qdd, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
     def linearization(self) -> CFunction:
-        """The function for A_q, A_qd and B, which returns a status."""
+        """The prototype of the function that computes da/dq, da/dqd and da/du of the accelerations
+        a.
+
+        The matrices are called A_q, A_qd and B. The function returns a status.
+        """
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
         widths = {"A_q": NQ, "A_qd": NQ}
         if target.system.inputs:
@@ -86,28 +97,38 @@ class Public:
 
     @property
     def project(self) -> CFunction:
-        """The function that projects a state onto the constraints, which returns a status."""
+        """The prototype of the function that projects a state onto the constraints and returns a
+        status.
+        """
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
         t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
         fixed = input_array("int", "fixed")
         return self._status("project", *self._state, *t, fixed, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
-        """Return the function for one step, which overwrites the state."""
+        """Return the prototype of the function for one step of a method, which overwrites the
+        state.
+        """
         return self._status(f"{method}_step", *self._state, *self.arguments("t", "h", "u", "p"))
 
     @property
     def fixed_step(self) -> CFunction:
-        """The function pointer for a fixed step in the memory of an adaptive run."""
+        """The prototype for calls of a step of fixed size through a function pointer.
+
+        The pointer is a member of the workspace of an adaptive run, `memory->step`.
+        """
         return replace(self.step("fixed"), name=member("memory", "step"))
 
     @property
     def fixed_type(self) -> CFunction:
-        """The function type of a fixed step."""
+        """The function type of a step of fixed size, for its typedef in the header."""
         return self.step("fixed")
 
     def derivative(self, method: str) -> CFunction:
-        """Return the function for Phi and Gamma of one step, which returns a status."""
+        """Return the prototype of the function for the derivatives of one step of a method.
+
+        These are Phi, along [q, qd], and Gamma, along u. The function returns a status.
+        """
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
         out = [output_array(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
         if target.system.inputs:
@@ -117,7 +138,9 @@ class Public:
         )
 
     def run(self, method: str) -> CFunction:
-        """Return the function for many steps, which overwrites the state."""
+        """Return the prototype of the function for many steps of a method, which overwrites the
+        state.
+        """
         P = self.target.prefix
         strides = [CArgument("long", "u_stride")] if self.target.system.inputs else []
         return CFunction(
@@ -131,7 +154,9 @@ class Public:
         )  # fmt: skip
 
     def batch(self, method: str) -> CFunction:
-        """Return the function for many steps of many instances."""
+        """Return the prototype of the function for many steps of several instances of the
+        system.
+        """
         target, real = self.target, self.target.real.name
         strides = [CArgument("long", name) for name in ("u_instance", "u_step", "p_instance")]
         return CFunction(
@@ -147,7 +172,7 @@ class Public:
         )  # fmt: skip
 
     def adaptive(self, method: str) -> CFunction:
-        """Return the function for steps with adaptive step-size control."""
+        """Return the prototype of the function for a run with adaptive step-size control."""
         P, real = self.target.prefix, self.target.real.name
         name = f"{P}_{method}_adaptive"
         return CFunction(
@@ -165,7 +190,9 @@ class Public:
         )  # fmt: skip
 
     def adaptive_batch(self, method: str) -> CFunction:
-        """Return the function for adaptive steps of many instances."""
+        """Return the prototype of the function for adaptive runs of several instances of the
+        system.
+        """
         target, real = self.target, self.target.real.name
         name = f"{target.prefix}_{method}_adaptive"
         strides = [CArgument("long", name) for name in ("u_instance", "p_instance")]
@@ -187,31 +214,41 @@ class Public:
 
     @property
     def adaptive_events(self) -> tuple[CArgument, ...]:
-        """Arguments for the events that are detected."""
+        """The C arguments of an adaptive run that receive the detected events.
+
+        They are the maximum number of events, their number, their indices, and rows with time and
+        state.
+        """
         return (
             CArgument("long", "room"), output_array("long", "events"), output_array("int", "which"),
             output_array(self.target.real.name, "event_rows"),
         )  # fmt: skip
 
     def _status(self, name: str, *arguments: CArgument) -> CFunction:
-        """Return a function that returns a status."""
+        """Return the prototype of the C function `name` (without the scene's prefix), which returns
+        a status.
+        """
         return CFunction(f"{self.target.prefix}_{name}", f"{self.target.prefix}_status", arguments)
 
     @property
     def _state(self) -> tuple[CArgument, ...]:
-        """Arguments for the state that is overwritten."""
+        """The C arguments q and qd of a function that overwrites them."""
         real, NQ = self.target.real.name, f"{self.target.PREFIX}_NQ"
         return tuple(output_array(real, name, NQ) for name in STATE)
 
     @property
     def _steps(self) -> tuple[CArgument, ...]:
-        """Arguments for start time, step size and number of steps."""
+        """The C arguments of a run: initial time (if needed), step size, first step and number of
+        steps.
+        """
         real = self.target.real.name
         t0 = [CArgument(real, "t0")] if self.target.driven else []
         return (*t0, CArgument(real, "h"), CArgument("long", "first"), CArgument("long", "steps"))
 
     @property
     def _row_output(self) -> tuple[CArgument, ...]:
-        """Arguments for the stored rows."""
+        """The C arguments for stored states: `every` (steps between them) and arrays for q and
+        qd.
+        """
         rows = (output_array(self.target.real.name, f"{name}_rows") for name in STATE)
         return (CArgument("long", "every"), *rows)
