@@ -18,23 +18,25 @@ MAX_INLINED_OPERATIONS = 300  # of accelerations, up to which every stage inline
 
 @dataclass(frozen=True)
 class Accelerations:
-    """The accelerations of a scene, split for the integration methods.
+    """The accelerations of a scene, split as the integration methods of optimised C need them.
 
     Attributes
     ----------
+    target
+        The program and its C names.
     constants
-        Names of precomputed expressions of the parameters.
+        Names of precomputed expressions, which depend on the parameters only.
     angles
-        Angles whose sines and cosines are arguments.
+        Angles whose sines and cosines are arguments of the remaining function.
     parts
-        Position-dependent and velocity-dependent part, where the split is faster.
+        Position-dependent and velocity-dependent part; None where the split is not faster.
     """
 
     target: Target
 
     @cached_property
     def function(self) -> Function:
-        """The function of the program."""
+        """The whole function of the program for the accelerations."""
         return self.target.program["acceleration"]
 
     @cached_property
@@ -44,8 +46,9 @@ class Accelerations:
 
     @cached_property
     def staged(self) -> tuple[Function, Function]:
-        """The function of the precomputed expressions of the parameters, and the remaining
-        function.
+        """Two functions: one for the expressions of the parameters alone, and one for the rest.
+
+        The first is evaluated once for a run, the second at every stage.
         """
         precomputed, remaining = outline.split_precomputed(self.function, self.parameter_names)
         projections = [self._split_projection[0]] if self._split_projection else []
@@ -74,7 +77,11 @@ class Accelerations:
 
     @cached_property
     def correction(self) -> tuple[Function, bool]:
-        """The projection, and whether it reads the sines of the accelerations."""
+        """The projection onto the constraints, and whether sines are arguments of it.
+
+        Its precomputed expressions are removed. If sines are arguments, they are those of the
+        accelerations; otherwise it computes its own.
+        """
         assert self._split_projection is not None
         remaining = self._split_projection[1]
         angles, separated = trig.separate_angles(remaining, self.target.names)
@@ -90,24 +97,32 @@ class Accelerations:
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Names of the precomputed expressions."""
+        """Names of the precomputed expressions, which depend on the parameters only."""
         return tuple(o.name for o in self.staged[0].outputs)
 
     @cached_property
     def rotated(self) -> tuple[tuple[Angle, ...], Function]:
-        """The angles, and the function that reads their sines and cosines."""
+        """The angles, and the function for the accelerations that takes their sines as arguments.
+
+        The function takes the sines and cosines of the angles instead of computing them, so that a
+        step can obtain them from those of another stage. There are no angles if eomc has no sine
+        and cosine for the type of numbers.
+        """
         if not self.target.real.reach:
             return (), self.staged[1]
         return trig.separate_angles(self.staged[1], self.target.names)
 
     @property
     def angles(self) -> tuple[Angle, ...]:
-        """Angles whose sines and cosines are arguments."""
+        """Angles whose sines and cosines are arguments of the function for the accelerations."""
         return self.rotated[0]
 
     @cached_property
     def parts(self) -> two_point.Parts | None:
-        """The two parts for RK4 in double precision; None where they are not used."""
+        """The position- and the velocity-dependent part, for RK4 in double precision.
+
+        None for other methods and precisions, and where the split is not faster.
+        """
         target = self.target
         if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
             return None
@@ -118,11 +133,14 @@ class Accelerations:
 
     @property
     def simd_angles(self) -> bool:
-        """Whether one trajectory computes the sines of four angles at once."""
+        """Whether the sines of four angles of one trajectory are computed in a vector register."""
         constrained = bool(self.target.system.constraints)
         return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
 
     @property
     def long(self) -> bool:
-        """Whether the accelerations are called rather than inlined, which bounds compile time."""
+        """Whether the accelerations are so long that they are called, not inlined.
+
+        This bounds the time of compilation.
+        """
         return outline.weight(self.rotated[1]) > MAX_INLINED_OPERATIONS

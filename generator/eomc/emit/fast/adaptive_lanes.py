@@ -12,7 +12,10 @@ from eomc.scene.schema import MAX_TOLERANCE
 
 
 def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
-    """Return the view of adaptive steps of many instances."""
+    """Return the template data for adaptive steps of many instances side by side.
+
+    form: what optimised C supplies to the shared code of adaptive steps.
+    """
     one, wide, s, m = steppers.one, steppers.wide, steppers.accelerations, METHOD
     stepping, computed = Stepping(steppers.functions, form), runs.constants_call(steppers)
     here = {"q": "at[i]", "qd": "moving[i]", "t": f"{c.member('x', 't')} + h*c_[i]"}

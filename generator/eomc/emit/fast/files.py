@@ -35,20 +35,23 @@ BINARY_FUNCTIONS = ("atan2", "pow", "min", "max", PIVOT)
 
 
 def steppers(target: Target) -> Steppers:
-    """Return the integration methods of a scene with its accelerations."""
+    """Return the accelerations and the integration methods of a scene in optimised C."""
     functions = Functions(target)
     return Steppers(Accelerations(target), functions, plain.linearization(functions))
 
 
 def rooms(steppers: Steppers) -> list[int]:
-    """Return the workspace size of each method, and of adaptive steps."""
+    """Return workspace sizes, in numbers: of each method's run, and last of adaptive steps."""
     system = steppers.one.target.system
     room = adaptive.workspace_size(system, steppers.one.width)
     return [*(runs.state_size(steppers, m) for m in steppers.methods), room]
 
 
 def files(steppers: Steppers, show: Show) -> dict[str, str]:
-    """Return header and source of optimised C by file name."""
+    """Return the header and the source of optimised C, as texts by file name.
+
+    show: renders template data as text.
+    """
     functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
     header = show(plain.header(functions, slopes, stamp, rooms(steppers), fast=True))

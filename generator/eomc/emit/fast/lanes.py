@@ -27,21 +27,26 @@ INLINE, NOINLINE = "INLINE", "NOINLINE"
 
 
 def four(n: int) -> int:
-    """Return the next multiple of four."""
+    """Return the smallest multiple of four that is at least `n`."""
     return -(-n // FOUR) * FOUR
 
 
 def interleaved(k: int) -> int:
-    """Return the index of number k in the interleaved layout of two points, as in
-    two_point.c.jinja.
+    """Return the index of number k in a vector that interleaves two configurations.
+
+    In groups of four, the coordinates or angles are in the order 0, 2, 1, 3, as the template
+    two_point.c stores them.
     """
     return k - k % FOUR + (0, 2, 1, 3)[k % FOUR]
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Accelerations with numbers of one type. name: the suffix of its C names, "" for one
-    number.
+    """C text of the accelerations for one *lane* type, the C type that the code computes with.
+
+    name: "" for one number; "wide" for a vector register with one value of each of several
+    instances; "two" for a register with the values of two configurations. C names of the lane end
+    in it.
     """
 
     accelerations: Accelerations
@@ -49,17 +54,17 @@ class Lane:
 
     @property
     def prefix(self) -> str:
-        """The prefix of all C names."""
+        """The prefix of all generated C names: the scene's name."""
         return self.accelerations.target.prefix
 
     @property
     def end(self) -> str:
-        """The suffix of C names of the lane."""
+        """The suffix of C names of the lane, such as "_wide"; "" for one number."""
         return f"_{self.name}" if self.name else ""
 
     @cached_property
     def real(self) -> Real:
-        """The type of numbers of one lane."""
+        """The C type of a value of the lane: one number or a vector register."""
         scalar = self.accelerations.target.real
         if not self.name:
             return scalar
@@ -68,67 +73,70 @@ class Lane:
 
     @property
     def mask(self) -> str:
-        """The C type of failures."""
+        """The C type that records failures: int, or a mask with one element for each value."""
         return f"{self.real.name}_mask" if self.name else "int"
 
     @property
     def clear(self) -> str:
-        """The initialiser for no failure."""
+        """The C initialiser of a `mask` without failures."""
         return "{ 0 }" if self.name else "0"
 
     @cached_property
     def target(self) -> Target:
-        """The program with numbers of this type."""
+        """The program and its C names, with this lane's type of numbers."""
         return replace(self.accelerations.target, real=self.real)
 
     @property
     def NQ(self) -> str:
-        """The number of coordinates, as C text."""
+        """The C macro for the number of coordinates."""
         return f"{self.target.PREFIX}_NQ"
 
     @property
     def constants(self) -> str:
-        """The C type of the precomputed expressions."""
+        """The C type of the struct with the precomputed expressions of the parameters."""
         return f"{self.prefix}_constants{self.end if self.name != 'two' else ''}"
 
     @property
     def qualifiers(self) -> Mapping[str, str]:
-        """The qualifiers of functions that are inlined and of those that are not."""
+        """C macros for the qualifiers of functions, by kind: INLINE and NOINLINE."""
         return {kind: f"{self.target.PREFIX}_{kind}" for kind in (INLINE, NOINLINE)}
 
     @property
     def names(self) -> dict[str, Any]:
-        """Fields that all views over a lane have."""
+        """Template fields that all code for a lane shares, by name; see `views.Laned`."""
         inline = self.qualifiers[INLINE]
         return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
     @property
     def unroll(self) -> str:
-        """The macro before loops over coordinates. They are vectors where accelerations are split
-        in two parts.
+        """The C macro before loops over coordinates, which selects how compilers unroll them.
+
+        If the accelerations are split into two parts, compilers put these loops into vector
+        registers.
         """
         return f"{self.target.PREFIX}_{'ROLLED' if self.padded else 'UNROLL'}"
 
     @property
     def computes_own_sines(self) -> bool:
-        """Whether some method computes all sines anew."""
+        """Whether some caller of the accelerations does not supply the sines of the angles."""
         run = self.target.system.run
         return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
 
     @property
     def padded(self) -> bool:
-        """Whether vectors of coordinates are padded with zeros to multiples of four."""
+        """Whether C vectors of coordinates are padded with zeros to a multiple of four."""
         return not self.name and self.accelerations.parts is not None
 
     @property
     def simd_angles(self) -> bool:
-        """Whether four angles are computed in one register."""
+        """Whether the sines of four angles are computed in one vector register."""
         return not self.name and self.accelerations.simd_angles
 
     @cached_property
     def width(self) -> int:
-        """Size of a vector of coordinates, including the angles that are read from it in groups of
-        four.
+        """Length of C vectors of coordinates.
+
+        With padding, it includes the space for reading angles from them in groups of four.
         """
         n = len(self.target.names)
         if not self.padded:
@@ -138,13 +146,14 @@ class Lane:
 
     @property
     def extent(self) -> str:
-        """`width` as C text."""
+        """`width` as a C expression."""
         return str(self.width) if self.padded else self.NQ
 
     @cached_property
     def contiguous_angles(self) -> int | None:
-        """The index of the first coordinate, if the angles are consecutive coordinates; else
-        None.
+        """Index of the coordinate that is the first angle, if angles are consecutive coordinates.
+
+        None if they are not.
         """
         names = self.target.names
         indices = [
@@ -160,7 +169,10 @@ class Lane:
     # arguments
 
     def argument(self, name: str) -> CArgument:
-        """Return one of the arguments q, qd, s, t, u, c."""
+        """Return the C argument for q, qd, s, t, u or c.
+
+        s: sines and cosines of the angles. c: precomputed expressions of the parameters.
+        """
         if name == "t":
             return CArgument(self.real.name, "t")
         if name == "s":
@@ -171,7 +183,7 @@ class Lane:
 
     @cached_property
     def argument_names(self) -> tuple[str, ...]:
-        """Names of the arguments of the accelerations, without results."""
+        """Names of the inputs of the C accelerations, in order: q, qd, s, t, u, c, if needed."""
         s = self.accelerations
         return (
             "q", "qd", *(["s"] if s.angles else []), *(["t"] if self.target.driven else []),
@@ -180,7 +192,7 @@ class Lane:
 
     @cached_property
     def names_of(self) -> dict[str, frozenset[str]]:
-        """The names of the program that each argument supplies."""
+        """For each C argument, the names of the program's values that it supplies."""
         groups = self.target.groups()
         sines = {n for a in self.accelerations.angles for n in (a.sine, a.cosine)}
         groups = {k: v for k, v in groups.items() if k in ("q", "qd", "t", "u")}
@@ -188,7 +200,7 @@ class Lane:
 
     @cached_property
     def where(self) -> dict[str, str]:
-        """The C expression of each sine, cosine and precomputed expression."""
+        """C expressions by name: of sines, cosines and precomputed parameter expressions."""
         expressions = {n: c.member("c", n) for n in self.accelerations.constants}
         for n, a in enumerate(self.accelerations.angles):
             k = interleaved(n) if self.name == "two" else n
@@ -223,16 +235,31 @@ class Lane:
         in_order: bool = False,
         inline: bool = True,
     ) -> Computed:
-        """Return a function that writes its results to `places` of `out`, and returns failures.
+        """Return a C function that evaluates a function of the program and returns its failures.
 
         Parameters
         ----------
+        function
+            The function of the program.
+        name
+            The C name, without the scene's prefix and the lane's suffix.
+        out, places
+            The C argument for the results (None if there are none), and the C expression to which
+            each result is assigned, such as "a[0]".
         extra
-            Additional arguments, the names that each supplies, and the C expression of these.
+            Additional arguments: for each, the C argument, the names that it supplies, and a format
+            for the C expression of such a name.
+        doc
+            The comment above the C function.
         takes
-            Names of the usual arguments; all of them by default.
+            Names of the usual arguments, see `argument`; all of them by default.
         constants
-            C expressions of precomputed values, where the function has its own.
+            C expressions of precomputed values by name, where they differ from `where`.
+        in_order
+            Whether the terms of sums stay in their order.
+        inline
+            Whether the C function is inlined, unless it is so long that it is split into several
+            ones.
         """
         function = rename_reserved(function)
         names_of_arguments = self.argument_names if takes is None else takes
@@ -308,7 +335,7 @@ class Lane:
 
     @property
     def pivots(self) -> int:
-        """The number of pivots of the accelerations, on which the tolerance of each depends."""
+        """Number of pivots in the solution for the accelerations, for the pivot tolerance."""
         return len(self.accelerations.function.checks)
 
     def _fails(self, body: Body) -> bool:
@@ -346,23 +373,23 @@ class Lane:
 
     @cached_property
     def out(self) -> CArgument:
-        """The argument for the accelerations."""
+        """The C argument for the accelerations."""
         return c.output_array(self.real.name, "a")
 
     @cached_property
     def places(self) -> list[str]:
-        """The elements of the accelerations."""
+        """C expressions of the elements of the accelerations, in the order of the coordinates."""
         return [self.target.element("a", n) for n in self.target.names]
 
     @cached_property
     def rates(self) -> Computed:
-        """The function for the accelerations from the state, its sines and the inputs."""
+        """The C function for the accelerations from the state, its sines and the inputs."""
         doc = sentence(self.accelerations.function)
         return self.computed(self.accelerations.rotated[1], "rates", self.out, self.places, doc=doc)
 
     @cached_property
     def signal(self) -> Computed | None:
-        """The function for the scene's signals; None without signals."""
+        """The C function for the scene's signals (formulas for inputs); None without signals."""
         if "signal" not in self.target.program:
             return None
         arguments = [*(["t"] if self.target.signal_t else [])]
@@ -377,8 +404,9 @@ class Lane:
 
     @cached_property
     def compute_constants(self) -> Computed:
-        """The function that precomputes expressions of the parameters. It fails if they make D
-        singular.
+        """The C function that precomputes expressions that depend on the parameters only.
+
+        It fails if the parameters make the mass matrix D singular.
         """
         parameters, target = frozenset(self.accelerations.parameter_names), self.target
         p = c.input_array(f"{self.prefix}_params", "p")
@@ -391,7 +419,12 @@ class Lane:
         )  # fmt: skip
 
     def linear(self, what: str, vector: str, offset: bool) -> CFunction:
-        """Return the function for the angles at q, or for their change with q."""
+        """Return the C function for all angles, as linear combinations of the coordinates.
+
+        what: its C name, without prefix and suffix. vector: the name of its argument, the
+        coordinates or a change of these. offset: whether the constant terms of the angles are
+        added: True for angles, False for changes of angles.
+        """
         angles = self.accelerations.angles
         values = [self.angle_text(a, vector, a.offset if offset else S.Zero) for a in angles]
         if self.padded and self.contiguous_angles is not None:
@@ -405,15 +438,16 @@ class Lane:
         )  # fmt: skip
 
     def angle_text(self, angle: Angle, vector: str, offset: Expr) -> str:
-        """Return an angle as C text, as a combination of the elements of a vector of
-        coordinates.
+        """Return an angle as a C expression: a linear combination of coordinates, plus `offset`.
+
+        vector: the C name of a vector of coordinates. offset: a constant, in rad.
         """
         where = {n: self.target.element(vector, n) for _, n in angle.terms}
         return Printer(self.prefix, self.real, where).value(Sum(angle.terms, offset))[0]
 
     @cached_property
     def calls(self) -> tuple[str, ...]:
-        """Names of functions of the mathematics library that the lane needs."""
+        """Sorted names of the mathematical functions of the scene, without sine and cosine."""
         functions = [self.accelerations.function]
         others = ("signal", "projection")
         functions += [f for n in others if (f := self.target.program.functions.get(n))]
@@ -427,20 +461,21 @@ class Lane:
 
     @property
     def sincos(self) -> str:
-        """The name of the C function for sine and cosine of one angle."""
+        """The name of the C function for the sine and cosine of one angle."""
         return f"{self.prefix}_sincos{self.accelerations.target.real.function_suffix}"
 
     @property
     def angle_count(self) -> str:
-        """The number of angles as C text, padded to whole registers where four are computed at
-        once.
+        """Length of C arrays of angles, as C text.
+
+        It is padded to a multiple of four if the sines of four angles are computed at once.
         """
         n = len(self.accelerations.angles)
         return str(four(n) if self.accelerations.simd_angles and self.name != "wide" else n)
 
     @cached_property
     def all_in_one(self) -> CFunction:
-        """The function for accelerations including signals and sines, where they are not given."""
+        """Prototype of the C accelerations, which compute signals and sines that are not given."""
         arguments = (self.out, *map(self.argument, self.argument_names))
         called = self.padded or self.accelerations.long
         return CFunction(
@@ -452,7 +487,7 @@ class Lane:
 
     @cached_property
     def configuration(self) -> Computed:
-        """The function for position-dependent terms at two configurations."""
+        """The C function for the position-dependent part of the accelerations at two points."""
         parts = self.accelerations.parts
         assert parts is not None
         out = c.output_array(f"{self.prefix}_configuration", "k")
@@ -465,8 +500,9 @@ class Lane:
 
     @cached_property
     def velocity(self) -> Computed:
-        """The function for the accelerations at one of two points, from the position-dependent
-        terms.
+        """The C function for the accelerations at one of two configurations.
+
+        It continues from the position-dependent part that `configuration` computes.
         """
         parts = self.accelerations.parts
         assert parts is not None

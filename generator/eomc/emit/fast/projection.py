@@ -14,7 +14,10 @@ from eomc.program.program import TIME
 
 
 def view(functions: Functions, lane: Lane) -> Projection:
-    """Return the view of the projection over a lane."""
+    """Return the template data of the projection onto the constraints for a lane.
+
+    lane: the type of numbers, one number or a vector register with values of several instances.
+    """
     correction, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = correction.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
@@ -30,8 +33,9 @@ def view(functions: Functions, lane: Lane) -> Projection:
 
 
 def projected(lane: Lane) -> CFunction:
-    """Return the function that changes the increment of a step so that its end satisfies the
-    constraints.
+    """Return the prototype of the C function that makes the end of a step satisfy the constraints.
+
+    It changes the increments r and v of q and q̇ in place. lane: one number or a vector register.
     """
     out = tuple(c.output_array(lane.real.name, n) for n in "rv")
     singular_flag = () if lane.name else (CArgument("int *", "singular"),)
@@ -44,12 +48,18 @@ def projected(lane: Lane) -> CFunction:
 
 
 def ending(functions: Functions, lane: Lane, **passed: str) -> str:
-    """Return the call that projects the end of a step; "" without constraints."""
+    """Return the C call that projects the end of a step onto the constraints; "" without these.
+
+    passed: C expressions for some arguments, by name.
+    """
     return projected(lane).call(**passed) if functions.projection else ""
 
 
 def onto(lane: Lane) -> CFunction:
-    """Return the function that projects a stage onto the constraints to first order."""
+    """Return the prototype of the C function that projects a stage onto the constraints.
+
+    It makes one correction, which is accurate to first order.
+    """
     state = tuple(c.output_array(lane.real.name, n) for n in ("at", "moving"))
     others = (n for n in _arguments(lane, sines=False) if n in "tc")
     return CFunction(

@@ -11,12 +11,12 @@ from eomc.integrators.tableaux import RK4, Method
 
 
 def predicts(steppers: Steppers, m: Method) -> bool:
-    """Return True if a method predicts angles."""
+    """Return True if steps of the method `m` predict angles, to compute their sines in advance."""
     return m is RK4 and steppers.predicted
 
 
 def state(steppers: Steppers, m: Method) -> views.State:
-    """Return the view of the state of a run."""
+    """Return the template data of the C struct with the state of a run by the method `m`."""
     lane = steppers.one
     return views.State(
         **steppers.extended(lane),
@@ -33,7 +33,7 @@ def state(steppers: Steppers, m: Method) -> views.State:
 
 
 def state_size(steppers: Steppers, m: Method) -> int:
-    """Return the size of the state, in numbers, for which the header reserves space."""
+    """Return the length of a run's workspace, in numbers, that the C header reserves."""
     n, angles, s = len(steppers.one.target.names), len(steppers.accelerations.angles), m.stages
     size = 4 * steppers.one.width + 32
     if steppers.functions.projection:
@@ -48,7 +48,7 @@ def state_size(steppers: Steppers, m: Method) -> int:
 
 
 def constants_call(steppers: Steppers) -> str:
-    """Return the call that precomputes expressions of the parameters; "" where there are none."""
+    """Return the C call that precomputes expressions of the parameters; "" if there are none."""
     function = steppers.one.compute_constants.function
     is_empty = (
         not steppers.accelerations.constants and sum(len(b.lines) for b in function.body) == 2
@@ -57,7 +57,7 @@ def constants_call(steppers: Steppers) -> str:
 
 
 def loop(steppers: Steppers, m: Method) -> views.Loop:
-    """Return the view of a method's step and run."""
+    """Return the template data of the C functions for one step and many steps of the method `m`."""
     lane, s, public = steppers.one, steppers.accelerations, steppers.functions.public
     run = public.run(m.name)
     corrected = steppers.corrected(m)
@@ -97,7 +97,7 @@ def loop(steppers: Steppers, m: Method) -> views.Loop:
 
 
 def batch(steppers: Steppers, m: Method) -> views.Batch:
-    """Return the view of a method's batch."""
+    """Return the template data of the C function that steps many instances by the method `m`."""
     lane, s = steppers.one, steppers.accelerations
     rk4 = m is RK4
     alone = steppers.advanced(lane, "rk4_alone" if rk4 and s.angles else m.name)
@@ -129,7 +129,8 @@ def batch(steppers: Steppers, m: Method) -> views.Batch:
 
 
 def prediction_width(angles: int) -> int:
-    """Return the lane width for predicted angles: two numbers per angle, rounded up to a power of
-    two.
+    """Return the number of values in the vector type for predicted angles.
+
+    It is twice the number of angles, rounded up to a power of two.
     """
     return 1 << (2 * angles - 1).bit_length()

@@ -25,7 +25,11 @@ from eomc.program import two_point
 
 @dataclass(frozen=True)
 class Steppers:
-    """The integration methods of a scene, with its accelerations."""
+    """The integration methods of a scene in optimised C: their functions and template data.
+
+    slopes: template data of the derivatives of the accelerations; None if the scene does not need
+    them.
+    """
 
     accelerations: Accelerations
     functions: Functions
@@ -33,59 +37,66 @@ class Steppers:
 
     @cached_property
     def one(self) -> Lane:
-        """The lane of one number."""
+        """The lane of one number, for single trajectories."""
         return Lane(self.accelerations)
 
     @cached_property
     def wide(self) -> Lane:
-        """The lane of a vector register."""
+        """The lane of a vector register, which has one value of each of several instances."""
         return Lane(self.accelerations, "wide")
 
     @property
     def two_point(self) -> bool:
-        """Whether one trajectory uses the accelerations in two parts."""
+        """Whether the accelerations of one trajectory are split into two parts.
+
+        The position-dependent part is then computed for two configurations at once.
+        """
         return self.accelerations.parts is not None
 
     @property
     def predicted(self) -> bool:
-        """Whether RK4 predicts the angles of one trajectory."""
+        """Whether RK4 extrapolates the angles of one trajectory to compute sines in advance."""
         s = self.accelerations
         few = 0 < len(s.angles) < two_point.MIN_ANGLES
         free = not (self.two_point or s.target.system.constraints)
         return few and s.target.real is DOUBLE and free
 
     def corrected(self, method: Method) -> bool:
-        """Return True if a method passes its last sines to the projection."""
+        """Return True if steps of `method` pass the sines at their end to the projection."""
         s = self.accelerations
         return method is RK4 and self.functions.projection is not None and s.correction[1]
 
     @property
     def methods(self) -> tuple[Method, ...]:
-        """The methods that the scene requests."""
+        """The integration methods that the scene requests."""
         return tuple(METHODS[name] for name in self.accelerations.target.system.run.methods)
 
     @property
     def shared_signals(self) -> bool:
-        """Whether the signals depend on time only, so that stages share them."""
+        """Whether signals depend on time only, so that stages share their values."""
         target = self.accelerations.target
         return "signal" in target.program and not target.signal_state
 
     @property
     def signals_supplied(self) -> bool:
-        """Whether all callers of the accelerations supply the signals."""
+        """Whether all callers of the C accelerations supply the inputs from the signals."""
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
         return self.shared_signals and alone and not self.predicted
 
     def accelerate(self, lane: Lane, **passed: str) -> str:
-        """Return a call of the accelerations of a lane, with some arguments replaced."""
+        """Return the C call of the accelerations for a lane (one number or a vector register).
+
+        passed: C expressions for some arguments, by name; the others are passed under their own
+        names. By default the sines are not supplied, but computed by the accelerations.
+        """
         if self.accelerations.angles:
             passed = {"s": "NULL"} | passed
         return lane.all_in_one.call(**passed)
 
     @property
     def driven(self) -> dict[str, Any]:
-        """View fields: whether steps read time, inputs and precomputed expressions."""
+        """Template fields by name: whether steps read time, inputs and precomputed expressions."""
         target = self.accelerations.target
         return {
             "timed": target.driven, "inputs": bool(target.system.inputs),
@@ -93,17 +104,21 @@ class Steppers:
         }  # fmt: skip
 
     def looping(self, lane: Lane) -> dict[str, Any]:
-        """Return fields of views with loops over coordinates."""
+        """Return template fields by name: names of the scene, and the macro before loops."""
         return self.functions.names | {"unroll": lane.unroll}
 
     def extended(self, lane: Lane) -> dict[str, Any]:
-        """Return fields of views with vectors of coordinates."""
+        """Return template fields by name: names of the scene, and the length of vectors."""
         return self.functions.names | {"extent": lane.extent}
 
     # what a step takes
 
     def stepping(self, lane: Lane) -> tuple[CArgument, ...]:
-        """Return the arguments of a step that this scene has: q, qd, t, h, u, c."""
+        """Return the C arguments of a step that this scene needs, among q, qd, t, h, u and c.
+
+        lane: one number or a vector register, which determines their types. c: the precomputed
+        expressions of the parameters.
+        """
         real = self.accelerations.target.real.name
         names = [n for n in lane.argument_names if n != "s"]
         arguments = [lane.argument(n) for n in names]
@@ -111,7 +126,11 @@ class Steppers:
         return (*arguments[:position], CArgument(real, "h"), *arguments[position:])
 
     def advanced(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
-        """Return a function that computes the increment of a step."""
+        """Return the prototype of the C function for the increments r of q and v of q̇ in a step.
+
+        name: its C name, without prefix and suffix of the lane. extra: further arguments at the
+        end.
+        """
         out = tuple(c.output_array(lane.real.name, n) for n in "rv")
         return CFunction(
             f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *extra)
@@ -120,7 +139,7 @@ class Steppers:
     # methods
 
     def rk4(self, lane: Lane) -> views.RungeKutta4:
-        """Return the view of RK4 over a lane."""
+        """Return the template data of a step of RK4 for one number or a vector register."""
         s = self.accelerations
         double, one = s.target.real is DOUBLE, not lane.name
         two_point = one and self.two_point
@@ -154,7 +173,7 @@ class Steppers:
         )
 
     def predictions(self) -> views.Predictions:
-        """Return the view of predicted angles."""
+        """Return the template data of the C functions that predict angles for RK4."""
         lane, angles = self.one, len(self.accelerations.angles)
         return views.Predictions(
             prefix=lane.prefix, real=lane.real.name, unroll=lane.unroll,
@@ -162,7 +181,7 @@ class Steppers:
         )  # fmt: skip
 
     def prediction(self) -> views.Predicted:
-        """Return the view of the loop of RK4 with predicted angles."""
+        """Return the template data of the loop over steps of RK4 with predicted angles."""
         lane, s = self.one, self.accelerations
         signal = lane.signal.function if lane.signal else None
         shared = self.shared_signals
@@ -190,7 +209,10 @@ class Steppers:
         )
 
     def explicit(self, lane: Lane, m: Method) -> views.Explicit:
-        """Return the view of an explicit method over a lane, except RK4."""
+        """Return the template data of a step of the explicit method `m`; RK4 has its own.
+
+        lane: one number or a vector register with values of several instances.
+        """
         real = self.accelerations.target.real
 
         def total(row: Row) -> str:
@@ -227,7 +249,7 @@ class Steppers:
         )
 
     def implicit(self, m: Method) -> CFunction:
-        """Return the function for a step of an implicit method."""
+        """Return the prototype of the C function for a step of the implicit method `m`."""
         lane = self.one
         state = c.output_array(f"{lane.prefix}_{m.name}_state", "m")
         extra = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
@@ -245,11 +267,11 @@ class Steppers:
 
     @property
     def follows(self) -> bool:
-        """Whether the signals depend on the state."""
+        """Whether the scene's signals depend on the state."""
         return self.accelerations.target.signal_state
 
     def gauss(self, m: Method) -> views.Gauss:
-        """Return the view of a Gauss method with Newton's method."""
+        """Return the template data of a step of a Gauss method that uses Newton's method."""
         lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
         assert slopes is not None
         f = self.functions
@@ -294,7 +316,7 @@ class Steppers:
 
     @property
     def literals(self) -> dict[str, str]:
-        """View fields: literals and names of library functions."""
+        """Template fields by name: C literals and the name of the C function for |x|."""
         real = self.one.real
         end = real.function_suffix
         return {
@@ -303,8 +325,9 @@ class Steppers:
         }  # fmt: skip
 
     def sweep(self, m: Method) -> CFunction:
-        """Return the function for one iteration over the stages of a method, one stage per lane
-        element.
+        """Return the prototype of the C function for one iteration over the stages of `m`.
+
+        It computes the stages side by side in vector registers.
         """
         P = f"{self.one.prefix}_{m.name}"
         out = c.output_array(f"{P}_stages", "b")
@@ -313,7 +336,7 @@ class Steppers:
         return c.static(f"{P}_sweep", "int", out, *arguments, *others)
 
     def stages(self, m: Method) -> views.Stages:
-        """Return the view of the accelerations at the stages and one iteration over them."""
+        """Return the template data of one iteration over the stages of the method `m`."""
         lane, wide, real = self.one, self.wide, self.one.real
         fixed = m.name in lane.target.system.run.methods
 
@@ -343,7 +366,7 @@ class Steppers:
         )
 
     def sweeps(self, m: Method) -> views.Sweeps:
-        """Return the view of a method with a fixed number of iterations."""
+        """Return the template data of a step of a method with a fixed number of iterations."""
         lane, real = self.one, self.one.real
         P = f"{lane.prefix}_{m.name}"
         state = c.output_array(f"{P}_state", "m")
@@ -380,7 +403,10 @@ class Steppers:
 
 
 def stability(m: Method) -> str:
-    """Return the stability limits of a method as text."""
+    """Return the stability limits of a method as text for a comment.
+
+    They are limits of h omega for undamped oscillation and of h lambda for pure decay.
+    """
     undamped, decay = m.limits
     return f"h omega <= {undamped:.3g} undamped" + (
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."

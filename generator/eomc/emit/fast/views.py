@@ -201,7 +201,9 @@ class TwoPoints(Prefixed):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named, Laned, Driven):
-    """Data for the template c/fast/rk4.c: a step of the classical Runge-Kutta method, for a lane.
+    """Data for the template c/fast/rk4.c: a step of the classical Runge-Kutta method.
+
+    It is printed for one instance, and for a vector register with values of several instances.
 
     Attributes
     ----------
@@ -311,6 +313,8 @@ class Stage:
 @dataclass(frozen=True)
 class Explicit(Prefixed, Laned, Driven):
     """Data for the template c/fast/explicit.c: a step of an explicit method except RK4.
+
+    It is printed for one instance, and for a vector register with values of several instances.
 
     Attributes
     ----------
