@@ -26,30 +26,33 @@ Pairs = tuple[tuple[Expr, Expr], ...]
 
 
 class MasslessError(Exception):
-    """Raised where a joint has no inertia along its axis (d = 0). `link`: the index of its link."""
+    """Raised when a joint has no inertia along its axis: d = 0, so no acceleration follows.
+
+    `link` is the index of the link that the joint moves.
+    """
 
     def __init__(self, link: int) -> None:
         self.link = link
 
 
 def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-    """Solve for the joint accelerations by the articulated-body algorithm.
+    """Return the joint accelerations of a kinematic tree by the articulated-body algorithm.
 
     Parameters
     ----------
     recursion : Recursion
-        The tree with its inertias, on a tape.
+        The tree with the inertias of its links.
     drive : sequence of Expr
-        Generalized force along each joint, less the forces of everything that is not part of the
-        tree.
+        For each joint, the generalized force along it (force in N or moment in N m), minus the
+        forces of everything that is not part of the tree.
 
     Returns
     -------
     qdd : list of Expr
-        The acceleration along each joint.
+        The acceleration along each joint (rad/s^2 or m/s^2).
     pivots : tuple of (Expr, Expr)
-        Each pivot d with a quantity of the size of the terms that it was computed from, against
-        which cancellation can be judged.
+        For each joint, the pivot d (its articulated inertia along the axis) and the magnitude of
+        the terms that d was computed from. A small ratio of the two indicates cancellation.
 
     Raises
     ------

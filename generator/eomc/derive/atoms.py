@@ -10,7 +10,11 @@ from sympy import Expr, Mul, S, Symbol
 
 
 def split(atom: Expr) -> tuple[Expr, Symbol | None]:
-    """Split an atom into (number, name). The name is None if the atom is a number."""
+    """Return the number and the name whose product is `atom`.
+
+    An atom is a number, a name, or a number times a name. The number is 1 if `atom` is a name; the
+    name is None if `atom` is a number.
+    """
     if atom.is_Symbol:
         return S.One, atom
     if atom.is_number:
@@ -22,15 +26,22 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
 
 
 def is_negative(number: Expr) -> bool:
-    """Return True if a number is negative. Fractions are decided by their numerator, which is
-    faster than SymPy's test.
+    """Return True if `number` is negative.
+
+    Rational numbers are decided by their numerator, which is faster than SymPy's test.
     """
     return bool(number.p < 0 if number.is_Rational else number.is_negative)
 
 
 class Sums(Protocol):
-    """The parts of a tape that `expand_sums` reads: leaves, and weights and constant of each
-    sum.
+    """The attributes of a `Tape` that `expand_sums` reads.
+
+    Attributes
+    ----------
+    leaves
+        The symbols without definition.
+    weights, constant
+        For each name that is defined as a sum: the weight of each name in it, and its constant.
     """
 
     leaves: dict[Symbol, Any]
@@ -41,9 +52,11 @@ class Sums(Protocol):
 def expand_sums(
     weights: dict[Symbol, Expr], constant: Expr, sums: Sums
 ) -> tuple[dict[Symbol, Expr], Expr]:
-    """Substitute nested sums of leaves in a sum where this makes it shorter: q1 + (q2 - q1) = q2.
+    """Return a sum in which nested sums of leaves are replaced by their terms if this shortens it.
 
-    Besides being shorter, the result avoids a rounding error that is large where q1 is large.
+    For example, q1 + (q2 - q1) becomes q2. This also avoids a rounding error that is large where
+    q1 is large. A sum is given and returned as the weight of each name and a constant. `sums` is
+    the tape on which the names are defined.
     """
     for symbol, weight in weights.items():
         inner = sums.weights.get(symbol)

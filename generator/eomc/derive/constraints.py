@@ -30,37 +30,40 @@ ZERO_GRADIENT_TOLERANCE = {"double": 1e-22, "float": 1e-12}
 
 @dataclass(frozen=True)
 class Constraints:
-    """The m constraint equations of a system on the tape of its equations, holonomic ones first.
+    """The m constraint equations of a system on a tape, holonomic equations first.
+
+    Each quantity is an atom of the tape of the equations of motion, see `Tape`.
 
     Attributes
     ----------
     values : (m,)
-        phi of holonomic and psi of nonholonomic constraints.
+        Residuals: phi(q, t) of holonomic and psi(q, qd, t) of nonholonomic constraints.
     jacobian : (m, nq)
-        A = d phi/d q, d psi/d qd.
+        A: d phi/d q of holonomic and d psi/d qd of nonholonomic constraints.
     rates : (m,)
         A qd + phi_t for holonomic constraints, psi for nonholonomic ones.
     rest : (m,)
         d(rates)/dt - A qdd.
-    moved : (m,)
-        The value of A qd for which `rates` is 0: minus the part that depends on time alone.
+    drift : (m,)
+        The value of A qd for which `rates` is 0: rates = A qd - drift.
     holonomic : int
         The number of holonomic constraints.
     solved : tuple of Sum
-        The independent equations that accelerations are solved with, each a weighted sum of
-        constraints. Most consist of one constraint; redundant constraints are left out.
+        The independent equations from which accelerations are computed, each a weighted sum of
+        constraint equations. Most consist of a single one; redundant ones are left out.
     drop : (Expr, Expr)
         Relative pivot tolerances for accelerations and for the projection. An equation whose pivot
-        is below it depends on others in this configuration, and its multiplier is set to 0.
+        is below the tolerance depends on others in this configuration; its multiplier is set to 0.
     weights : tuple of Expr
         Where D alone is singular, the weight w of each equation with which D + A^T w A is regular.
         Empty otherwise.
-    faded : tuple of Expr
-        For each equation, the pivot below which its gradient vanishes in this configuration.
+    pivot_limits : tuple of Expr
+        For each equation in `solved`, the pivot below which its gradient counts as zero.
     switched : frozenset of int
-        The constraints that hold in some modes only.
+        Indices of the constraints that are active in some modes only.
     rotation_errors : tuple of (Expr, Expr)
-        Of each constraint that has one, its rotation error and cos(a/2)^2.
+        For each axis equation of a loop whose rotation error is an angle a about n: the component
+        of 2 tan(a/2) n along the axis, and cos(a/2)^2.
     """
 
     values: Vector
@@ -78,7 +81,11 @@ class Constraints:
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
-    """Return the constraint equations of a system with energies e; None without constraints."""
+    """Return the constraint equations of a system, or None if it has none.
+
+    `e` contains the system's energies and the residuals of its constraints on a tape; the
+    derivatives of the residuals are defined on the same tape.
+    """
     if not system.constraints:
         return None
     tape, q, qd = e.tape, system.q, system.qd
@@ -128,10 +135,11 @@ def _pivot_limit(gradient: Sequence[Expr], limit: float) -> Expr:
 
 
 def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vector:
-    """Return A qd + phi_t of each unswitched equation, then sum |terms| of each.
+    """Return the rate of each unswitched equation, followed by the magnitude of each rate's terms.
 
-    Where an equation depends on others, its multiplier cannot enforce it. A rate that is large
-    relative to the sum of its terms then shows that the motion violates the equation.
+    The rate is A qd + phi_t, the magnitude is the sum of the absolute values of its terms. Where an
+    equation depends on others, its multiplier cannot enforce it. A rate that is large relative to
+    its terms then shows that the motion violates the equation.
     """
     indices = [k for k, row in enumerate(rows.solved) if row[0][0] not in rows.switched]
     A = jacobian(tape, rows)
@@ -144,13 +152,17 @@ def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vec
 
 
 def jacobian(tape: Tape, rows: Constraints) -> Rows:
-    """Return the Jacobian of the independent equations `rows.solved`."""
+    """Return the Jacobian A of the independent constraint equations `rows.solved`, by rows."""
     columns = [select_rows(tape, column, rows) for column in zip(*rows.jacobian, strict=True)]
     return tuple(zip(*columns, strict=True))
 
 
 def select_rows(tape: Tape, numbers: Sequence[Expr], rows: Constraints) -> list[Expr]:
-    """Form the weighted sums `rows.solved` of one number per constraint."""
+    """Return one value for each independent equation from one number for each constraint equation.
+
+    An equation in `rows.solved` is a weighted sum of constraint equations; its value is the sum of
+    their `numbers` with the same weights.
+    """
     return [
         numbers[row[0][0]] if len(row) == 1
         else tape.total([tape.scaled(w, numbers[k]) for k, w in row])

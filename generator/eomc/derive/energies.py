@@ -14,8 +14,29 @@ from eomc.model.system import System, dot, symbol, t
 
 @dataclass
 class Energies:
-    """Energies and forces on a tape: K, P, a . qd, R, Q, and the points y_k with velocities w_k =
-    dot(y_k).
+    """Energies, forces and constraint residuals of a system, as atoms of `tape`.
+
+    Attributes
+    ----------
+    kinetic, potential : Expr
+        Energies K and P (J).
+    linear_potential : Expr
+        The potential a(q, t) . qd that is linear in the velocities.
+    dissipation : Expr
+        Rayleigh's dissipation function R (W).
+    forces : list of Expr
+        Generalized force Q on each coordinate.
+    signals : list of Expr
+        Value of each input.
+    points : dict
+        The position y_k of each point whose velocity w_k = dot(y_k) occurs in a formula, by w_k.
+    applied : list of (Expr, Expr)
+        For each force at a point: the point's velocity, and the force.
+    rows : list of Expr
+        Residual of each constraint equation.
+    rotation_errors : list of (Expr, Expr)
+        For each axis equation of a loop whose rotation error is an angle a about n: the component
+        of 2 tan(a/2) n along the axis, and cos(a/2)^2.
     """
 
     tape: Tape
@@ -32,13 +53,19 @@ class Energies:
 
 
 def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
-    """Return a symbol for the component of a direction along each of q, qd and u."""
+    """Return the symbols for the components of a direction in the space of q, qd and u.
+
+    The keys are the coordinates, velocities and inputs. Derivatives along a direction are expressed
+    with these symbols.
+    """
     return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
 
 
 def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
-    """Return the stage of each symbol that is not defined by others: t, parameters, inputs, q, qd,
-    `more`.
+    """Return the stage (earliest time of evaluation) of each symbol that has no definition.
+
+    These are t, the parameters, inputs, q and qd of the system, and the symbols `velocities`, which
+    have the same stage as qd.
     """
     stages: dict[Symbol, Stage] = {t: Stage.TIME}
     stages |= {p.symbol: Stage.PARAMETER for p in system.parameters}
@@ -50,9 +77,22 @@ def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
 def energies_on_tape(
     system: System, kinetic: Expr, potential: Expr, accelerations: bool = False
 ) -> Energies:
-    """Write K and P, and the system's dissipation, forces, signals and constraints, to a new tape.
+    """Define the energies and all other terms of a system's equations of motion on a new tape.
 
-    Raises EomcError where a formula needs the time derivative of a velocity or an input.
+    The other terms are the system's dissipation, forces, input signals and constraint residuals.
+
+    Parameters
+    ----------
+    kinetic, potential
+        Formulas of the energies to use in place of `system.kinetic` and `system.potential`.
+    accelerations
+        Whether the tape has the accelerations `system.qdd` as symbols, in place of the components
+        of a direction (`tangent_symbols`).
+
+    Raises
+    ------
+    EomcError
+        If a formula needs the time derivative of a velocity or an input.
     """
     more = system.qdd if accelerations else tangent_symbols(system).values()
     tape = Tape(leaves(system, *more), frozenset(system.q) - system.rates.keys())

@@ -23,21 +23,25 @@ UNROLLED_SIZE_LIMIT = 2500
 
 @dataclass(frozen=True)
 class MotionTerms:
-    """Terms of D qdd + bias = tau as atoms of a tape, with bias = C qd + g.
+    """Terms of the equations of motion D qdd + bias = tau, as atoms of a tape.
 
     Attributes
     ----------
     D : (nq, nq) or (1, nq)
-        Mass matrix by rows. Where that would be long, one row: D v for the direction v whose
-        entries are `tangent_symbols(system)`.
-    bias, g, tau : (nq,)
-        C qd + g; its part at rest; generalized forces.
+        Mass matrix by rows. Where the matrix would be long: the single row D v for the direction v
+        with the entries `tangent_symbols(system)`.
+    bias : (nq,)
+        C qd + g.
+    g : (nq,)
+        The bias at qd = 0.
+    tau : (nq,)
+        Generalized forces.
     balance : (nq,)
-        b = tau - bias in D qdd = b.
+        tau - bias, the right-hand side of D qdd = tau - bias.
     quadratic : bool
-        Whether K is a quadratic form of the velocities.
+        Whether K is a quadratic form of the velocities without explicit time.
     notes : tuple of str
-        Where unusual terms of K appear in the equations.
+        Sentences that say where the parts of K that are not quadratic appear in the equations.
     """
 
     D: Rows
@@ -51,21 +55,23 @@ class MotionTerms:
 
 @dataclass(frozen=True)
 class Equations(MotionTerms):
-    """The equations of motion of a system.
+    """The equations of motion of a system, as atoms of `tape`.
 
     Attributes
     ----------
+    tape : Tape
+        The definitions of all names that the attributes contain.
     C : (nq, nq) or (1, nq)
         Coriolis matrix, in the same form as D.
     signals : (nu,)
         Values of the inputs.
     kinetic, potential : Expr
-        Energies K and P.
+        Energies K and P (J).
     jacobi : Expr or None
-        Jacobi's integral p . qd - K + P, which is conserved without forces and explicit time. None
-        where it equals K + P.
+        Jacobi's integral p . qd - K + P, with p = dK/dqd. It is conserved without forces and
+        explicit time. None where it equals K + P.
     power : Expr
-        d(jacobi)/dt without the power of constraint forces; 0 for a conservative system.
+        d(jacobi)/dt without the power of constraint forces (W); 0 for a conservative system.
     rows : Constraints or None
         The constraint equations.
     """
@@ -81,8 +87,10 @@ class Equations(MotionTerms):
 
 
 def equations(system: System, e: Energies, motion: MotionTerms) -> Equations:
-    """Complete D, bias, K and P to the equations of motion: C, Jacobi's integral and its time
-    derivative.
+    """Return the equations of motion of a system, from its energies and its terms D, bias and tau.
+
+    Derives what `motion` does not contain: the Coriolis matrix, Jacobi's integral with its time
+    derivative, and the constraint equations.
     """
     tape, qd = e.tape, system.qd
 
@@ -140,7 +148,11 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
 
 
 def raise_no_inertia(system: System, name: str) -> NoReturn:
-    """Raise a SceneError for a coordinate without inertia, with the remedy that fits the scene."""
+    """Raise a SceneError for the coordinate `name`, which has no inertia.
+
+    The message suggests a remedy, which depends on whether bodies on joints, or a formula of the
+    kinetic energy, should give the coordinate its inertia.
+    """
     links = system.tree.links if system.tree else ()
     body = next((link.name for link in links if symbol(name) in link.q.free_symbols), "")
     if body:

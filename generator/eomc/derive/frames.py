@@ -31,18 +31,22 @@ Twist = tuple[Vector, Vector]  # (velocity, angular velocity) or (force, moment)
 
 @dataclass(frozen=True)
 class Motions:
-    """Kinematics of all requested frames as atoms of a tape, one frame after the other.
+    """Kinematics of all frames that a system outputs, as atoms of the tape `tape`.
+
+    Each sequence lists one frame after the other. Vectors are along the world's axes; lengths are
+    in m, angles in rad.
 
     Attributes
     ----------
     poses
-        Position (3) and rotation matrix by rows (9) of each frame; in the plane x, y, angle.
+        For each frame, its position (3) and rotation matrix by rows (9); in the plane x, y, angle.
     velocities, accelerations
-        Linear (3) and angular (3) of each frame; in the plane x, y, angle.
+        For each frame, the linear (3) and angular (3) part; in the plane x, y, angle.
     jacobians
-        By rows, (6, nq) for each frame; (3, nq) in the plane.
+        For each frame, the matrix that maps qd to its velocity, by rows: (6, nq); in the plane
+        (3, nq).
     forces : (nq,)
-        Generalized forces of the wrenches `wrenches(system)` at the frames.
+        Generalized forces of the forces and moments `wrenches(system)` that act at the frames.
     """
 
     tape: Tape
@@ -54,9 +58,10 @@ class Motions:
 
 
 def wrenches(system: System) -> list[Symbol]:
-    """Return symbols for the force and moment at each requested frame, along the world's axes.
+    """Return the symbols for the force (N) and moment (N m) at each frame that the system outputs.
 
-    They end in an underscore, so no name of a scene coincides with them.
+    The components are along the world's axes: fx fy fz mx my mz, in the plane fx fy mz. The names
+    end in an underscore, so no name of a scene coincides with them.
     """
     entries = "fx fy mz" if system.plane else "fx fy fz mx my mz"
     count = len(system.output_frames)
@@ -64,7 +69,10 @@ def wrenches(system: System) -> list[Symbol]:
 
 
 def motions(system: System) -> Motions:
-    """Derive the kinematics of the frames that the system requests."""
+    """Return poses, velocities, accelerations and Jacobians of the frames `system.output_frames`.
+
+    They are derived on a new tape.
+    """
     entries = wrenches(system)
     tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(entries, Stage.TIME))
     kinematics = Sweep(tape, system, system.output_frames)
@@ -89,22 +97,24 @@ def motions(system: System) -> Motions:
 
 @dataclass(frozen=True)
 class FrameKinematics:
-    """A frame with its pose, velocity, acceleration and Jacobian along the world's axes.
+    """Pose, velocity, acceleration and Jacobian of a frame, along the world's axes.
+
+    A `Twist` is a pair of vectors (linear, angular).
 
     Attributes
     ----------
     link : int
-        Index of the link that it is fixed to; -1 for a frame placed by formulas.
+        Index of the link that the frame is fixed to; -1 for a frame placed by formulas.
     arm, at : Vector
-        Position relative to the link's origin, and in the world.
+        Position relative to the link's origin, and position in the world.
     rotation : sequence of Vector
         Rotation matrix by rows.
     angle : Expr
         Angle in the plane; 0 in space.
     velocity, acceleration : Twist
-        Linear and angular velocity, and acceleration.
+        Linear and angular velocity; linear and angular acceleration.
     jacobian : sequence of Twist
-        Velocities for a unit rate of each coordinate.
+        For each coordinate, the velocity of the frame for a unit rate of the coordinate.
     """
 
     link: int
@@ -118,7 +128,20 @@ class FrameKinematics:
 
 
 class Sweep(Links):
-    """Kinematics of links along the world's axes. d, width: entries of a position, a twist."""
+    """Kinematics of a tree's links and of frames, along the world's axes, from base to leaves.
+
+    Attributes
+    ----------
+    d, width : int
+        Number of entries of a position (2 in the plane, 3 in space) and of a twist, which is a
+        linear and an angular velocity (3 in the plane, 6 in space).
+    columns, origin, step
+        For each link, the columns of its rotation matrix, the position of its origin, and the
+        vector from its parent's origin to its own.
+    velocity, acceleration, spin, turning
+        For each link, the velocity and acceleration of its origin, its angular velocity and
+        its angular acceleration.
+    """
 
     def __init__(self, tape: Tape, system: System, frames: Sequence[Frame]) -> None:
         super().__init__(tape, system.tree or Tree((), (), ZERO, ZERO))
@@ -186,16 +209,24 @@ class Sweep(Links):
         self.acceleration.append(a)
 
     def world(self, k: int, v: Vector) -> Vector:
-        """Transform a vector from link k's frame to the world's axes."""
+        """Return the components along the world's axes of a vector given in link k's frame."""
         return self.plus(*(self.scaled(c, x) for c, x in zip(self.columns[k], v, strict=True)))
 
     def axis(self, k: int) -> Vector:
-        """Return the joint axis of link k along the world's axes."""
+        """Return the unit vector of link k's joint axis, along the world's axes."""
         return self.columns[k][self.links[k].axis]
 
     def propagate(self, moving: Twist, accelerating: Twist, r: Vector) -> Twist:
-        """Return velocity and acceleration of the point at `r` from the reference point on the same
-        body.
+        """Return the velocity and acceleration of the point at `r` from a reference point.
+
+        Both points belong to the same body, and `r` is the vector from the reference point.
+
+        Parameters
+        ----------
+        moving : Twist
+            Velocity of the reference point, and angular velocity of the body.
+        accelerating : Twist
+            Acceleration of the reference point, and angular acceleration of the body.
         """
         (v, omega), (a, alpha) = moving, accelerating
         rotational = self.cross(omega, r)
@@ -207,13 +238,14 @@ class Sweep(Links):
     # --- frames ----------------------------------------------------------------------------------
 
     def flat(self, linear: Vector, angular: Vector) -> Sequence[Expr]:
-        """Return the entries of a twist or wrench: 6 in space; x, y and the angular entry in the
-        plane.
+        """Return the entries of a twist or wrench as one sequence.
+
+        In space these are the 6 entries of both vectors; in the plane x, y and the angular entry.
         """
         return (*linear[:2], angular[2]) if self.plane else (*linear, *angular)
 
     def twist(self, entries: Sequence[Expr]) -> Twist:
-        """Return the (linear, angular) pair of the entries that `flat` returns."""
+        """Return the pair of vectors (linear, angular) with the given entries; inverts `flat`."""
         if self.plane:
             x, y, turn = entries
             return (x, y, S.Zero), (S.Zero, S.Zero, turn)
@@ -222,7 +254,7 @@ class Sweep(Links):
 
     @cached_property
     def known(self) -> Mapping[Symbol, Expr]:
-        """The atoms of all definitions that occur in formulas of frames."""
+        """The atoms of all definitions of the scene that occur in formulas of frames, by symbol."""
         formulas = [formula for f in self.frames for formula in self._formulas(f)]
         known: dict[Symbol, Expr] = {}
         for name, formula in needed(self.system.definitions, formulas):
@@ -235,17 +267,17 @@ class Sweep(Links):
         return (*placed, f.angle) if self.plane else placed
 
     def value(self, e: Expr) -> Expr:
-        """Return the atom of a formula that may contain definitions."""
+        """Return the atom of the formula `e`, which may contain the scene's definitions."""
         return self.define(e.xreplace(self.known))
 
     def pose(self, frame: FrameKinematics) -> Sequence[Expr]:
-        """Return position and rotation matrix; in the plane position and angle."""
+        """Return position and rotation matrix by rows, 12 entries; in the plane x, y and angle."""
         if self.plane:
             return (*frame.at[:2], frame.angle)
         return (*frame.at, *(x for row in frame.rotation for x in row))
 
     def frame(self, f: Frame) -> FrameKinematics:
-        """Compute the kinematics of a frame."""
+        """Return pose, velocity, acceleration and Jacobian of the frame `f`."""
         if f.link < 0:
             return self._frame_by_formulas(f)
         k = f.link
@@ -299,7 +331,12 @@ class Sweep(Links):
     # --- forces ----------------------------------------------------------------------------------
 
     def forces(self, frames: Sequence[FrameKinematics], wrenches: Sequence[Twist]) -> list[Expr]:
-        """Project wrenches at frames onto the coordinates: generalized forces sum_k J_k^T w_k."""
+        """Return the generalized force on each coordinate of forces and moments that act at frames.
+
+        `wrenches` contains the pair (force, moment) for each frame. With the frame's Jacobian J_k
+        and wrench w_k, the result is sum_k J_k^T w_k. One pass from the leaves to the base computes
+        it for all frames that are fixed to links.
+        """
         force, moment = [[ZERO] * self.n for _ in range(2)]
         generalized: dict[Symbol, list[Expr]] = {q: [] for q in self.system.q}
         for frame, (f, m) in zip(frames, wrenches, strict=True):

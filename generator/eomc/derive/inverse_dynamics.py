@@ -18,8 +18,9 @@ from eomc.model.system import System
 
 
 def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """Derive tau = D qdd + C qd + g, (nq,), as a function of q, qd, qdd and t. Returns the tape and
-    tau.
+    """Return a tape and the (nq,) generalized forces tau = D qdd + C qd + g on it.
+
+    tau is a function of q, qd, qdd and t. It is derived without forming the matrix D.
     """
     tree = system.tree
     energies = (tree.other_kinetic, tree.other_potential) if tree else None

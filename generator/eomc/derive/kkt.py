@@ -32,22 +32,25 @@ DROPPED_PIVOT = sympy.Float("1e-9")  # replaces a dropped pivot, relative to its
 
 @dataclass(frozen=True)
 class KktFactors:
-    """L diag(d) L^T of a KKT matrix: indices below `count` are coordinates, the others constraints.
+    """Factors L diag(d) L^T of a KKT matrix [D A^T; A 0], as atoms of `tape`.
+
+    Indices below `count` are coordinates, all others are constraint equations.
 
     Attributes
     ----------
     steps
-        In order of elimination: index, inverse of the pivot, and the column of L below it.
+        In order of elimination: the index, the inverse of its pivot, and the column of L below it.
     pivots
         Pivots of coordinates, all positive, each with the matrix entry that it started from.
     inverses
-        Inverse pivots of the constraints; 0 where one is dropped.
+        Inverse pivots of the constraint equations; 0 for an equation that is dropped because its
+        pivot is too small.
     switched
-        For constraints that modes switch: the pivot (a small fraction of its initial value where it
-        is dropped), and the entries below it before they are divided.
+        For each constraint equation that modes switch, by index: its pivot (a small fraction of
+        its initial value where it is dropped), and the entries below it before they are divided.
     slides
-        For each coordinate that a switched constraint fixes: 0 where that constraint is active,
-        else 1.
+        For each coordinate that a switched constraint fixes, by index: 0 where that constraint is
+        active, else 1.
     """
 
     tape: Tape
@@ -61,12 +64,20 @@ class KktFactors:
     def solve(
         self, b: Sequence[Expr], c: Sequence[Expr], short: Callable[[Expr], Expr]
     ) -> tuple[Vector, Vector, Vector]:
-        """Solve the KKT system for right-hand sides b and c.
+        """Return the solution of D a - A^T lambda = b, A a = c.
 
-        A coordinate that a switched constraint fixes gets an acceleration of exactly 0, so that
-        rounding errors do not move it. `short` rewrites intermediate results. Returns a, lambda,
-        and the product lambda times pivot for switched constraints, whether or not the pivot is
-        dropped.
+        `short` is applied to intermediate results and may replace them by shorter ones. A
+        coordinate that an active switched constraint fixes gets an acceleration of exactly 0, so
+        that rounding errors do not move it.
+
+        Returns
+        -------
+        a : (nq,)
+            The accelerations.
+        lambda : (m,)
+            The multipliers; 0 for dropped equations.
+        residuals
+            For each switched constraint, lambda times pivot, whether or not the pivot is dropped.
         """
         tape, y = self.tape, [*b, *c]
         for k, _, factors in self.steps:
@@ -97,12 +108,25 @@ def factors(
     switched: Container[int] = (),
     last: Container[int] = (),
 ) -> KktFactors:
-    """Factor the KKT matrix of D and A.
+    """Return the factors L diag(d) L^T of the KKT matrix [D A^T; A 0].
 
-    drop: relative pivot tolerance. faded: absolute pivot tolerance of each constraint. short:
-    rewrites intermediate results. switched: constraints that modes switch, for which more is
-    returned. last: constraints that are eliminated after all others, and are dropped where the
-    others already determine them.
+    Parameters
+    ----------
+    tape : Tape
+        Receives the definitions of the factors.
+    D, A : Rows
+        Mass matrix and Jacobian of the constraint equations.
+    drop : Expr
+        Pivot tolerance of a constraint equation, relative to the pivot's initial value.
+    faded : sequence of Expr
+        Absolute pivot tolerance of each constraint equation.
+    short
+        Applied to intermediate results, which it may replace by shorter ones.
+    switched
+        Indices of constraint equations that modes switch, see `KktFactors.switched`.
+    last
+        Indices of constraint equations that are eliminated after all others, and are dropped
+        where the others already determine them.
     """
     n = len(D)
     M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -200,7 +224,11 @@ def accelerations(
     rows: Constraints,
     short: Callable[[Expr], Expr] = lambda atom: atom,
 ) -> Solution:
-    """Solve for qdd and all multipliers; those of redundant constraints are 0."""
+    """Return the solution of the constrained equations of motion: qdd and all multipliers.
+
+    `b` is tau - bias. The multipliers of redundant constraints are 0. `short` is applied to
+    intermediate results, which it may replace by shorter ones.
+    """
     A = jacobian(tape, rows)
     c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
@@ -233,8 +261,8 @@ def with_mass(
 ) -> tuple[Rows, Sequence[Expr]]:
     """Return D + A^T W A and b + A^T W c where D alone is singular, else D and b.
 
-    Since A a = c, accelerations and multipliers are unchanged. W: the weights of the equations; 1
-    where there are none and a coordinate has no inertia.
+    Since A a = c, accelerations and multipliers are unchanged. W is diagonal with the entries
+    `weights`; if there are none and a coordinate has no inertia, W is the identity.
     """
     n = range(len(D))
     if not weights and all(D[i][i] != 0 for i in n):
@@ -253,7 +281,7 @@ def with_mass(
 def projection(
     tape: Tape, D: Rows, rows: Constraints, q: Sequence[sympy.Symbol]
 ) -> tuple[Vector, Pairs]:
-    """Derive the corrections of q and qd onto the constraints, and the inverse pivots.
+    """Return the corrections that move q and qd onto the constraints, and the inverse pivots.
 
     One Newton step in the metric of D: the smallest dq (in the norm of D) with A dq = -phi, then
     the smallest correction of qd, with the velocity constraints taken at q + dq to first order.
@@ -263,7 +291,7 @@ def projection(
     values : tuple of Expr
         dq (nq), dqd (nq), and the inverse pivot of each constraint that modes do not switch.
     pivots : Pairs
-        Pivots as in `Solution`.
+        Pivots of coordinates, each with the matrix entry that it started from.
     """
     n, A = len(D), jacobian(tape, rows)
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)

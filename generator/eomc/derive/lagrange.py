@@ -49,18 +49,25 @@ MASSLESS = "a motion that nothing resists"
 
 @dataclass(frozen=True)
 class Derivation:
-    """The equations of motion by each method that may lead to the fastest code.
+    """The equations of motion of `system`, by each method that may lead to the fastest code.
 
     Attributes
     ----------
     lagrange : Equations or None
         By differentiation of K and P; None where that method was not used.
     newton_euler : Equations or None
-        By the recursive algorithms; None without bodies on joints.
-    ldl, composite, articulated, multipliers : SolveResult
-        Accelerations by L D L^T of Lagrange's D, by L D L^T of D from composite bodies, by
-        articulated bodies, and by link multipliers. A str gives the reason why a method was not
-        used. None where a method does not apply, as with constraints (see kkt.py).
+        By the recursive Newton-Euler algorithm; None without bodies on joints.
+    ldl : SolveResult
+        Accelerations by L D L^T factorization of the mass matrix that Lagrange's method gives.
+    composite : SolveResult
+        Accelerations by L D L^T factorization of the mass matrix from composite bodies.
+    articulated : SolveResult
+        Accelerations by the articulated-body algorithm.
+    multipliers : SolveResult
+        Accelerations by link multipliers (link_multipliers.py).
+
+    A SolveResult is the solution, or a str with the reason why the method was not used. It is None
+    where the method does not apply, as with constraints (see kkt.py).
     """
 
     system: System
@@ -73,12 +80,17 @@ class Derivation:
 
 
 def derive(system: System) -> Derivation:
-    """Derive the equations of motion of `system` by all methods that apply.
+    """Return the equations of motion of `system`, derived by all methods that apply.
 
-    Raises SceneError where K is not quadratic in the velocities or a coordinate has no inertia.
+    Raises
+    ------
+    SceneError
+        If K is not quadratic in the velocities, or a coordinate has no inertia.
 
-    Sources: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral); C from
-    Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
+    References
+    ----------
+    Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral).
+    Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3 (matrix C).
     """
     lagrange = newton_euler = articulated = composite = multipliers = None
     places = len(needed(system.definitions, (system.kinetic, system.potential)))
@@ -236,8 +248,10 @@ def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
 def inertial_forces(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> list[Expr]:
-    """Derive D qdd + bias of energies on a tape by Lagrange's operator. accelerations: by velocity
-    symbol.
+    """Return D qdd + bias, one force for each coordinate, of the energies on a tape.
+
+    They are derived by Lagrange's operator. `accelerations` maps each velocity symbol to its time
+    derivative.
     """
     tape, q = e.tape, system.q
     momentum_rates = _momenta(system, e, accelerations)[1]

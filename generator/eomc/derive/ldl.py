@@ -19,7 +19,7 @@ MAX_PIVOTS_PER_PRODUCT = 8  # products of 8 pivots from 1e-38 to 1e38 stay in a 
 
 @dataclass(frozen=True)
 class Solution:
-    """The solution of D qdd = tau - bias by one method, on a tape.
+    """The solution of D qdd = tau - bias by one method, as atoms of `tape`.
 
     Attributes
     ----------
@@ -28,14 +28,14 @@ class Solution:
     order : tuple of int
         Coordinates in order of elimination.
     pivots : Pairs
-        Pivots of L diag(pivots) L^T, all positive where D is positive definite, each with a
-        quantity of the size of the terms that it was computed from.
+        Pivots of L diag(pivots) L^T, all positive where D is positive definite, each with the
+        magnitude of the terms that it was computed from.
     matrix : str
-        The matrix that is factored: "D", or "S" for link multipliers.
+        The matrix that is factored: "D", or "S" for link multipliers (see link_multipliers.py).
     multipliers : Vector
         Lagrange multipliers of the constraints; empty without constraints.
     parts : mapping
-        For constraints that modes switch, by index, the two quantities whose ratio is the
+        For constraints that modes switch, by index: the two quantities whose ratio is the
         multiplier, see `Constraint.parts`.
     """
 
@@ -60,11 +60,13 @@ def solve(
     opaque: Callable[[Expr], Expr] = lambda atom: atom,
     short_chains: bool = False,
 ) -> Solution:
-    """Solve D x = b by L diag(d) L^T, unrolled. Zeros are neither stored nor computed with.
+    """Return the solution x of D x = b by L diag(d) L^T, each operation a definition on the tape.
 
-    The next pivot is the one with the fewest entries left in its row (minimum degree), among equals
-    the one known earliest, then the one with the shortest chain of divisions before it: a chain is
-    eliminated from both of its ends, which a processor computes in parallel.
+    Zeros are neither stored nor computed with.
+
+    The next pivot is the one with the fewest entries left in its row (minimum degree). Among equals
+    it is the one known earliest, then the one with the shortest chain of divisions before it. A
+    chain is thus eliminated from both of its ends, which a processor computes in parallel.
 
     With `short_chains`, dependency chains are shorter at the price of more operations. A pivot that
     depends on parameters only is ranked as if its row had one entry less, so that every other pivot
@@ -78,8 +80,12 @@ def solve(
 
     Parameters
     ----------
+    tape : Tape
+        Receives the definitions of the solution.
+    D, b
+        Symmetric matrix by rows, and right-hand side.
     short
-        Rewrites intermediate results, so that terms that cancel are removed.
+        Applied to intermediate results, so that terms that cancel are removed.
     opaque
         Applied to the entries of L. With `Tape.opaque`, each x depends on the one before through
         one operation rather than two.
@@ -140,7 +146,7 @@ def solve(
 
 
 def count_operations(D: Rows) -> int:
-    """Return the number of operations of `solve`, including those on fill-in."""
+    """Return the number of arithmetic operations that `solve` needs for D, including fill-in."""
     neighbours = {i: {j for j, x in enumerate(row) if x != 0 and j != i} for i, row in enumerate(D)}
     total = 0
     while neighbours:

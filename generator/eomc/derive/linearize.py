@@ -29,11 +29,15 @@ STICKS = (
 
 
 def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
-    """Return [da/dq, da/dqd, da/du], (nq, 2 nq + nu), for accelerations a on the tape at constant
-    inputs.
+    """Return the derivatives [da/dq, da/dqd, da/du] of accelerations a at constant inputs.
 
-    By rows, or where that would be long one row: the derivative along the direction whose entries
-    are `tangent_symbols`. Raises SceneError where the accelerations jump.
+    The result has the shape (nq, 2 nq + nu), by rows. Where that would be long it is a single row:
+    the derivative of a along the direction with the components `tangent_symbols(system)`.
+
+    Raises
+    ------
+    SceneError
+        If the accelerations jump.
     """
     entries = tangent_symbols(system)
     if len(entries) * len(tape.live(accelerations)) > UNROLLED_SIZE_LIMIT:
@@ -43,17 +47,18 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
 
 
 def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
-    """Return the derivatives of functions of the state along the direction `tangent_symbols`.
+    """Return the derivative of each value along the direction `tangent_symbols(system)`.
 
-    Raises SceneError where a function jumps.
+    The values are functions of state and inputs on the tape. The direction has one component for
+    each coordinate, velocity and input. Raises SceneError if a value jumps.
     """
     return _slopes(system, tape, values, [tangent_symbols(system)])[0]
 
 
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
-    """Return da/dp, (nq, np), for accelerations a on the tape at constant inputs.
+    """Return the derivatives da/dp of accelerations a with respect to the parameters, (nq, np).
 
-    Raises SceneError where the accelerations jump.
+    Inputs are held constant. Raises SceneError if the accelerations jump.
     """
     entries = [{p.symbol: S.One} for p in system.parameters]
     return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))

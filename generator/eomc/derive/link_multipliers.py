@@ -37,12 +37,25 @@ Row = dict[int, Expr]  # nonzero entries of a sparse row, by column
 
 
 class UnsuitedError(Exception):
-    """Raised with the reason why a system does not consist of point masses on links."""
+    """Raised with the reason why link multipliers do not apply to a system.
+
+    They apply to point masses on links only.
+    """
 
 
 @dataclass(frozen=True)
 class PointMass:
-    """A position with kinetic energy mass*speed^2/2."""
+    """A point mass: a coordinate or position with the kinetic energy mass speed^2/2.
+
+    Attributes
+    ----------
+    place : Expr
+        The position, as an atom of the tape.
+    speed : Symbol
+        Its time derivative.
+    mass : Expr
+        The mass.
+    """
 
     place: Expr
     speed: Symbol
@@ -51,9 +64,20 @@ class PointMass:
 
 @dataclass(frozen=True)
 class LinkGroup:
-    """Increments of one angle phi = sum direction_i q_i: edd = slopes phidd + beta.
+    """The increments e of positions that depend on the same angle phi = sum_i direction_i q_i.
 
-    across: rows n with n . slopes = 0.
+    Their second time derivatives are slopes phidd + beta.
+
+    Attributes
+    ----------
+    direction : (nq,)
+        Weights of the coordinates in the angle.
+    members : tuple of int
+        Indices of the increments.
+    slopes, beta : tuple of Expr
+        For each increment, de/dphi and its second time derivative at qdd = 0.
+    perpendicular : tuple of rows
+        A basis of the rows n with n . slopes = 0.
     """
 
     direction: tuple[Expr, ...]
@@ -64,16 +88,22 @@ class LinkGroup:
 
 
 def prefer_short_chains(system: System) -> bool:
-    """Return True if short dependency chains are preferred to few operations, see `ldl.solve`.
+    """Return True if `ldl.solve` should prefer short dependency chains to few operations.
 
-    In batches, several states are computed in parallel and hide latencies; in single precision,
-    products of pivots would exceed the range of a float.
+    This is not worthwhile in batches, where several states are computed in parallel and hide
+    latencies. In single precision, products of pivots would exceed the range of a float.
     """
     return system.run.real == "double" and not system.run.batch
 
 
 def solution(system: System) -> Solution:
-    """Derive qdd by link multipliers. Raises UnsuitedError where the system is not of this kind."""
+    """Return the accelerations qdd of a system of point masses by link multipliers.
+
+    Raises
+    ------
+    UnsuitedError
+        If the method does not apply to the system.
+    """
     # With more velocities there would be more multipliers than coordinates.
     most = 2 * len(system.q)
     speeds = system.kinetic.atoms(dot) | (system.kinetic.free_symbols & {*system.qd})
@@ -340,7 +370,7 @@ class _Links(Vectors):
     # --- the multipliers -------------------------------------------------------------------------
 
     def solution(self) -> Solution:
-        """Solve for qdd. Its pivots are those of S and all quantities that were divided by."""
+        """Return qdd. Its pivots are those of S and all quantities that were divided by."""
         tape, groups, near = self.tape, self.groups, self.near
         forces, loads = self._forces()
         free = self._accelerations_without_multipliers(forces)

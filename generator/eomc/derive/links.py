@@ -15,7 +15,24 @@ from eomc.model.tree import Tree
 
 
 class Links(Vectors):
-    """The links of a tree on a tape, parents before children."""
+    """The links of a kinematic tree on a tape, parents before children.
+
+    Link k moves relative to its parent by the displacement s_k(q) of its joint: an angle (rad)
+    about the joint's axis where `links[k].turns`, else a length (m) along it.
+
+    Attributes
+    ----------
+    moved, speed, drift
+        For each link, s_k, its time derivative, and its second time derivative at qdd = 0.
+    slopes
+        For each link, the derivatives ds_k/dq by coordinate.
+    cosine, sine
+        For each link, those of the joint's angle; 1 and 0 where the joint does not turn.
+    rotation
+        For each link, the rotation matrix from its frame at s_k = 0 to its parent's frame.
+    arm
+        For each link, the vector from the parent's origin to its own, in the parent's frame.
+    """
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape)
@@ -43,12 +60,16 @@ class Links(Vectors):
 
     @property
     def plain(self) -> bool:
-        """Whether each joint has a coordinate of its own."""
+        """Whether each joint has a coordinate of its own: s_k = q_k."""
         coordinates = {link.q for link in self.links if link.q.is_Symbol}
         return len(coordinates) == self.n
 
     def projected(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
-        """Convert forces along joints to generalized forces: sum_k ds_k/dq f_k."""
+        """Return the generalized force on each coordinate, from the force along each joint.
+
+        `by_link` contains the force f_k (N) or moment (N m) along the joint of each link k. With
+        the joint's displacement s_k, the generalized force on q is sum_k ds_k/dq f_k.
+        """
         terms: dict[Symbol, list[Expr]] = {}
         for slopes, force in zip(self.slopes, by_link, strict=True):
             for q, slope in slopes.items():
@@ -56,7 +77,11 @@ class Links(Vectors):
         return {q: self.add(*forces) for q, forces in terms.items()}
 
     def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
-        """Convert a direction of the coordinates to one of the joints: sum_q ds_k/dq v_q."""
+        """Return the rate of each joint's displacement, from the rate of each coordinate.
+
+        `direction` maps each coordinate q to its rate v_q. With the displacement s_k of the joint
+        of link k, the result for link k is sum_q ds_k/dq v_q.
+        """
         return [
             self.add(*(self.times(slope, direction[q]) for q, slope in slopes.items()))
             for slopes in self.slopes
@@ -65,8 +90,9 @@ class Links(Vectors):
     # --- frames ----------------------------------------------------------------------------------
 
     def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
-        """Rotate a vector of link k's frame by the joint's angle; by the negative angle with
-        `back`.
+        """Return a vector of link k's frame, rotated by the angle of its joint.
+
+        With `back`, it is rotated by the negative angle. A prismatic joint leaves it unchanged.
         """
         if not self.links[k].turns:
             return v
@@ -79,11 +105,11 @@ class Links(Vectors):
         return (out[0], out[1], out[2])
 
     def inwards(self, k: int, v: Vector) -> Vector:
-        """Transform a vector from link k's frame to its parent's frame."""
+        """Return the components in the parent's frame of a vector given in link k's frame."""
         return self.apply(self.rotation[k], self.turn(k, v))
 
     def outwards(self, k: int, v: Vector) -> Vector:
-        """Transform a vector from the parent's frame to link k's frame."""
+        """Return the components in link k's frame of a vector given in its parent's frame."""
         return self.turn(k, self.apply(transposed(self.rotation[k]), v), back=True)
 
     def _arm(self, k: int) -> Vector:
@@ -96,13 +122,16 @@ class Links(Vectors):
         return self.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
-        """Return the vector of length x along link k's joint axis."""
+        """Return the vector of length x along link k's joint axis, in link k's frame."""
         v = list(ZERO)
         v[self.links[k].axis] = x
         return (v[0], v[1], v[2])
 
     def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
-        """Return the angular velocity of each link in its own frame."""
+        """Return the angular velocity of each link, in its own frame (rad/s).
+
+        `rates` are the rates of the joints' displacements.
+        """
         out: list[Vector] = []
         for k, link in enumerate(self.links):
             w = self.outwards(k, out[link.parent]) if link.parent >= 0 else ZERO
@@ -110,8 +139,10 @@ class Links(Vectors):
         return out
 
     def velocities(self, rates: Sequence[Expr], spin: Sequence[Vector]) -> list[Vector]:
-        """Return the velocity of each link's origin in its own frame. spin: the angular
-        velocities.
+        """Return the velocity of each link's origin, in the link's own frame (m/s).
+
+        `rates` are the rates of the joints' displacements; `spin` are the angular velocities of the
+        links, as `angular_velocities` returns them.
         """
         out: list[Vector] = []
         for k, link in enumerate(self.links):

@@ -16,10 +16,16 @@ from eomc.model.system import System
 
 
 def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """Derive mass, centre of mass, momentum and angular momentum about the centre of mass.
+    """Return a tape and, on it, total mass, centre of mass and momenta of all moving bodies.
 
-    All along the world's axes, without the rotors of drives; in the plane m, x, y, px, py, L.
-    Raises SceneError if no moving body has mass. Returns the tape and the values.
+    The values are the mass (kg), the position of the centre of mass (m), the momentum (kg m/s) and
+    the angular momentum about the centre of mass (kg m^2/s), along the world's axes; in the plane
+    m, x, y, px, py, L. The rotors of drives do not count.
+
+    Raises
+    ------
+    SceneError
+        If no moving body has mass.
     """
     tape = Tape(leaves(system, *system.qdd))
     sweep = Sweep(tape, system, [f for f in system.frames if f.mass != 0])

@@ -30,10 +30,19 @@ from eomc.model.tree import Link, Tree
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass, first moment and inertia (symmetric, by (i, j) with i <= j) about a frame's origin.
+    """Mass, first moment and inertia tensor of a link about the origin of a frame.
 
-    Grouped as by Gautier and Khalil: parameters that have the same effect on the motion as those of
-    the parent are moved to the parent.
+    The parameters of links are grouped (Gautier and Khalil): those that have the same effect on the
+    motion as parameters of the parent are moved to the parent.
+
+    Attributes
+    ----------
+    mass : Expr
+        Mass (kg).
+    moment : Vector
+        Mass times the position of the centre of mass (kg m).
+    inertia : mapping
+        Entries (i, j), i <= j, of the symmetric inertia tensor (kg m^2); absent entries are 0.
     """
 
     mass: Expr
@@ -41,16 +50,16 @@ class Inertia:
     inertia: Mapping[tuple[int, int], Expr]
 
     def entry(self, i: int, j: int) -> Expr:
-        """Return I_ij."""
+        """Return the entry (i, j) of the inertia tensor."""
         return self.inertia.get((min(i, j), max(i, j)), S.Zero)
 
     @property
     def tensor(self) -> list[list[Expr]]:
-        """I by rows."""
+        """The 3 x 3 inertia tensor by rows."""
         return [[self.entry(i, j) for j in range(3)] for i in range(3)]
 
     def is_zero(self) -> bool:
-        """Return True if mass, first moment and inertia are all zero."""
+        """Return True if mass, first moment and inertia tensor are zero."""
         return self.mass == 0 and self.moment == ZERO and not any(self.inertia.values())
 
 
@@ -63,7 +72,22 @@ class _Forces:
 
 
 class Recursion(Links):
-    """A tree on a tape: grouped inertias and the recursive algorithms."""
+    """A kinematic tree on a tape, with the recursive algorithms of its dynamics.
+
+    The algorithms are recursive Newton-Euler (bias, gravity forces, inverse dynamics) and composite
+    bodies (mass matrix). Forces "by link" are those along the joint of each link, in N or N m.
+
+    Attributes
+    ----------
+    gravity : Vector
+        Acceleration of gravity in the world's axes (m/s^2).
+    armature
+        For each link, the inertia of its drive's rotor, added to that along the joint.
+    inertia : list of Inertia
+        For each link, its inertial parameters after grouping.
+    fixed_moment : Vector
+        First moment (kg m) of mass that is fixed in the world.
+    """
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape, tree)
@@ -179,11 +203,15 @@ class Recursion(Links):
         return self.tape.scaled(S(2), x)
 
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
-        """Return (t, c e) for rotating the 2 x 2 matrix [[first, b], [b', second]], with across = b
-        + b'.
+        """Return the terms by which a rotation about joint k's axis changes a 2 x 2 matrix.
 
-        With e = s (first - second) + c across and t = s e, the diagonal becomes first - t, second +
-        t, and the off-diagonal entries change by c e - across.
+        The matrix is [[first, b], [b', second]], and across = b + b'. With c and s of the joint's
+        angle, e = s (first - second) + c across and t = s e, the diagonal becomes first - t,
+        second + t, and the off-diagonal entries change by c e - across.
+
+        Returns
+        -------
+        t, c e
         """
         c, s = self.cosine[k], self.sine[k]
         e = self.add(self.times(s, self.add(first, self.minus(second))), self.times(c, across))
@@ -194,8 +222,11 @@ class Recursion(Links):
     def forces(
         self, rates: Sequence[Expr], joint_accelerations: Sequence[Expr], gravity: bool = True
     ) -> _Forces:
-        """Return the force and moment that each link needs for given joint rates and
-        accelerations.
+        """Return the force (N) and moment (N m) on each link that given joint motions need.
+
+        They are in the link's own frame, the moment about its origin. `rates` and
+        `joint_accelerations` are the first and second time derivatives of the joint displacements.
+        Without `gravity`, the forces do not support the links' weight.
         """
         out = _Forces([], [])
         spin = self.angular_velocities(rates)
@@ -274,8 +305,9 @@ class Recursion(Links):
     # --- inwards: joint forces -------------------------------------------------------------------
 
     def joint_forces(self, forces: _Forces) -> list[Expr]:
-        """Return the force along each joint: the sum of the forces beyond it, projected onto its
-        axis.
+        """Return the force along each joint that gives the links the forces `forces`.
+
+        It is the sum of the forces on all links beyond the joint, projected onto its axis.
         """
         f, n = list(forces.force), list(forces.moment)
         out: list[Expr] = [S.Zero] * self.n
@@ -289,22 +321,28 @@ class Recursion(Links):
         return out
 
     def bias(self) -> list[Expr]:
-        """Return C qd + g, by link."""
+        """Return C qd + g as the force along each joint."""
         return self._forces_for(self.drift)
 
     def inverse_dynamics(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
-        """Return D qdd + C qd + g, by link, for the accelerations qdd along the joints."""
+        """Return D qdd + C qd + g as the force along each joint.
+
+        `joint_accelerations` is qdd along the joints, as `by_link` returns it.
+        """
         return self._forces_for(
             [self.add(*pair) for pair in zip(joint_accelerations, self.drift, strict=True)]
         )
 
     def gravity_forces(self) -> list[Expr]:
-        """Return g, by link."""
+        """Return g, the forces along the joints that hold the tree at rest against gravity."""
         rest = [S.Zero] * self.n
         return self.joint_forces(self.forces(rest, rest))
 
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
-        """Return D v, by link, without forming D."""
+        """Return D v as the force along each joint, without forming D.
+
+        `direction` is v along the joints, as `by_link` returns it.
+        """
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
 
@@ -320,7 +358,10 @@ class Recursion(Links):
     # --- D by composite bodies -------------------------------------------------------------------
 
     def mass_matrix(self) -> list[list[Expr]]:
-        """Return D by links, with zeros between branches, by the composite-body algorithm."""
+        """Return the mass matrix by the composite-body algorithm, with one row and column per link.
+
+        It refers to the displacements of the joints. Entries between different branches are 0.
+        """
         beyond = list(self.inertia)
         for k in reversed(range(self.n)):
             if (p := self.links[k].parent) >= 0:
@@ -345,7 +386,10 @@ class Recursion(Links):
         return D
 
     def count_elimination_operations(self) -> int:
-        """Return the operations to factor D and solve with it, using its zeros between branches."""
+        """Return the number of operations to factor D and solve with it.
+
+        Zeros between different branches of the tree are not computed with.
+        """
         depth = [0] * self.n
         for k, link in enumerate(self.links):
             depth[k] = depth[link.parent] + 1 if link.parent >= 0 else 0
@@ -354,7 +398,7 @@ class Recursion(Links):
     # --- energies --------------------------------------------------------------------------------
 
     def kinetic_energy(self) -> Expr:
-        """Return the kinetic energy of the tree."""
+        """Return the kinetic energy of the tree, including that of its armatures (J)."""
         rates = self.speed
         spin = self.angular_velocities(rates)
         terms: list[Expr] = []
@@ -370,7 +414,7 @@ class Recursion(Links):
         return self.add(*terms)
 
     def potential_energy(self) -> Expr:
-        """Return the potential energy of the tree in gravity: -g . sum(mass times position)."""
+        """Return the potential energy of the tree in gravity (J): -g . sum(mass times position)."""
         mass = [x.mass for x in self.inertia]
         moment = [x.moment for x in self.inertia]
         total = self.fixed_moment

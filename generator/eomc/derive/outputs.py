@@ -18,16 +18,17 @@ from eomc.model.system import System, t
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs and their derivatives as atoms of a tape.
+    """The outputs of a scene and their derivatives, as atoms of the tape `tape`.
 
     Attributes
     ----------
     values : (ny,)
         The outputs.
     slopes : (ny, 3 nq + nu)
-        Derivatives with respect to q, qd, u and qdd.
+        Derivatives with respect to q, qd, u and qdd. Rows are empty where none were requested.
     sensitivity : (ny, np)
-        Derivatives with respect to the parameters, all others constant.
+        Derivatives with respect to the parameters at constant q, qd, u and qdd. Rows are empty
+        where none were requested.
     """
 
     tape: Tape
@@ -42,19 +43,20 @@ def outputs(
     extra_symbols: Sequence[Symbol] = (),
     base: tuple[Tape, Mapping[Symbol, Expr]] | None = None,
 ) -> Outputs:
-    """Derive the system's outputs, and their derivatives if `with_derivatives`.
+    """Return the system's outputs, with their derivatives if `with_derivatives`.
 
     Parameters
     ----------
     extra_symbols
         Symbols that outputs may contain in addition to those of the system.
     base
-        A tape to continue, with the atoms of some symbols on it. A new tape by default.
+        A tape to continue, and the atoms on it of symbols that outputs may contain. A new tape by
+        default.
 
     Raises
     ------
     SceneError
-        Where a derivative is needed that does not exist.
+        If a derivative is needed that does not exist, since a function jumps.
     """
     stages = leaves(system, *system.qdd, *extra_symbols)
     tape, known = base or (Tape(stages), {})
@@ -71,7 +73,10 @@ def outputs(
 
 
 def signal_slopes(system: System) -> Outputs:
-    """Derive the inputs' signals as outputs, with derivatives along q, qd and qdd."""
+    """Return the signals of the inputs, with their derivatives with respect to q, qd and qdd.
+
+    A signal is the formula of an input. The result has the form of outputs of the scene.
+    """
     signals = tuple(Output(i.name, i.signal) for i in system.inputs)
     return outputs(replace(system, outputs=signals, inputs=()), with_derivatives=True)
 

@@ -27,7 +27,12 @@ class NotDifferentiableError(EomcError):
 
 
 class Stage(IntEnum):
-    """The binding time of a value: the latest of those that it depends on."""
+    """The binding time of a value: when it can be computed.
+
+    It is the latest binding time of the symbols that the value depends on. NUMBER is known when
+    code is generated, PARAMETER once for each set of parameters, TIME from t and the inputs,
+    POSITION from q, VELOCITY from q and qd.
+    """
 
     NUMBER = 0
     PARAMETER = 1
@@ -42,14 +47,24 @@ _Varying = tuple[tuple[Symbol, Expr], ...]  # powers of names that do not depend
 
 @dataclass(frozen=True)
 class RootSlope:
-    """The derivative of s**p with 0 < p < 1, p s**(p - 1), bounded by p/least where s is 0.
+    """The bounded derivative of a root s**p, 0 < p < 1, by which the derivative of s is multiplied.
 
-    It is multiplied by the derivative of s. Where s is 0 and smooth, or constant nearby, that
-    derivative is 0, and for p >= 1/2 so is the product, since s is of second order. For p < 1/2 the
-    derivative of the root is infinite, unless a factor of the root is 0: `at_zero` is added along
-    each of the `leaves`. The derivative of a root of |x| is infinite too: it is taken along x, with
-    the sign of one side at 0. What is left of the bound in a result makes it infinite, see
-    `Tape._overflowing`.
+    The derivative p s**(p - 1) is bounded by p/least where s is 0. Where s is 0 and smooth, or
+    constant nearby, the derivative of s is 0, and for p >= 1/2 so is the product, since s is of
+    second order. For p < 1/2 the derivative of the root is infinite, unless a factor of the root is
+    0. The derivative of a root of |x| is infinite too: it is taken along x, with the sign of one
+    side at 0. What is left of the bound in a result makes it infinite, see `Tape._overflowing`.
+
+    Attributes
+    ----------
+    slope : Expr
+        The bounded derivative.
+    along : Symbol
+        The name with respect to which it is taken.
+    at_zero : Expr
+        A term that is added for each symbol in `leaves`: nonzero where s is 0, for p < 1/2.
+    leaves : tuple of Symbol
+        The symbols without definition that s depends on.
     """
 
     slope: Expr
@@ -59,18 +74,18 @@ class RootSlope:
 
 
 class Tape:
-    """Definitions in order, each a sum, a product or a function of earlier names.
+    """A list of named definitions, each a sum, a product or a function of earlier names.
 
     `define` takes any expression and returns its atom: a number, a name, or a number times a name.
-    Right-hand sides are in a normal form: a sum of atoms, a product of powers of names, or one
-    function of atoms.
+    Definitions are in a normal form: a sum of atoms, a product of powers of names, or one function
+    of atoms. Equal expressions have the same name.
 
     Parameters
     ----------
     leaves : mapping of Symbol to Stage
-        The symbols that are not defined by others.
-    still : set of Symbol
-        Leaves that count as constant: all gradients along them are 0.
+        The symbols that have no definition, such as coordinates and parameters, and their stages.
+    constant_leaves : set of Symbol
+        Leaves that count as constant: all gradients with respect to them are 0.
     """
 
     def __init__(
@@ -99,7 +114,10 @@ class Tape:
     # --- definitions ---------------------------------------------------------------------------
 
     def define(self, expr: Expr) -> Expr:
-        """Return the atom of `expr`: a number, a name, or a number times a name."""
+        """Add `expr` to the tape and return its atom: a number, a name, or a number times a name.
+
+        A subexpression that already has a name is not defined again.
+        """
         if expr.is_Symbol or expr.is_number:
             return expr
         if expr.is_Add:
@@ -120,8 +138,10 @@ class Tape:
         return name
 
     def named(self, expr: Expr, name: str) -> Expr:
-        """Define `expr` under a name that products do not expand. Numbers and leaves are returned
-        as they are.
+        """Define `expr` under a name of its own, which products do not expand, and return the name.
+
+        `name` is a hint for the name of the variable in generated code. Numbers and leaves are
+        returned as they are.
         """
         atom = self.define(expr)
         factor, symbol = split(atom)
@@ -134,7 +154,7 @@ class Tape:
         return symbol
 
     def opaque(self, atom: Expr) -> Expr:
-        """Return the atom as a name, or minus a name, that products do not expand."""
+        """Return a name, or minus a name, for the atom; products do not expand its definition."""
         factor, symbol = split(atom)
         if symbol is None:
             return atom
@@ -144,16 +164,19 @@ class Tape:
         return self.scaled(factor, symbol)
 
     def stage_of(self, atom: Expr) -> Stage:
-        """Return the binding time of an atom."""
+        """Return the stage of an atom: when it can be computed."""
         symbol = split(atom)[1]
         return Stage.NUMBER if symbol is None else self.stage[symbol]
 
     def is_sine(self, symbol: Symbol) -> bool:
-        """Return True if the name stands for a sine."""
+        """Return True if the name is defined as a sine."""
         return isinstance(self._rhs.get(symbol), sympy.sin)
 
     def rhs(self, symbol: Symbol) -> Expr:
-        """Return the definition of a name as a SymPy expression. Raises KeyError for a leaf."""
+        """Return the definition of a name as a SymPy expression of earlier names.
+
+        Raises KeyError if `symbol` is a leaf, which has no definition.
+        """
         if symbol not in self._rhs:
             if symbol in self.weights:
                 terms = [self.scaled(w, name) for name, w in self.weights[symbol].items()]
@@ -194,7 +217,7 @@ class Tape:
         return self.powers.get(symbol) or {symbol: S.One}
 
     def scaled(self, number: Expr, atom: Expr) -> Expr:
-        """Return a number times an atom."""
+        """Return the atom of a number times an atom."""
         factor, symbol = split(atom)
         factor = number if factor is S.One else number * factor
         if symbol is None or factor is S.Zero:
@@ -255,7 +278,7 @@ class Tape:
         return result
 
     def times(self, first: Expr, second: Expr) -> Expr:
-        """Return the product of two atoms."""
+        """Return the atom of the product of two atoms."""
         (a, x), (b, y) = split(first), split(second)
         if x is None:
             return self.scaled(a, second)
@@ -272,7 +295,7 @@ class Tape:
         return self.scaled(a * b, product)
 
     def total(self, atoms: Iterable[Expr]) -> Expr:
-        """Return the sum of atoms."""
+        """Return the atom of the sum of `atoms`."""
         weights: dict[Symbol, Expr] = {}
         constant: Expr = S.Zero
         for atom in atoms:
@@ -398,8 +421,9 @@ class Tape:
     # --- derivatives -----------------------------------------------------------------------------
 
     def live(self, atoms: Iterable[Expr], stop: Set[Symbol] = frozenset()) -> list[Symbol]:
-        """Return the names that `atoms` depend on, in order. Definitions of names in `stop` are not
-        followed.
+        """Return the defined names that `atoms` depend on, in the order of their definition.
+
+        Names in `stop` are returned, but not the names in their definitions.
         """
         names: set[Symbol] = set()
         queue = [s for atom in atoms for s in atom.free_symbols]
@@ -412,14 +436,14 @@ class Tape:
         return sorted(names, key=self._number.__getitem__)
 
     def leaves_of(self, atoms: Iterable[Expr]) -> set[Symbol]:
-        """Return the leaves that `atoms` depend on."""
+        """Return the leaves (symbols without definition) that `atoms` depend on."""
         atoms = list(atoms)
         parts = (self.parts[n] for n in self.live(atoms))
         symbols = {s for atom in atoms for s in atom.free_symbols}.union(*parts)
         return symbols & self.leaves.keys()
 
     def partial(self, symbol: Symbol, part: Symbol) -> Expr:
-        """Return the partial derivative of a definition with respect to a name in it."""
+        """Return the partial derivative of the definition of `symbol` by the name `part` in it."""
         key = (symbol, part)
         if key not in self._partial:
             if symbol in self.weights:
@@ -436,9 +460,21 @@ class Tape:
     def forward(
         self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr], least: Expr | None = None
     ) -> list[Expr]:
-        """Return the directional derivatives sum_k d(output)/d(leaf_k) seed_k (forward mode).
+        """Return the derivative of each output along a direction, by forward differentiation.
 
-        With `least`, the derivatives of roots are bounded, see `RootSlope`.
+        Parameters
+        ----------
+        outputs
+            Atoms of the tape.
+        seeds
+            The direction: its component along each leaf; 0 along leaves that are absent.
+        least
+            Bound of the roots in derivatives of roots, see `RootSlope`. None for no bound.
+
+        Returns
+        -------
+        list of Expr
+            sum_k d(output)/d(leaf_k) seed_k of each output.
         """
         tangent: dict[Symbol, Expr] = dict(seeds)
         for symbol in self.live(outputs):
@@ -462,10 +498,23 @@ class Tape:
         stop: Set[Symbol] = frozenset(),
         least: Expr | None = None,
     ) -> list[Expr]:
-        """Return sum_k seed_k d(output_k)/d(name) for each name in `wrt` (reverse mode).
+        """Return the gradient of a weighted sum of outputs, by reverse differentiation.
 
-        `outputs` are (output, seed) pairs. Names in `stop` are independent variables: their
-        definitions are not differentiated. `least` as in `forward`.
+        Parameters
+        ----------
+        outputs
+            Pairs of an atom and its weight, the seed.
+        wrt
+            The names with respect to which the derivatives are taken.
+        stop
+            Names that are independent variables: their definitions are not differentiated.
+        least
+            Bound of the roots in derivatives of roots, see `RootSlope`. None for no bound.
+
+        Returns
+        -------
+        list of Expr
+            sum_k seed_k d(output_k)/d(name) for each name in `wrt`.
         """
         terms: dict[Symbol, list[Expr]] = {}
         for output, seed in outputs:
@@ -607,7 +656,7 @@ class Tape:
         return self.times(atom, self.define(beyond**4))
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
-        """Return the outputs with leaves replaced by `values`."""
+        """Return the atoms of the outputs with leaves replaced by the atoms `values`."""
         new: dict[Symbol, Expr] = dict(values)
         for symbol in self.live(outputs):
             changed = {part: new[part] for part in self.parts[symbol] if part in new}

@@ -15,21 +15,24 @@ AXES = ((1, 2), (2, 0), (0, 1))  # for each axis, the other two in cyclic order
 
 
 class Vectors:
-    """Sums and products of vectors on a tape that leave out zeros."""
+    """Operations on numbers and vectors on a tape, which leave out zeros.
+
+    The arguments and results are atoms of the tape: numbers, names, or numbers times a name.
+    """
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
 
     def define(self, e: Expr) -> Expr:
-        """Return the atom of an expression."""
+        """Return the atom of an expression: its value on the tape."""
         return self.tape.define(e)
 
     def add(self, *terms: Expr) -> Expr:
-        """Return the sum of the terms."""
+        """Return the sum of the terms, 0 without terms."""
         return self.tape.total([x for x in terms if x is not S.Zero])
 
     def times(self, a: Expr, b: Expr) -> Expr:
-        """Return a b."""
+        """Return the product a b of two atoms."""
         return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
 
     def minus(self, a: Expr) -> Expr:
@@ -47,18 +50,18 @@ class Vectors:
         return (x, y, z)
 
     def dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
-        """Return a . b."""
+        """Return the scalar product a . b."""
         return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
 
     def cross(self, a: Sequence[Expr], b: Sequence[Expr]) -> Vector:
-        """Return a x b."""
+        """Return the vector product a x b."""
         x, y, z = (
             self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
         )
         return (x, y, z)
 
     def apply(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
-        """Return R v."""
+        """Return the product R v of a 3 x 3 matrix, given by rows, and a vector."""
         x, y, z = (self.dot(row, v) for row in R)
         return (x, y, z)
 

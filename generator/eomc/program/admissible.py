@@ -21,14 +21,22 @@ MAX_ERROR_RATIO = 2  # a route with more than twice the rounding error of anothe
 
 @dataclass(frozen=True)
 class Candidate:
-    """A function by one route: outputs and (pivot, diagonal) pairs on a tape, and names for them.
+    """One way to compute a function: its results as atoms of `tape`, the result of one route.
+
+    A route is a method of derivation, see routes.py.
 
     Attributes
     ----------
+    outputs
+        The results.
+    checks
+        Pairs (pivot, diagonal entry); every pivot must be positive.
+    labels
+        Names for the outputs, then for pivots and diagonal entries.
     order
         Coordinates in order of elimination.
     multipliers
-        Lagrange multipliers of the constraints, for accelerations.
+        Lagrange multipliers of the constraints; for accelerations only.
     parts
         For constraints that modes switch, see `Solution.parts`.
     """
@@ -43,9 +51,10 @@ class Candidate:
 
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
-    """Lower a function by each route and return the one with the fewest operations.
+    """Return the function `name` by the route with the fewest operations.
 
-    Routes with significantly larger rounding errors than another are excluded.
+    Routes with significantly larger rounding errors than another are excluded. `routes` maps the
+    name of each route to its candidate.
     """
     lowered = {
         way: lower(name, r.tape, r.outputs, system.names, checks=r.checks, labels=r.labels)
@@ -103,5 +112,5 @@ def _errors(function: Function, system: System, states: Iterable[int]) -> list[f
 
 
 def weight(cost: Cost) -> int:
-    """Return the cost of a call in units of one addition."""
+    """Return the cost of one call of a function, in units of the cost of one addition."""
     return cost.adds + cost.multiplications + 8 * cost.divisions + 25 * (cost.sincos + cost.calls)

@@ -41,7 +41,20 @@ MAX_ROTATION_ERROR = 0.5  # rad: axis equations satisfied at more have a wrong r
 
 @dataclass(frozen=True)
 class Start:
-    """Consistent initial values: configuration in doubles, q in forty digits, velocities."""
+    """Consistent initial values of a system with constraints.
+
+    Attributes
+    ----------
+    configuration : Configuration
+        Constraints and their derivatives at the initial coordinates.
+    q : (nq,)
+        The coordinates in forty digits.
+    qd : (nq,)
+        The velocities.
+    may_have_changed_branch : bool
+        Whether small steps from the guess did not converge but longer ones did, so that the loops
+        may be closed on another branch than that of the guess.
+    """
 
     configuration: Configuration
     q: Sequence[Any]
@@ -50,10 +63,16 @@ class Start:
 
 
 def assembled(system: System) -> System:
-    """Return the system with consistent initial values, redundant constraints marked and `closure`.
+    """Return the system with initial values that satisfy its constraints.
 
-    A system without constraints, or one that is assembled already, is returned unchanged. Raises
-    SceneError where fixed values violate constraints, or constraints contradict one another.
+    In the result, constraints that others imply are marked as redundant, and `closure` summarises
+    the assembly. A system without constraints, or one that is assembled already, is returned
+    unchanged.
+
+    Raises
+    ------
+    SceneError
+        If fixed values violate constraints, or constraints contradict one another.
     """
     if not system.constraints:
         return system

@@ -19,7 +19,11 @@ _Pair = tuple[str, str, Expr]  # (name, name, ratio of the second weight to the 
 
 
 def reduce_operations(d: ScheduleBuilder, ends: list[Operand]) -> None:
-    """Reduce the operations of a function without changing its results."""
+    """Rewrite the assignments of `d` so that the function needs fewer operations.
+
+    The results of the function are unchanged. `ends` lists them as operands, which are rewritten
+    in place.
+    """
     _scale(d, ends)
     d.drop(ends)
     _absorb(d, ends)

@@ -22,7 +22,11 @@ from eomc.program.lower import lower
 
 
 def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
-    """Yield the additional functions of a system with constraints. taken: its accelerations."""
+    """Yield the functions that a system with constraints has in addition, if it has constraints.
+
+    `taken` is the candidate that was selected for the accelerations; the multipliers are computed
+    with it.
+    """
     system = derived.system
     if not system.constraints:
         return
@@ -55,8 +59,9 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
 
 
 def of_rows(derived: Derivation) -> Iterator[Function]:
-    """Yield residuals, Jacobian and rates of the constraints, which the assembly of a start
-    needs.
+    """Yield the functions for residuals, Jacobian and rates of the constraint equations.
+
+    The assembly of initial values evaluates them.
     """
     system, e = derived.system, _equations(derived)
     assert e.rows is not None
@@ -107,7 +112,11 @@ def _reactions(system: System) -> Function:
 def weighted(
     functions: Mapping[str, Function], system: System, values: Mapping[str, float]
 ) -> list[tuple[float, list[float]]]:
-    """Return (weight, gradient) of the constraints that make D regular. Raises as `evaluate`."""
+    """Return (weight, gradient) of each constraint equation that is added to make D regular.
+
+    With a weight w and gradient a, D + sum_k w_k a_k a_k^T is regular. The list is empty where D is
+    regular by itself. `values` contains coordinates and parameters by name. Raises as `evaluate`.
+    """
     closure = system.closure
     if closure is None or not closure.weights:
         return []

@@ -36,14 +36,22 @@ SAMPLE_DISTANCE = 0.1  # of these configurations, relative to the largest coordi
 
 
 def key(row: Constraint) -> str:
-    """Return the scene key of a constraint."""
+    """Return the key of a constraint in its scene (TOML file), such as "loop.knee"."""
     return f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
 
 
 def of_positions(
     manifold: Manifold, free: Flags, configuration: Configuration
 ) -> Iterator[Problem]:
-    """Report why the positions cannot be assembled, from the configuration where assembly ended."""
+    """Yield the problem that explains why no positions satisfy the constraints.
+
+    Parameters
+    ----------
+    free
+        For each coordinate, whether its initial value may change.
+    configuration
+        Where the assembly of initial values ended.
+    """
     system = manifold.system
     step = TangentSpace(configuration, free, manifold.holonomic).truncated_correction(
         configuration.phi
@@ -104,7 +112,17 @@ def of_positions(
 def of_rates(
     manifold: Manifold, free: Flags, place: Configuration, q: Sequence[Any], rates: Vector
 ) -> Iterator[Problem]:
-    """Report initial velocities that violate the constraints; `rates` minimise the residual."""
+    """Yield the problem that explains why the initial velocities violate the constraints.
+
+    Parameters
+    ----------
+    free
+        For each coordinate, whether its initial velocity may change.
+    place
+        The configuration at the start, with the coordinates `q` in forty digits.
+    rates
+        Velocities with the smallest residual.
+    """
     system = manifold.system
     if clash := _inconsistent_set(manifold, place):
         yield _inconsistent_rates(manifold, clash, place)
@@ -238,10 +256,10 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Configuration) -> boo
 
 
 def powers(system: System) -> list[int]:
-    """Return constraints whose formulas show that their gradient vanishes wherever they hold.
+    """Return the indices of constraints whose gradient vanishes wherever they are satisfied.
 
-    These are powers above 1, sums of even powers with coefficients of one sign, and expanded
-    powers.
+    They are recognised by their formulas: powers above 1, sums of even powers with coefficients of
+    one sign, and expanded powers.
     """
     indices, coordinates = [], {*system.q}
     for k, c in enumerate(system.constraints):
@@ -260,8 +278,9 @@ def powers(system: System) -> list[int]:
 
 
 def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
-    """Report constraints whose gradient vanishes wherever they hold; all constraints if `flat` is
-    empty.
+    """Yield a problem for each constraint in `flat`, whose gradient vanishes where it holds.
+
+    If `flat` is empty, one problem covers all constraints.
     """
     for row in [system.constraints[k] for k in flat]:
         base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
@@ -282,7 +301,10 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
 
 
 def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration) -> Problem:
-    """Report coordinates that move without inertia and without a constraint that fixes them."""
+    """Return a problem for coordinates that move without inertia and without a constraint on them.
+
+    `massless` contains the indices of the coordinates.
+    """
     system, random = manifold.system, np.random.default_rng(7)
     names = [system.coordinates[k].name for k in massless]
     nearby = manifold.configuration(
@@ -305,7 +327,7 @@ def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration
 
 
 def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
-    """Report expressions that have no value, or no gradient, at a start."""
+    """Yield a problem for each constraint or energy that has no value, or no gradient, at `q`."""
     system, count = manifold.system, 0
     for k, c in enumerate(system.constraints):
         manifold_of_one = Manifold(replace(system, constraints=(c,)))

@@ -28,7 +28,7 @@ _DOUBLES: Mapping[str, Callable[..., Any]] = {
 
 @cache
 def context() -> Any:
-    """Return the mpmath context with 40 digits."""
+    """Return the mpmath context with 40 digits, in which exact values are computed."""
     mp = mpmath.mp.clone()
     mp.dps = 40
     return mp
@@ -49,7 +49,7 @@ def _many_digits() -> Mapping[str, Callable[..., Any]]:
 def evaluate(
     function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
 ) -> tuple[list[float], bool]:
-    """Evaluate a function.
+    """Return the results of a function at one state, and whether its matrix is regular there.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def evaluate(
     results : list of float
         The outputs.
     regular : bool
-        Whether all pivots are positive beyond rounding.
+        Whether all pivots are positive beyond rounding errors.
 
     Raises
     ------
@@ -78,14 +78,18 @@ def evaluate(
 def evaluator(
     function: Function, exact: bool = False, unit: float = 2.0**-52
 ) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
-    """Return `evaluate` for one function and many states, with its numbers converted once."""
+    """Return a function of `values` with the results of `evaluate`.
+
+    It is faster than `evaluate` for many states, since the numbers in `function` are converted
+    once.
+    """
     run, atom = _steps(function, _many_digits() if exact else _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
     checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
     tolerance = 8 * unit * max(1, len(checks))
 
     def evaluate_at(values: Mapping[str, float]) -> tuple[list[float], bool]:
-        """Evaluate the function at one state."""
+        """Return the results at one state, and whether all pivots are positive beyond rounding."""
         known = run(values)
         try:
             results = [float(c * known[n]) for c, n in outputs]
@@ -102,17 +106,17 @@ def evaluator(
 
 
 def exact_evaluator(function: Function) -> Callable[[Mapping[str, Any]], list[Any]]:
-    """Return a function that evaluates `function` in 40 digits without rounding the results.
+    """Return a function that computes the results of `function` in 40 digits, not rounded.
 
-    The values by name are floats or mpmath numbers. Raises ArithmeticError or ValueError where a
-    result is not a finite real number.
+    It takes values by name, which are floats or mpmath numbers. It raises ArithmeticError or
+    ValueError if a result is not a finite real number.
     """
     mp = context()
     run, atom = _steps(function, _many_digits())
     outputs = [atom(o) for o in function.outputs]
 
     def evaluate_at(values: Mapping[str, Any]) -> list[Any]:
-        """Evaluate the function at one state."""
+        """Return the results at one state, in 40 digits."""
         known = run(values)
         results = [mp.mpmathify(c * known[n]) for c, n in outputs]
         if not all(isinstance(x, mp.mpf) and mp.isfinite(x) for x in results):
@@ -171,16 +175,16 @@ def _call(known: Mapping[str, Any], operation: Callable[..., Any], args: Sequenc
 def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], list[float]]:
     """Return a function that bounds the rounding error of each result, in units of rounding.
 
-    To first order, the bound is sum |d result/d v| |v| over all inputs, numbers, terms of sums and
-    intermediate values v (Higham, *Accuracy and Stability of Numerical Algorithms*, sec. 3.1), by
-    one reverse pass per result. Raises as `evaluate`.
+    It takes values by name. To first order, the bound is sum |d result/d v| |v| over all inputs,
+    numbers, terms of sums and intermediate values v (Higham, *Accuracy and Stability of Numerical
+    Algorithms*, sec. 3.1), computed by one reverse pass per result. It raises as `evaluate`.
     """
     run, atom = _steps(function, _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
     steps = [(a.name, *_linearize(a.value)) for a in (*function.early, *function.body)]
 
     def bound(known: Mapping[str, float], coefficient: float, name: str) -> float:
-        """Return the bound for the result coefficient * name."""
+        """Return the bound of the rounding error of the result coefficient * (value of `name`)."""
         slopes, total = {name: coefficient}, 0.0
         for value, size, partials in reversed(steps):
             slope = slopes.pop(value, 0.0)
@@ -191,7 +195,7 @@ def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], li
         return total + sum(abs(slope * known[n]) for n, slope in slopes.items())
 
     def evaluate_at(values: Mapping[str, float]) -> list[float]:
-        """Evaluate the bounds at one state."""
+        """Return the bound of each result's rounding error at one state, in units of rounding."""
         known = run(values)
         bounds = [bound(known, c, n) for c, n in outputs]
         if not all(map(math.isfinite, bounds)):
@@ -247,8 +251,10 @@ def _linearize(
 
 
 def nearby(system: System, k: int) -> dict[str, float]:
-    """Return values by name at the k-th of a series of states around the start, which is state
-    0.
+    """Return the values of parameters, coordinates, velocities and t at the k-th test state.
+
+    The keys are their names. State 0 is the start; the others lie around it, farther away for
+    larger k.
     """
     out = {p.name: p.value for p in system.parameters} | {t.name: 0.0}
     for i, c in enumerate(system.coordinates):

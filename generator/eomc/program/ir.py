@@ -16,40 +16,49 @@ from eomc.derive.tape import Stage
 
 @dataclass(frozen=True)
 class Sum:
-    """constant + sum of coefficient times name."""
+    """A right-hand side: a constant plus a sum of products of a coefficient and a name.
+
+    `terms` contains the pairs (coefficient, name).
+    """
 
     terms: tuple[tuple[Expr, str], ...]
     constant: Expr = S.Zero
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names on this right-hand side, repeated as often as they occur."""
+        """The names in the sum, repeated as often as they occur."""
         return tuple([n for _, n in self.terms])
 
 
 @dataclass(frozen=True)
 class Product:
-    """coefficient times a product of names; integer powers are repeated names."""
+    """A right-hand side: coefficient times a product of names.
+
+    Integer powers are written as repeated names.
+    """
 
     coefficient: Expr
     factors: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names on this right-hand side, repeated as often as they occur."""
+        """The names in the product, repeated as often as they occur."""
         return self.factors
 
 
 @dataclass(frozen=True)
 class Call:
-    """A function of atoms: "reciprocal", "sqrt", "pow" or one of the functions of scenes."""
+    """A right-hand side: a function of operands.
+
+    `function` is "reciprocal", "sqrt", "pow", "pivot_inverse" or one of the functions of scenes.
+    """
 
     function: str
     args: tuple[Operand, ...]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names on this right-hand side, repeated as often as they occur."""
+        """The names in the arguments, repeated as often as they occur."""
         return tuple([a.name for a in self.args if a.name])
 
 
@@ -66,7 +75,15 @@ Value = Sum | Product | Call
 
 @dataclass(frozen=True)
 class Assignment:
-    """name = value, with its binding time. `named`: the name is meaningful to a reader."""
+    """A statement "name = value" of a function.
+
+    Attributes
+    ----------
+    stage
+        The binding time: when the value can be computed, see `Stage`.
+    named
+        Whether the name is meaningful to a reader.
+    """
 
     name: str
     value: Value
@@ -76,7 +93,11 @@ class Assignment:
 
 @dataclass(frozen=True)
 class Cost:
-    """Operations of one call, without those that depend on parameters only."""
+    """Number of operations of one call of a function.
+
+    Operations that depend on parameters only are not counted, since they are precomputed. `calls`
+    counts square roots and other functions of the mathematics library.
+    """
 
     adds: int = 0
     multiplications: int = 0
@@ -86,7 +107,7 @@ class Cost:
 
     @property
     def flops(self) -> int:
-        """Additions, multiplications and divisions."""
+        """The number of additions, multiplications and divisions."""
         return self.adds + self.multiplications + self.divisions
 
     def __str__(self) -> str:
@@ -103,7 +124,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Function:
-    """One function of the generated code.
+    """One function of the generated code, as a list of assignments.
 
     Attributes
     ----------
@@ -114,11 +135,11 @@ class Function:
     outputs
         The results; matrices by rows.
     checks
-        (pivot, diagonal) pairs; all pivots must be positive.
+        Pairs (pivot, diagonal entry); all pivots must be positive.
     cost
-        Operations of one call.
+        Number of operations of one call.
     route, routes
-        The route that was selected, and the cost of each route.
+        The method of derivation (route) that was selected, and the cost with each route.
     """
 
     name: str
@@ -132,7 +153,7 @@ class Function:
 
     @cached_property
     def uses(self) -> frozenset[str]:
-        """All names that the function reads and does not compute."""
+        """The names of all values that the function reads and does not compute."""
         computed = {a.name for a in (*self.early, *self.body)}
         names = {n for a in (*self.early, *self.body) for n in a.value.names}
         results = [*self.outputs, *(o for pair in self.checks for o in pair)]
@@ -140,7 +161,7 @@ class Function:
 
 
 def rename(function: Function, new_names: Mapping[str, str]) -> Function:
-    """Return the function with some of its values renamed."""
+    """Return the function with its values renamed: `new_names` maps old names to new ones."""
 
     def new_name(name: str) -> str:
         return new_names.get(name, name)
@@ -164,7 +185,7 @@ def rename(function: Function, new_names: Mapping[str, str]) -> Function:
 
 
 def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
-    """Return a right-hand side with its names replaced."""
+    """Return a right-hand side with each of its names replaced by `real(name)`."""
     if isinstance(value, Sum):
         return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
     if isinstance(value, Product):

@@ -24,13 +24,17 @@ def lower(
     checks: Sequence[tuple[Expr, Expr]] = (),
     labels: Sequence[str] = (),
 ) -> Function:
-    """Return the function that computes `outputs`, with `checks` that must be positive.
+    """Return the function that computes `outputs`, the atoms of a tape, as a list of assignments.
 
     Parameters
     ----------
+    name
+        Name of the function.
     reserved
         Names that no value may have. They include names that the function does not read, since
         values of several functions may share a struct with parameters.
+    checks
+        Pairs (pivot, diagonal entry) of atoms; the function fails unless all pivots are positive.
     labels
         Names for the outputs, then for pivots and diagonal entries, where they have none.
     """

@@ -49,9 +49,21 @@ def _max_abs(x: Vector) -> float:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Constraints at q (nq,) and t: phi (m,), 0 for nonholonomic ones; A (m, nq); D (nq, nq).
+    """The constraint equations of a system at the coordinates `q` and the time `t`.
 
-    For constraints with a rotation error, phi is the rotation vector and A its Jacobian.
+    Attributes
+    ----------
+    q : (nq,)
+        The coordinates.
+    t : float
+        The time (s).
+    phi : (m,)
+        Residuals of the constraint equations; 0 for nonholonomic ones. For the axis equations of a
+        loop, the components of the rotation error vector (rad).
+    A : (m, nq)
+        Jacobian of `phi`; for nonholonomic constraints, the coefficients of the velocities.
+    D : (nq, nq)
+        Mass matrix.
     """
 
     q: Vector
@@ -62,7 +74,7 @@ class Configuration:
 
     @cached_property
     def singular(self) -> bool:
-        """Whether D alone is not positive definite."""
+        """Whether the mass matrix D alone is not positive definite."""
         diagonal = np.diag(self.D)
         if np.all(diagonal > 0):
             scale = 1 / np.sqrt(diagonal)
@@ -77,7 +89,7 @@ class Configuration:
 
     @property
     def weights(self) -> Vector:
-        """Weights (m,) of the constraints in `metric` where D is singular; powers of two."""
+        """Weight (m,) of each constraint equation in `metric` if D is singular, a power of 2."""
         diagonal, size = np.diag(self.D), np.sum(self.A**2, axis=1)
         known = diagonal > 0
         mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
@@ -85,7 +97,10 @@ class Configuration:
 
     @cached_property
     def metric(self) -> Vector:
-        """Return D, or D + sum_r weights[r] A_r^T A_r where D is singular."""
+        """The matrix (nq, nq) that defines lengths of directions in coordinate space.
+
+        It is D, or D + sum_r weights[r] A_r^T A_r where D is singular.
+        """
         return self.metric_of(range(len(self.A)))
 
     def metric_of(self, rows: Sequence[int]) -> Vector:
@@ -104,30 +119,36 @@ class Configuration:
 
     @cached_property
     def sizes(self) -> Vector:
-        """Scale sqrt(A D^-1 A^T) (m,) of each constraint; 1 where that is 0."""
+        """The scale sqrt(A D^-1 A^T) (m,) of each constraint equation; 1 where that is 0.
+
+        It is the inverse of the root of the equation's effective mass.
+        """
         B = np.linalg.solve(np.linalg.cholesky(self.metric), self.A.T)
         sizes = np.sqrt(np.sum(B**2, axis=0))
         return np.where(sizes > 0, sizes, 1.0)
 
     @property
     def slopes(self) -> Vector:
-        """Norm sqrt(A D^-1 A^T) (m,) of each constraint's gradient."""
+        """The norm sqrt(A D^-1 A^T) (m,) of each constraint equation's gradient."""
         return np.where(np.any(self.A != 0, axis=1), self.sizes, 0.0)
 
     @cached_property
     def levels(self) -> Vector:
-        """Change (m,) of each constraint when every coordinate changes by its own magnitude."""
+        """The change (m,) of each residual if every coordinate changes by its own magnitude."""
         scale = np.sqrt(np.diag(self.metric))
         return self.sizes * float(np.linalg.norm(scale * self.q) + 1e-3 * np.max(scale))
 
     @cached_property
     def residual_norm(self) -> float:
-        """Norm of the scaled constraint residuals, as a length."""
+        """The Euclidean norm of the constraint residuals, each divided by its scale in `sizes`."""
         return float(np.linalg.norm(self.phi / self.sizes))
 
 
 class TangentSpace:
-    """The tangent space of the constraints `rows` over the coordinates `free`."""
+    """Directions of the `free` coordinates along which the constraints `rows` stay satisfied.
+
+    Lengths are in the metric of the configuration.
+    """
 
     def __init__(self, configuration: Configuration, free: Flags, rows: Sequence[int]) -> None:
         self.configuration, self.free, self.rows = configuration, np.flatnonzero(free), list(rows)
@@ -138,7 +159,10 @@ class TangentSpace:
 
     @cached_property
     def parts(self) -> tuple[Vector, Vector, Vector]:
-        """Singular value decomposition (U, s, V^T) of B = U diag(s) V^T."""
+        """The singular value decomposition (U, s, V^T) of B = U diag(s) V^T.
+
+        B is the Jacobian of the scaled constraint equations, in an orthonormal basis of the metric.
+        """
         U, s, V = np.linalg.svd(self.B, full_matrices=False)
         return np.asarray(U), np.asarray(s), np.asarray(V)
 
@@ -154,18 +178,26 @@ class TangentSpace:
         return whole
 
     def correction(self, values: Vector, damping: float = 0.0) -> Vector:
-        """Return the damped minimum-norm direction (nq,) that changes the residuals by -values."""
+        """Return the minimum-norm direction (nq,) along which the residuals change by -values.
+
+        `values` contains a residual for each constraint equation of the system. A positive damping
+        shortens the direction where the gradients are nearly dependent.
+        """
         aim = values[self.rows] / self.configuration.sizes[self.rows]
         return -self._from_metric(self.B.T @ self._inverse(aim, damping))
 
     def truncated_correction(self, values: Vector) -> Vector:
-        """Return the minimum-norm least-squares correction (nq,), by a truncated SVD."""
+        """Return the minimum-norm direction (nq,) along which the residuals change best by -values.
+
+        `values` contains a residual for each constraint equation of the system. The least-squares
+        solution is found by a singular value decomposition, without its smallest singular values.
+        """
         U, s, V = self.parts
         aim = values[self.rows] / self.configuration.sizes[self.rows]
         return -self._from_metric(V.T @ (U.T @ aim / np.where(s > RANK_TOLERANCE, s, np.inf)))
 
     def projected(self, direction: Vector) -> Vector:
-        """Return the projection (nq,) of a direction onto the tangent space."""
+        """Return the projection (nq,) of a direction onto the tangent space, in the metric."""
         y = self.L.T @ direction[self.free]
         for _ in range(2):
             y = y - self.B.T @ self._inverse(self.B @ y, 0.0)
@@ -177,7 +209,10 @@ class TangentSpace:
 
 
 class Manifold:
-    """The constraints of a system, at the default values of its parameters."""
+    """The constraint equations of a system, evaluated at the default values of its parameters.
+
+    The set of coordinates that satisfy them is the constraint manifold.
+    """
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -202,7 +237,7 @@ class Manifold:
 
     @cached_property
     def reads(self) -> Flags:
-        """Whether each constraint depends on each coordinate, or its velocity (m, nq)."""
+        """Whether each constraint depends on each coordinate or its velocity, (m, nq)."""
         outputs = self.functions["constraint_jacobian"].outputs
         return np.array([o.coefficient != 0 for o in outputs]).reshape(len(self.rows), -1)
 
@@ -211,7 +246,10 @@ class Manifold:
         return {**self._fixed, t.name: time, **moving}
 
     def value(self, name: str, q: Vector, qd: Vector, time: float) -> Vector:
-        """Evaluate a function in doubles; NaN where it has no value."""
+        """Return the results of the function `name` at a state, in doubles.
+
+        They are NaN if the function has no value there.
+        """
         if name not in self._plain:
             self._plain[name] = evaluator(self.functions[name])
         try:
@@ -220,19 +258,22 @@ class Manifold:
             return np.full(len(self.functions[name].outputs), np.nan)
 
     def exact_value(self, name: str, q: Sequence[Any], qd: Sequence[Any], time: float) -> list[Any]:
-        """Evaluate a function in forty digits."""
+        """Return the results of the function `name` at a state, in forty digits.
+
+        Raises ArithmeticError or ValueError if the function has no value there.
+        """
         if name not in self._exact:
             self._exact[name] = exact_evaluator(self.functions[name])
         values: list[Any] = self._exact[name](self._values(q, qd, time))
         return values
 
     def has_values(self, q: Vector, time: float = 0.0) -> bool:
-        """Whether the constraints, their Jacobian and D are finite."""
+        """Return True if the constraints, their Jacobian and D are finite at q and a time."""
         names = ("constraints", "constraint_jacobian", "D")
         return all(np.all(np.isfinite(self.value(name, q, 0 * q, time))) for name in names)
 
     def configuration(self, q: Vector, time: float = 0.0) -> Configuration | None:
-        """Return the configuration at q and a time; None where a function has no value."""
+        """Return the constraint equations at q and a time; None where a function has no value."""
         n, rest, phi = len(q), np.zeros(len(q)), self._residuals(q, time)
         A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
         for rows, vector, slopes in self._rotation_vectors(q, time):
@@ -253,7 +294,7 @@ class Manifold:
 
     @cached_property
     def typical_gradients(self) -> Vector:
-        """Largest Euclidean norm (m,) of each constraint's gradient near the start."""
+        """Largest Euclidean norm (m,) of each constraint's gradient at states near the start."""
         random, n = np.random.default_rng(3), len(self.system.q)
         start = np.array([c.start for c in self.system.coordinates])
         norms = np.zeros((NEARBY_SAMPLES, len(self.rows)))
@@ -298,7 +339,11 @@ class Manifold:
             yield list(rows), e, J
 
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
-        """Return the first-order rounding error (m,) of each residual; 0 where one has no value."""
+        """Return the first-order rounding error (m,) of each result of the function `name`.
+
+        These are the residuals of the constraints, or their rates for "constraint_rates". All
+        errors are 0 if the function has no value there.
+        """
         if name not in self._rounding:
             self._rounding[name] = rounding_evaluator(self.functions[name])
         try:
@@ -312,9 +357,24 @@ class Manifold:
     ) -> tuple[Configuration | None, bool]:
         """Solve the holonomic constraints for the free coordinates by a damped Gauss-Newton method.
 
-        Steps are of minimum norm. strict: steps are shortened until the residuals follow their
-        tangent to MAX_NONLINEARITY; else until they decrease. Returns the last configuration, None
-        without values at q, and whether the iteration converged.
+        Steps are of minimum norm in the metric of D.
+
+        Parameters
+        ----------
+        q : (nq,)
+            Where the iteration starts.
+        free : (nq,)
+            For each coordinate, whether it may change.
+        strict : bool
+            Shorten steps until the residuals follow their tangent to MAX_NONLINEARITY, so that the
+            iteration stays on the branch of `q`; otherwise only until the residuals decrease.
+
+        Returns
+        -------
+        configuration : Configuration or None
+            The last configuration; None without values at q.
+        converged : bool
+            Whether the iteration converged.
         """
         configuration = self.configuration(q, time)
         if configuration is None:
@@ -347,7 +407,7 @@ class Manifold:
         return configuration, False
 
     def rounded(self, configuration: Configuration) -> bool:
-        """Whether the residuals are within the rounding errors of doubles."""
+        """Return True if the residuals are within the rounding errors of doubles."""
         off, limit = np.abs(configuration.phi), EPS * configuration.levels
         if not np.all(off <= ROUNDING_FACTOR * limit):
             limit = np.maximum(
@@ -380,8 +440,8 @@ class Manifold:
     ) -> Configuration:
         """Return the configuration on the manifold that is locally closest to a guess.
 
-        Steps in the tangent space towards the guess, each corrected onto the manifold, until the
-        distance no longer decreases.
+        Steps go in the tangent space towards the guess, each corrected onto the manifold, until the
+        distance no longer decreases. Only the free coordinates change.
         """
         for _ in range(100):
             frame = TangentSpace(configuration, free, self.holonomic)
@@ -404,7 +464,10 @@ class Manifold:
         return configuration
 
     def refine(self, configuration: Configuration, free: Flags) -> tuple[list[Any], bool]:
-        """Return q in forty digits and whether it converged, from a solution in doubles."""
+        """Return q in forty digits and whether the iteration converged, from a solution in doubles.
+
+        The free coordinates are changed so that the holonomic constraints are satisfied.
+        """
         rest = [0] * len(configuration.q)
 
         def phi(q: list[Any]) -> list[Any]:
@@ -421,8 +484,10 @@ class Manifold:
     def rates(
         self, configuration: Configuration, q: list[Any], qd: Vector, free: Flags
     ) -> tuple[list[Any], bool]:
-        """Return qd in forty digits, by the least change of the free velocities, and whether it
-        converged.
+        """Return qd in forty digits, and whether the iteration converged.
+
+        The free velocities change as little as possible so that the constraints are satisfied at
+        the coordinates `q`, which are given in forty digits.
         """
 
         def rates(qd: list[Any]) -> list[Any]:

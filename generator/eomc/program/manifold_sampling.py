@@ -16,7 +16,11 @@ MAX_CORRECTION = 0.1  # of the return to the manifold, relative to the step
 def random_walk(
     manifold: Manifold, start: Configuration, positions: int
 ) -> Iterator[Configuration]:
-    """Yield configurations that satisfy the constraints, by small steps in random directions."""
+    """Yield configurations that satisfy the constraints, by small steps in random directions.
+
+    At most `positions` configurations are yielded, fewer if the system cannot move. Time advances
+    too, if the constraints depend on it.
+    """
     random = np.random.default_rng(17)
     free = np.ones(len(start.q), dtype=bool)
     span = manifold.system.run.duration if manifold.timed else 0.0
@@ -65,8 +69,10 @@ def random_walk(
 def trace_branch(
     manifold: Manifold, start: Configuration, max_step: float = MAX_STEP, sign: int = 1
 ) -> Iterator[Configuration]:
-    """Yield configurations along one branch, each a small step from the last, in the direction
-    `sign` (1 or -1).
+    """Yield configurations along a branch of the manifold, each a small step from the last.
+
+    `sign` (1 or -1) selects the direction from the start. `max_step` limits the steps, in the units
+    of the coordinates.
     """
     free, configuration, step = np.ones(len(start.q), dtype=bool), start, INITIAL_STEP
     tangent = np.random.default_rng(17).normal(size=len(start.q)) / np.sqrt(np.diag(start.metric))
@@ -89,8 +95,10 @@ def trace_branch(
 def step_on_manifold(
     manifold: Manifold, place: Configuration, tangent: Vector, drift: float, free: Flags
 ) -> Configuration | None:
-    """Return the configuration after a step; None where the step may be too long to stay on the
-    branch.
+    """Return the configuration after one step along `tangent`, corrected onto the manifold.
+
+    None if the step may be too long to stay on the same branch. `place` is where the step begins,
+    `drift` the increase of time (s), and `free` marks the coordinates that may change.
     """
     predicted = manifold.configuration(place.q + tangent, place.t + drift)
     if predicted is None:

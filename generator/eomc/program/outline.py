@@ -23,7 +23,7 @@ PIECE = 500  # weight of an outlined function, within a third
 
 @dataclass(frozen=True)
 class Piece:
-    """An outlined function: consecutive assignments of another function.
+    """An outlined function: a part of a long function, emitted as a function of its own.
 
     Attributes
     ----------
@@ -32,9 +32,9 @@ class Piece:
     outputs
         Indices of these results in the original function.
     reads
-        Values that earlier pieces compute.
+        Names of the values that earlier pieces compute and this one reads.
     keeps
-        Values that later pieces read.
+        Names of the values of this piece that later pieces read.
     """
 
     function: Function
@@ -49,7 +49,7 @@ def weight(function: Function) -> int:
 
 
 def is_large(function: Function) -> bool:
-    """Return True if a function is long enough to be split."""
+    """Return True if a function is long enough to be split into outlined functions."""
     return weight(function) > LARGE
 
 
@@ -63,8 +63,8 @@ def _weight(a: Assignment) -> int:
 def split(function: Function, piece: int) -> tuple[Piece, ...]:
     """Split a function into outlined functions of about `piece` operations.
 
-    The assignments and their relative order are unchanged, so results are identical to the last
-    bit. Values that cross a boundary count as named.
+    Their assignments in order are those of `function`, so results are identical to the last bit.
+    Values that are passed from one to another count as named.
     """
     assignments = _paired((*function.early, *function.body))
     ends = _cuts(assignments, piece)
@@ -149,7 +149,7 @@ def _angle(a: Assignment) -> tuple[Operand, ...]:
 
 
 def with_names(function: Function, names: frozenset[str]) -> Function:
-    """Return the function with the given values marked as named."""
+    """Return the function with the values `names` marked as named: meaningful to a reader."""
 
     def marked(run: tuple[Assignment, ...]) -> tuple[Assignment, ...]:
         return tuple(replace(a, named=True) if a.name in names else a for a in run)
@@ -160,7 +160,8 @@ def with_names(function: Function, names: frozenset[str]) -> Function:
 def split_precomputed(function: Function, parameters: Sequence[str]) -> tuple[Function, Function]:
     """Split off the assignments that depend on parameters only, as a function `prepare`.
 
-    Its results include parameters that the remaining function reads. Returns (prepare, remaining).
+    The results of `prepare` include the `parameters` (names) that the remaining function reads.
+    Returns the pair (prepare, remaining function).
     """
     early = {*parameters, *(a.name for a in function.early)}
     is_early = [not pair[0].name or pair[0].name in early for pair in function.checks]

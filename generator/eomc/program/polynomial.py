@@ -28,11 +28,14 @@ MAX_INTERMEDIATE_TERMS = 8 * MAX_TERMS  # before cancellation
 
 
 class TooLargeError(Exception):
-    """Raised where a polynomial has too many terms to be worth expanding."""
+    """Raised if a polynomial has too many terms to be worth expanding."""
 
 
 class Expander:
-    """Expands definitions of a tape to polynomials, which are stored and used by every function."""
+    """Expansion of definitions on a tape to polynomials; results are stored for later calls.
+
+    `tape` is a list of named definitions, see `Tape`.
+    """
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
@@ -41,10 +44,10 @@ class Expander:
         self.symbols: dict[str, Symbol] = {}
 
     def expand(self, outputs: Sequence[Expr]) -> list[Expr] | None:
-        """Expand the outputs to polynomials in leaves and functions; None where they become too
-        large.
+        """Return the outputs expanded to polynomials in leaves and functions.
 
-        sin^2 + cos^2 = 1 is applied wherever it shortens a sum.
+        None if the polynomials become too large. sin^2 + cos^2 = 1 is applied wherever it shortens
+        a sum.
         """
         try:
             polynomials = [self.atom(output) for output in outputs]
@@ -55,22 +58,20 @@ class Expander:
         return [self.built(polynomial) for polynomial in polynomials]
 
     def short(self, atom: Expr) -> Expr:
-        """Expand an atom if that leaves few terms, so that terms cancel; else return it
-        unchanged.
-        """
+        """Return an atom, expanded if that leaves few terms, so that terms cancel."""
         if (out := self.expand([atom])) is not None and len(self.atom(atom)) <= 8:
             return out[0]
         return atom
 
     def atom(self, atom: Expr) -> Polynomial:
-        """Return the polynomial of an atom."""
+        """Return the polynomial of an atom, as a coefficient for each monomial."""
         factor, symbol = split(atom)
         if symbol is None:
             return {(): factor} if factor != 0 else {}
         return {m: factor * c for m, c in self.symbol(symbol).items()}
 
     def symbol(self, symbol: Symbol) -> Polynomial:
-        """Return the polynomial of a name. Raises TooLargeError."""
+        """Return the polynomial of a name on the tape. Raises TooLargeError."""
         if symbol not in self.known:
             live = self.tape.live([symbol])
             if not self.large.isdisjoint(live):
@@ -165,7 +166,10 @@ class Expander:
     # --- back on the tape ------------------------------------------------------------------------
 
     def built(self, polynomial: Polynomial) -> Expr:
-        """Write a polynomial to the tape with parameters collected and common factors extracted."""
+        """Write a polynomial to the tape and return its atom.
+
+        Parameters are collected and common factors extracted.
+        """
         coefficients: dict[Monomial, list[Expr]] = {}
         for monomial, c in polynomial.items():
             constant = [p for p in monomial if self._stage(p[0]) <= Stage.PARAMETER]

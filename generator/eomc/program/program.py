@@ -46,11 +46,11 @@ class Program:
     functions
         The functions by name.
     notes
-        Where unusual terms of K appear in the equations.
+        Sentences that say where unusual terms of the kinetic energy appear in the equations.
     order
-        Coordinates in order of elimination.
+        Indices of the coordinates in order of elimination.
     passed_over
-        Routes to the accelerations that were not used, with the reason.
+        Methods of derivation (routes) that were not used for the accelerations, with the reason.
     """
 
     system: System
@@ -73,9 +73,14 @@ class Program:
 
 
 def build(derived: Derivation) -> Program:
-    """Build the program of a system's equations, each function by its cheapest route.
+    """Return the program of a system's equations: each function by its cheapest route.
 
-    Raises SceneError where [run] requests something that is not possible for this system.
+    A route is a method of derivation, see routes.py.
+
+    Raises
+    ------
+    SceneError
+        If the table [run] of the scene requests something that is not possible for this system.
     """
     system, material = derived.system, RouteInputs(derived)
     by_route = {r.name: f for r in ROUTES.values() if (f := r.functions(material))}
@@ -115,8 +120,16 @@ def build(derived: Derivation) -> Program:
 
 
 def accelerations(material: RouteInputs) -> tuple[Function, Candidate, dict[str, str]]:
-    """Return the accelerations by their cheapest route, its candidate, and the routes not used,
-    with reasons.
+    """Return the function for the accelerations by its cheapest route.
+
+    Returns
+    -------
+    function
+        The function "acceleration".
+    candidate
+        Its results on the tape, for functions that are derived from it.
+    passed_over
+        For each route that was not used, the reason.
     """
     solutions = {r.name: r.accelerations(material) for r in ROUTES.values()}
     system = material.derived.system
@@ -319,7 +332,7 @@ def _jumps(program: Program) -> str:
 
 
 def inertia(program: Program) -> list[Problem]:
-    """Return a warning if D is not positive definite at the start.
+    """Return a warning if the mass matrix D is not positive definite at the start, else nothing.
 
     Raises SceneError if D is not positive definite at states around the start either.
     """
@@ -363,8 +376,10 @@ def inertia(program: Program) -> list[Problem]:
 
 
 def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[list[float]]:
-    """Return D or C, (nq, nq), at the given values by name, in Python floats. Raises as
-    `evaluate`.
+    """Return the mass matrix D or the Coriolis matrix C, (nq, nq), at one state, in Python floats.
+
+    `name` is "D" or "C"; `values` contains coordinates, velocities and parameters by name. Raises
+    as `evaluate`.
     """
     names = [c.name for c in program.system.coordinates]
     n = len(names)

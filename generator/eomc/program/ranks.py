@@ -48,35 +48,36 @@ MAX_SETS = 4000  # sets that are compared; with more, constraints are dropped on
 
 @dataclass(frozen=True)
 class Ranks:
-    """The rank of the constraints and the equations to solve with.
+    """The rank of a system's constraints, and the equations to solve with.
 
     Attributes
     ----------
     rank : int
-        Rank of all constraints almost everywhere.
+        Rank of all constraint equations almost everywhere.
     left_out : tuple of int
-        Constraints that others imply.
+        Constraints that others imply, by index.
     shared : tuple of int
         Constraints whose multipliers are not unique.
     good : bool
         Whether some set of equations is independent at all sampled configurations.
     sigma : (float, float)
-        Smallest over largest nonzero singular value, at the start and at the worst configuration.
+        Smallest over largest nonzero singular value of the scaled Jacobian, at the start and at the
+        worst configuration.
     positions : int
         Number of sampled configurations.
     weights : tuple of float
-        Weight of each constraint that makes D regular; empty where D is regular.
+        Weight of each constraint that makes D regular; empty where D is regular by itself.
     slopes : tuple of float
-        Largest A D^-1 A^T of each constraint.
+        Largest A D^-1 A^T of each constraint equation.
     latest : float
-        Time of the last configuration, s.
+        Time of the last configuration (s).
     flat : tuple of int
-        Constraints whose gradient vanishes wherever they hold.
+        Constraints whose gradient vanishes wherever they are satisfied.
     massless_coordinates : tuple of int
-        Coordinates that neither inertia nor a constraint fixes.
+        Coordinates that neither inertia nor a constraint determines.
     sums : tuple of tuple of float
-        Where `good` is false for single constraints, weighted sums of `shared` that are
-        independent.
+        If no set of single constraints is `good`: weighted sums of `shared` that are independent,
+        as the weight of each constraint.
     """
 
     rank: int
@@ -94,7 +95,10 @@ class Ranks:
 
 
 def ranks(manifold: Manifold, start: Configuration) -> Ranks:
-    """Compute the rank of the constraints around an assembled start."""
+    """Return the rank of the constraints, and the equations to solve with.
+
+    They are computed at configurations on a random walk from the assembled start.
+    """
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()

@@ -26,7 +26,10 @@ MAX_EXPANDED_DEFINITIONS = 120  # definitions that C depends on, up to which it 
 
 
 class RouteInputs:
-    """Inputs of all routes: a derivation, and Lagrange's equations expanded."""
+    """The inputs of all routes: a derivation, and Lagrange's equations expanded to polynomials.
+
+    A route is a method by which a function is derived.
+    """
 
     def __init__(self, derived: Derivation) -> None:
         self.derived = derived
@@ -35,7 +38,10 @@ class RouteInputs:
 
     @cached_property
     def expanded(self) -> tuple[Tape, Rows, Sequence[Expr]] | None:
-        """D and b of D qdd = b, expanded on the tape; None where they become too large."""
+        """D and b of D qdd = b by Lagrange's method, expanded to polynomials on the tape.
+
+        The tape, D by rows, and b; None if they become too large.
+        """
         if self.lagrange is None or self.expander is None:
             return None
         D, n = self.lagrange.D, len(self.lagrange.bias)
@@ -52,7 +58,15 @@ class RouteInputs:
 
 @dataclass(frozen=True)
 class Functions:
-    """Outputs of functions by name, on a tape; notes: where unusual terms of K appear."""
+    """Functions of the equations of motion by one route, as atoms of `tape`.
+
+    Attributes
+    ----------
+    outputs
+        The results of each function, by its name.
+    notes
+        Sentences that say where unusual terms of the kinetic energy appear.
+    """
 
     tape: Tape
     outputs: Mapping[str, Sequence[Expr]]
@@ -71,21 +85,22 @@ def _by_ldl(system: System, order: str) -> str:
 
 @dataclass(frozen=True)
 class Route:
-    """A method for the accelerations, for the other functions, or for both.
+    """A method to derive the accelerations, the other functions of the motion, or both.
 
     Attributes
     ----------
     sentence
         A description for users.
     accelerations
-        Returns qdd; a str gives the reason why the route is not used; None where it does not apply.
+        Returns the solution for qdd, a str with the reason why the route is not used, or None where
+        it does not apply.
     functions
         Returns the other functions; None where the route does not apply.
     solved
         Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system
-        and the order of elimination.
+        and the names of the coordinates in order of elimination.
     penalty
-        A factor on the operation count for disadvantages that it does not include.
+        A factor on the operation count, for disadvantages that the count does not include.
     """
 
     name: str

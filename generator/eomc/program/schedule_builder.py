@@ -10,7 +10,19 @@ from eomc.program.ir import Assignment, Operand, Product, Sum, Value, renamed_va
 
 
 class ScheduleBuilder:
-    """Right-hand sides by name, with the binding time and the preferred name of each."""
+    """The assignments of one function while they are simplified and put in order.
+
+    Attributes
+    ----------
+    values
+        The right-hand side of each name.
+    stages
+        The binding time (see `Stage`) of each name.
+    hints
+        A preferred name for some of the names.
+    known
+        The name of each right-hand side.
+    """
 
     def __init__(self) -> None:
         self.values: dict[str, Value] = {}
@@ -20,7 +32,7 @@ class ScheduleBuilder:
         self.made = 0
 
     def new(self, value: Value) -> str:
-        """Return the name of a value, adding it under a new name if it has none."""
+        """Return the name of a right-hand side, adding it under a new name if it has none."""
         if value not in self.known:
             self.made += 1
             self.put(f"_n{self.made:06d}", value)
@@ -39,18 +51,18 @@ class ScheduleBuilder:
         self.stages[name] = self.stage(value)
 
     def stage(self, value: Value) -> Stage:
-        """Return the binding time of a value."""
+        """Return the binding time of a right-hand side: when it can be computed."""
         return max((self.stages[n] for n in value.names), default=Stage.NUMBER)
 
     def uses(self, ends: Iterable[Operand]) -> Counter[str]:
-        """Count how often each name is read."""
+        """Return how often each name is read, by right-hand sides and by the results `ends`."""
         uses: Counter[str] = Counter(o.name for o in ends if o.name)
         for value in self.values.values():
             uses.update(value.names)
         return uses
 
     def drop(self, ends: Iterable[Operand]) -> None:
-        """Remove values that no output depends on."""
+        """Remove the values that none of the results `ends` depends on."""
         needed: set[str] = set()
         queue = [o.name for o in ends if o.name]
         while queue:
@@ -62,13 +74,16 @@ class ScheduleBuilder:
         self.known = {v: n for n, v in reversed(self.values.items())}
 
     def sort(self) -> None:
-        """Put definitions before their uses and update their binding times."""
+        """Put definitions before their uses, and update their binding times."""
         self.values = {name: self.values[name] for name in _in_order(self.values)}
         for name, value in self.values.items():
             self.stages[name] = self.stage(value)
 
     def assignments(self, ends: list[Operand]) -> list[Assignment]:
-        """Return the assignments by binding time, without aliases."""
+        """Return the assignments, sorted by binding time and without copies of other values.
+
+        `ends` are the results of the function; names of copies in them are replaced.
+        """
         aliases: dict[str, Operand] = {}
         for name, value in self.values.items():
             single: Operand | None = None

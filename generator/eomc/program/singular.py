@@ -27,12 +27,18 @@ GOLDEN = (5**0.5 - 1) / 2
 
 @dataclass(frozen=True)
 class ClosestSingularity:
-    """The configuration closest to a singularity.
+    """The configuration closest to a singularity, for a mechanism with one degree of freedom.
 
-    sigma: smallest over largest nonzero singular value of the constraint Jacobian, 0 at a singular
-    configuration. q: the coordinates there. Constraints are scaled by their largest inverse inertia
-    along the motion and coordinates by the metric of D, so that a constraint whose gradient
-    vanishes is detected.
+    Constraint equations are scaled by their largest inverse inertia along the motion, and
+    coordinates by the metric of D, so that a constraint whose gradient vanishes is detected.
+
+    Attributes
+    ----------
+    sigma : float
+        Smallest over largest nonzero singular value of the scaled constraint Jacobian; 0 at a
+        singular configuration.
+    q : dict
+        The coordinates by name.
     """
 
     sigma: float
@@ -44,7 +50,7 @@ class ClosestSingularity:
 
 
 def closest_singularity(system: System) -> ClosestSingularity | None:
-    """Find the configuration closest to a singularity along the motion of an assembled system.
+    """Return the configuration closest to a singularity along the motion of an assembled system.
 
     None for more than one degree of freedom, and for constraints that depend on velocities or time.
     Among equally close configurations, the one that is reached first is returned.

@@ -16,8 +16,9 @@ from eomc.program.ir import Assignment, Call, Function, Operand, Sum, Value
 
 @dataclass(frozen=True)
 class Angle:
-    """An angle, offset + sum of coefficient times coordinate, and the names of its sine and
-    cosine.
+    """An angle, offset + sum of coefficient times coordinate, and the names of its sine and cosine.
+
+    `terms` contains the pairs (coefficient, coordinate).
     """
 
     terms: tuple[tuple[Expr, str], ...]
@@ -29,8 +30,10 @@ class Angle:
 def separate_angles(
     function: Function, coordinates: Collection[str]
 ) -> tuple[tuple[Angle, ...], Function]:
-    """Separate the angles that depend on coordinates only. Returns them and the function without
-    them.
+    """Remove the sines and cosines of angles that depend on coordinates only from a function.
+
+    `coordinates` are the names of the coordinates. Returns the angles, and the function, which then
+    reads the sines and cosines.
     """
     values = {a.name: a.value for a in function.body}
     by_argument: dict[tuple[Operand, ...], dict[str, str]] = {}
@@ -49,7 +52,10 @@ def separate_angles(
 
 
 def names_of_pair(names: Mapping[str, str]) -> tuple[str, str]:
-    """Return names for sine and cosine of an angle, of which only one may exist."""
+    """Return the names of the sine and of the cosine of an angle.
+
+    `names` maps "sin" and "cos" to names that exist; the other one is derived from it.
+    """
     sine = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
     return sine, names.get("cos") or names["sin"].replace("sin", "cos") + "_"
 

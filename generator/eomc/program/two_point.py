@@ -29,9 +29,16 @@ MAX_INLINED_OPERATIONS = 400  # of a step, up to which its parts are inlined
 
 @dataclass(frozen=True)
 class Parts:
-    """The two parts of an acceleration, both without expressions that depend on parameters only.
+    """An acceleration split into two functions, each without assignments of parameters only.
 
-    handed: names of the values that `configuration` computes and `velocity` reads.
+    Attributes
+    ----------
+    configuration
+        The function of the coordinates.
+    velocity
+        The function of the state, which reads the results of `configuration`.
+    handed
+        Names of the values that `configuration` computes and `velocity` reads.
     """
 
     configuration: Function
@@ -40,15 +47,20 @@ class Parts:
 
     @property
     def short(self) -> bool:
-        """Whether both parts are inlined, by the operations of a step."""
+        """Whether both functions are short enough to be inlined in a step."""
         weight = 2 * outline.weight(self.configuration) + 4 * outline.weight(self.velocity)
         return weight <= MAX_INLINED_OPERATIONS
 
 
 def split(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
-    """Split an acceleration that reads the sines of `angles`; None where a split has no advantage.
+    """Return an acceleration split into its parts; None where a split has no advantage.
 
-    fixed: names of values that depend on parameters only.
+    Parameters
+    ----------
+    rest
+        The function for the accelerations, which reads the sines and cosines of `angles`.
+    fixed
+        Names of values that depend on parameters only.
     """
     if not angles or not (len(angles) >= MIN_ANGLES or outline.is_large(rest)):
         return None

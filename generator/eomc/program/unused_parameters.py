@@ -21,7 +21,8 @@ SCENE_KEYS = {  # scene key of each expression
 def parameters(program: Program) -> list[Problem]:
     """Return a warning for each parameter that has no effect on the motion, such as M in M x_dot/2.
 
-    Parameters that are used elsewhere, as in an output, a start or a body, are not reported.
+    Parameters that are used elsewhere, as in an output, an initial value or a body, are not
+    reported.
     """
     s = program.system
     excluded = ENERGIES | OUTPUTS if s.scene else ENERGIES  # a scene says which outputs name it
