@@ -176,7 +176,7 @@ class BatchRows:
 
         The run lasts `span` seconds from the time of the checked state, with the initial states
         `starts`. The function is called until no instance is left, with at most `steps` steps of
-        each per call. stiff: the option of `simulate`. longest: limit of the step size, s; 0 for
+        each per call. stiff: begin with Newton's method. longest: limit of the step size, s; 0 for
         none.
         """
         model, n, s = self.model, len(starts), starts[0]

@@ -61,8 +61,8 @@ class _Adaptive:
     ) -> _RunResult:  # fmt: skip
         """Return an adaptive run of `span` seconds by the C function, of at most MAX_STEPS steps.
 
-        s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff: the
-        option of `simulate`. each: number of steps in each call of the C function.
+        s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff:
+        begin with Newton's method. each: number of steps in each call of the C function.
         """
         model, many = self.model, 2 * MAX_STEPS
         x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)

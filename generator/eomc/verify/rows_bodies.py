@@ -49,11 +49,13 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
 
 
 def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[float]:
-    """Yield widths of lines for these velocities, s; the smallest error counts.
+    """Yield widths, s, of time intervals along which quantities are interpolated at a state.
 
-    First come fractions of the time in which a coordinate moves as far as in a motion. If that is
-    short, as with a stiff spring, differences are rounding, so wider lines follow, up to one that
-    moves by a unit. No width makes an error vanish.
+    spread: how far each coordinate goes in a motion. qd, qdd: velocities and accelerations. First
+    come fractions of the time in which a coordinate moves that far. If that is short, as with a
+    stiff spring, differences are rounding, so longer intervals follow, up to one in which a
+    coordinate moves by one unit. The interval with the smallest error counts: none makes a wrong
+    value right.
     """
 
     def rate(far: Vector) -> float:
@@ -68,14 +70,17 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
 
 
 class Bodies:
-    """Checks of bodies."""
+    """Checks of energies and power, which are recomputed from the bodies in the scene's own tables.
+
+    lines: the lines of motion computed so far, by state and width.
+    """
 
     def __init__(self, check: Comparison, scene: Scene) -> None:
         self.check, self.scene = check, scene
         self.lines: dict[tuple[int, float], Line] = {}
 
     def report(self) -> None:
-        """Append the checks of bodies."""
+        """Append the rows on energies of bodies and on the power of forces to the report."""
         limit = max(LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
@@ -83,11 +88,18 @@ class Bodies:
                            partial(self.compare, name))  # fmt: skip
 
     def compare(self, name: str) -> float:
-        """Return the largest difference over the states, for each with the best line."""
+        """Return the largest relative error of a quantity of the module over the states.
+
+        name: "kinetic_energy", "potential_energy" or "power", the power of forces.
+        """
         return self.check.largest(partial(self.off, name), STATES)
 
     def off(self, name: str, e: Expected) -> float:
-        """Return the relative difference at one state; nan if nothing can be compared."""
+        """Return the relative error of the quantity `name` at one state, from the bodies.
+
+        The width of the interpolated line of motion (see `widths`) with the smallest error counts.
+        The result is nan if there is no value to compare with.
+        """
         s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
         if name == "power":  # that of forces alone
@@ -112,22 +124,29 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Frame:
-    """A body's frame along the line: origin (n, 3), a quaternion (n, 4), the angle in the plane."""
+    """The frame of a body at the n points of a line of motion.
+
+    at: origins in the world, (n, 3), m. turn: rotations as unit quaternions, real part first, (n,
+    4). angle: rotation angles about the z axis, (n,), rad, for scenes in the plane.
+    """
 
     at: Vector
     turn: Vector
     angle: Vector
 
     def point(self, x: Vector) -> Vector:
-        """Return a point of the frame, (3,) or (n, 3), in the world."""
+        """Return the world coordinates of a point of the frame, (n, 3), m.
+
+        x: coordinates in the frame, (3,) or (n, 3), m.
+        """
         return self.at + rotate(self.turn, x)
 
     def slid(self, by: Vector, axis: Vector) -> Frame:
-        """Return the frame translated along its own axis."""
+        """Return the frame translated along its own `axis` by the distances `by`, (n,), m."""
         return replace(self, at=self.point(by[:, None] * axis))
 
     def turned(self, by: Vector, axis: Vector) -> Frame:
-        """Return the frame rotated about its own axis."""
+        """Return the frame rotated about its own `axis` by the angles `by`, (n,), rad."""
         half = by[:, None] / 2
         turn = np.hstack([np.cos(half), np.sin(half) * axis])
         return Frame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
@@ -135,7 +154,28 @@ class Frame:
 
 @dataclass
 class Line:
-    """A scene's bodies along q + s qd + s^2/2 bend, t + s for |s| <= width, all numbers (n,)."""
+    """The bodies of a scene along a line of motion through a state, for interpolation in time.
+
+    Coordinates are q + stretch qd s + bend s²/2 at the times t + s, |s| <= width. Each quantity is
+    an array of its values at the n nodes s; rates are derivatives of the interpolating polynomial.
+
+    Attributes
+    ----------
+    state : State
+        The state in the middle of the line.
+    width : float
+        Half the duration of the line, s.
+    stretch : float
+        Factor of all velocities.
+    bend : array or 0
+        Accelerations.
+    slides : mapping
+        Names of coordinates with stick-slip friction, and the direction in which each slides.
+    frames : dict
+        Frames of the bodies and of the world, by name.
+    known : dict
+        Values of the names in the scene's formulas.
+    """
 
     scene: Scene
     state: State
@@ -179,16 +219,19 @@ class Line:
 
     @property
     def assembly(self) -> Assembly:
-        """The scene's bodies."""
+        """The scene's tables of bodies, springs, dampers and forces."""
         assert self.scene.assembly is not None
         return self.scene.assembly
 
     def evaluate(self, formula: Formula) -> Any:
-        """Return the value of a formula along the line."""
+        """Return the value of a formula at the nodes of the line, (n,), or one constant number."""
         return formulas.evaluate(formula, self.algebra, self.value_of_name)
 
     def at_rest(self, formula: Formula) -> Any:
-        """Return the value of a formula with all velocities zero: of a potential, the energy."""
+        """Return the value of a formula at the nodes, with all velocities set to zero.
+
+        That is the energy of a potential.
+        """
         known, algebra = self.known, self.algebra
         self.known = {name: x for name, x in known.items() if name not in self.formulas}
         self.known |= {f"{c.name}_dot": 0 * self.nodes for c in self.scene.coordinates}
@@ -204,31 +247,34 @@ class Line:
         return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
 
     def value_of_name(self, name: str) -> Any:
-        """Return the value of a name along the line."""
+        """Return the value of a name in the scene's formulas at the nodes of the line."""
         if name not in self.known:
             self.known[name] = self.limited(name, self.evaluate(self.formulas[name]))
         return self.known[name]
 
     def limited(self, name: str, value: Any) -> Any:
-        """Return the value of a name, limited if it is an input with limits."""
+        """Return the value clipped to the limits of the input `name`; unchanged without limits."""
         for ends in (i.limits for i in self.scene.inputs if i.name == name):
             for end, within in zip(ends, (np.maximum, np.minimum), strict=True):
                 value = value if end is None else within(value, self.evaluate(end))
         return value
 
     def vector(self, entries: Sequence[Formula]) -> Vector:
-        """Three numbers that do not change."""
+        """Return the values of three constant formulas, (3,)."""
         return np.array([float(self.evaluate(x)) for x in entries])
 
     def oriented(self, frame: Frame, body: Body) -> Frame:
-        """Return the frame with the rotation of the body's table."""
+        """Return the frame after the rotations in the table of the body."""
         for turn in body.rotation:
             axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
             frame = frame.turned(self.evaluate(turn.angle) + 0 * self.nodes, axis)
         return frame
 
     def attach(self, body: Body) -> None:
-        """Add the frame of a body after its joint, and the names of its centre."""
+        """Add the frame of a body, and the coordinates of its centre of mass to the known names.
+
+        body: one with a joint; the frame of its parent must have been added.
+        """
         frame = self.frames[body.parent]
         if body.offset:
             frame = replace(frame, at=frame.point(self.vector(body.offset)))
@@ -248,7 +294,11 @@ class Line:
     # --- energies --------------------------------------------------------------------------------
 
     def value(self, name: str) -> float:
-        """Return the compared quantity at the state itself."""
+        """Return a quantity at the state in the middle of the line, from the scene's tables.
+
+        name: "kinetic_energy" or "potential_energy", J, or "power", the power of all forces and of
+        dissipation, W.
+        """
         if name == "kinetic_energy":
             return self.at_middle(
                 self.evaluate(self.scene.kinetic) + sum(map(self.kinetic, self.bodies))
@@ -265,7 +315,7 @@ class Line:
         return [b for b in self.assembly.bodies if b.name not in self.immovable_bodies()]
 
     def immovable_bodies(self) -> set[str]:
-        """Return the names of the bodies that are fixed to the world."""
+        """Return the names of the world and of the bodies that are fixed to it."""
         immovable = {WORLD}
         for body in self.assembly.bodies:
             if body.joint == "fixed" and body.parent in immovable:
@@ -273,14 +323,15 @@ class Line:
         return immovable
 
     def at_middle(self, values: Any) -> float:
-        """Return the value in the middle of the line."""
+        """Return the entry for the middle node of an array of values at the nodes."""
         return float((values + 0 * self.nodes)[self.middle])
 
     def points(self, body: Body) -> list[tuple[float, Vector]]:
-        """Return point masses with the body's mass, centre and inertia; some are negative.
+        """Return point masses with the body's mass, centre of mass and inertia.
 
-        With J = tr(I)/2 - I, the second moments of the mass: two for each eigenvector of J at a
-        unit's distance from the centre, the rest in the centre.
+        Each is a pair of a mass, kg, and a position in the body's frame, m; some masses are
+        negative. With the second moments J = tr(I)/2 - I, there are two for each eigenvector of J,
+        at unit distance from the centre of mass, and the rest is in the centre of mass.
         """
         m, centre = float(self.evaluate(body.mass)), self.vector(body.center)
         xx, yy, zz, xy, xz, yz = (float(self.evaluate(entry)) for entry in body.inertia)
@@ -292,7 +343,10 @@ class Line:
         return masses
 
     def kinetic(self, body: Body) -> Vector:
-        """Return the kinetic energy of a body's point masses and of the rotors at its joint."""
+        """Return the kinetic energy of a body at the nodes, (n,), J.
+
+        It is that of the body's point masses and of the rotors at its joint.
+        """
         frame, energy = self.frames[body.name], 0 * self.nodes
         for m, x in self.points(body):
             velocity = self.rate @ frame.point(x)
@@ -302,18 +356,18 @@ class Line:
         return energy
 
     def rates(self, body: Body) -> Iterator[Vector]:
-        """Yield the rates of the motions of a body's joint."""
+        """Yield the velocity of each motion of a body's joint at the nodes, (n,)."""
         for formula in body.coordinates:
             yield self.rate @ (self.evaluate(formula) + 0 * self.nodes)
 
     def weight(self, body: Body) -> Vector:
-        """-m g.c"""
+        """Return the potential energy of a body's weight at the nodes, -m g·c, (n,), J."""
         centre = self.frames[body.name].point(self.vector(body.center))
         energy: Vector = -self.evaluate(body.mass) * centre @ self.vector(self.assembly.gravity)
         return energy
 
     def length(self, line: Spring | Damper) -> Vector:
-        """Return the length of a spring or damper, or its angle."""
+        """Return the length (m) or angle (rad) of a spring or damper at the nodes, (n,)."""
         if line.coordinate:
             return np.asarray(self.known[line.coordinate])
         assert line.bodies is not None
@@ -327,7 +381,7 @@ class Line:
         return np.asarray(np.linalg.norm(b - a, axis=1))
 
     def spring(self, spring: Spring) -> Vector:
-        """Return the energy of a spring, k/2 times its squared extension."""
+        """Return the energy of a spring, k/2 times its squared extension, at the nodes, (n,), J."""
         longer = self.length(spring) - self.evaluate(spring.length)
         energy: Vector = self.evaluate(spring.stiffness) / 2 * longer**2
         return energy
@@ -335,7 +389,10 @@ class Line:
     # --- forces ----------------------------------------------------------------------------------
 
     def forces(self) -> Vector:
-        """Return the power of forces, friction and drives, without that of dissipation."""
+        """Return the power of forces, friction and drives at the nodes, (n,), W.
+
+        That of the dissipation function is not included; see `loss`.
+        """
         power = 0 * self.nodes
         for name, formula in self.scene.forces.items():
             power = power + self.evaluate(formula) * self.known[f"{name}_dot"]
@@ -360,13 +417,21 @@ class Line:
         return power
 
     def unit_friction_power(self, name: str, rate: Vector, width: Formula | None) -> Vector:
-        """Return the power of unit Coulomb friction, smoothed over `width`, or sliding."""
+        """Return the absolute power of Coulomb friction of 1 N or N m, (n,), W.
+
+        name: the coordinate. rate: its velocity at the nodes. Friction is smoothed over `width`, or
+        has a fixed direction if the coordinate has stick-slip friction.
+        """
         if name in self.slides:
             return self.slides[name] * rate
         return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate
 
     def work(self, force: Force, at_rest: Line) -> Vector:
-        """F.v + torque.omega of a force on a body, less that of what moves at rest."""
+        """Return the power of a force and torque on a body at the nodes, (n,), W.
+
+        at_rest: the line of motion with zero velocities, whose power is subtracted: that of points
+        that move with time alone.
+        """
         frame, zero = self.frames[force.body], 0 * self.nodes
         F, torque = (
             np.stack([self.evaluate(x) + zero for x in given], axis=1)
@@ -379,12 +444,18 @@ class Line:
         return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
 
     def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
-        """Return the velocity of a point of a frame, and the angular velocity 2 dq/dt q*."""
+        """Return the velocity of a point of a frame, and the frame's angular velocity, both (n, 3).
+
+        point: its coordinates in the frame, (3,), m. Both are world coordinates, in m/s and rad/s.
+        """
         turning = quaternion_product(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
         return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
     def loss(self) -> float:
-        """dR/dqd . qd, by R at velocities that are a little larger and smaller."""
+        """Return the power of dissipation at the state, ∂R/∂q̇ · q̇, W.
+
+        It is a difference quotient of R at velocities that are a little larger and smaller.
+        """
         total = 0.0
         if not self.loses():
             return total
@@ -396,12 +467,12 @@ class Line:
         return total
 
     def loses(self) -> bool:
-        """Return whether the scene has dissipation R."""
+        """Return whether the scene has a dissipation function, damped joints or dampers."""
         joints = any(body.damping for body in self.assembly.bodies)
         return bool(joints or self.assembly.dampers or self.scene.dissipation.text != "0")
 
     def dissipation(self) -> Vector:
-        """Return R of the scene, of joints and of dampers."""
+        """Return the dissipation function R of scene, joints and dampers at the nodes, (n,), W."""
         R: Vector = self.evaluate(self.scene.dissipation) + 0 * self.nodes
         for body in self.assembly.bodies:
             for damping, rate in zip(body.damping, self.rates(body), strict=False):
@@ -426,7 +497,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 def quaternion_product(a: Vector, b: Vector) -> Vector:
-    """Return the product a b of quaternions (n, 4), real part first."""
+    """Return the products a b of quaternions, row by row; all are (n, 4), real part first."""
     w, x = a[:, :1], a[:, 1:]
     v, y = b[:, :1], b[:, 1:]
     real = w * v - np.sum(x * y, axis=1, keepdims=True)
@@ -434,7 +505,10 @@ def quaternion_product(a: Vector, b: Vector) -> Vector:
 
 
 def rotate(turn: Vector, x: Vector) -> Vector:
-    """Return vectors rotated by unit quaternions (w, a): x + 2 w a x x + 2 a x (a x x)."""
+    """Return vectors x rotated by unit quaternions `turn` (n, 4), real part first: (n, 3).
+
+    With turn = (w, a) the result is x + 2 w a × x + 2 a × (a × x).
+    """
     w, a = turn[:, :1], turn[:, 1:]
     across = 2 * _cross(a, np.broadcast_to(x, a.shape))
     return np.asarray(x + w * across + _cross(a, across))

@@ -1,10 +1,10 @@
-"""Rows of `check` about constraints: what is zero, A, multipliers, projection, reactions.
+"""Rows of `check` about constraints: residuals, Jacobian A, multipliers, projection, reactions.
 
-At states that the reference has put onto the rows, along a run, and of both forms of C. Multipliers
-and accelerations are compared with those of a dense KKT matrix in NumPy (`kkt`), a corrected step
-in `comparison` with a step that is put back by Newton's method. The module alone is asked whether
-multipliers work only where rows move by themselves, whether A is the slope of the rows, and whether
-reactions do what multipliers do.
+They use states that the reference has projected onto the constraints, states along a run, and both
+forms of C. Multipliers and accelerations are compared with those of a dense KKT matrix in NumPy
+(`kkt`), a corrected step in `comparison` with a step that Newton's method projects. Of the module
+alone it is tested whether multipliers have power only where constraints depend on time, whether A
+is the derivative of the constraint equations, and whether reactions have the power of multipliers.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ UNITS = "units of rounding"
 
 
 def report(check: Comparison) -> None:
-    """Append the checks of a scene with constraints."""
+    """Append the rows on constraints to the report of a scene that has constraints."""
     rows = FormRows(check, check.module)
     for name in VALUES:
         check.row(name, LIMIT, UNITS, partial(check.value, name))
@@ -80,16 +80,21 @@ def _values(check: Comparison, module: Any) -> float:
 
 
 class FormRows:
-    """Checks of the module of one form of C."""
+    """Checks of constraints for the module of one form of C, optimised or portable.
+
+    holonomic: for each constraint equation, whether it is one of positions.
+    """
 
     def __init__(self, check: Comparison, module: Any) -> None:
         self.check, self.module, self.system = check, module, check.system
         self.holonomic = np.array([c.holonomic for c in check.system.constraints])
 
     def slopes(self) -> float:
-        """A of the module beside differences of its rows: along q, of rows of rates along qd.
+        """Return the largest relative error of the module's constraint Jacobian A over the states.
 
-        The best of some widths counts: no width makes a wrong A right.
+        It is compared with differences of the constraint equations, along q for holonomic and along
+        q̇ for nonholonomic ones. Of several widths the smallest error counts: none makes a wrong A
+        right.
         """
         check, spread = self.check, self.check.sampler.spread
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
@@ -115,7 +120,10 @@ class FormRows:
         return check.largest(error)
 
     def tangent(self) -> float:
-        """Return the change of constraints and their rates along tangent directions, which is 0."""
+        """Return how much constraints and their rates change along the module's tangent directions.
+
+        The change must be zero. It is relative to the sum of the sizes of its terms.
+        """
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
         steps = {"q": self.check.sampler.spread, "qd": self.check.sampler.speed}
 
@@ -153,7 +161,11 @@ class FormRows:
         return total
 
     def power(self) -> float:
-        """lambda . A qd beside -lambda . b, of rows A qd + b: 0 where none moves by itself."""
+        """Return the largest error of the power of the multipliers, λ·(A q̇), in units of rounding.
+
+        If the constraint equations' rates are A q̇ + b, it must be -λ·b: 0 unless constraints
+        depend on time.
+        """
 
         def error(e: Expected) -> float:
             s = e.state
@@ -168,10 +180,11 @@ class FormRows:
         return self.check.largest(error)
 
     def reactions(self) -> float:
-        """Virtual work: what reactions do as one coordinate moves, beside lambda . A of the loop.
+        """Return the largest relative error of the virtual work of reactions over some states.
 
-        The force acts at the second body's point, on it and against the first one; so does the
-        moment. Velocities are those of rows_bodies.py, from the scene's own tables.
+        As one coordinate moves, reactions at a loop must do the work λ·A of the loop's equations.
+        Force and moment act at the loop's point on its second body, and against the first one.
+        Velocities follow from the scene's own tables, as in rows_bodies.py.
         """
         return self.check.largest(self._work, STATES)
 
@@ -222,7 +235,10 @@ class FormRows:
         return float(total / np.sum(moving))
 
     def residual_along_run(self, method: str) -> float | Measurement:
-        """Return the largest residual of constraints and their rates along a run, in units."""
+        """Return the largest residual of constraints and their rates along runs, in roundings.
+
+        The runs by `method` start at a few states.
+        """
         check = self.check
         errors: list[float | None] = []
         for e in check.few(3):

@@ -19,7 +19,7 @@ SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on derivatives that implicit methods or the scene require."""
+    """Append the rows on `linearize` and `sensitivity`, if the module has these functions."""
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)
     for name in ("linearize", "sensitivity"):
         if _has(check, name):
@@ -35,9 +35,11 @@ def _has(check: Comparison, name: str) -> bool:
 
 
 def slopes(check: Comparison, name: str) -> float | Measurement:
-    """linearize or sensitivity against differences of the reference's accelerations.
+    """Return the largest relative error of the module's derivatives of accelerations.
 
-    The best of some widths counts for each entry, as of skewness.
+    name: "linearize" (derivatives by q, q̇ and u) or "sensitivity" (by parameters). They are
+    compared with differences of the reference's accelerations. Of several widths, the smallest
+    error counts for each entry: no width makes a wrong entry right.
     """
     scale = check.sampler.scale
     n, nu = len(check.system.q), len(check.system.inputs)
@@ -63,7 +65,11 @@ def slopes(check: Comparison, name: str) -> float | Measurement:
 
 
 def module_derivatives(check: Comparison, name: str, s: State) -> Vector | None:
-    """Return the module's derivatives at a state; None if dq/dt is not q̇."""
+    """Return the module's derivatives of accelerations at a state, (nq, k).
+
+    name: "linearize", with the k = 2 nq + nu columns q, q̇ and u, or "sensitivity", with a column
+    for each parameter. None if the rest of A and B does not say that the derivative of q is q̇.
+    """
     n, arguments = len(check.system.q), {"u": s.u, "t": s.t, "params": s.params}
     if name == "sensitivity":
         return np.asarray(check.module.sensitivity(s.q, s.qd, **arguments))

@@ -1,7 +1,7 @@
-"""Rows of `check` about derivatives of steps: beside differences of steps by the tableau.
+"""Rows of `check` about derivatives of steps, compared with differences of steps by the tableau.
 
 The steps are those of `one_step`, on the reference's accelerations; under constraints the reference
-puts their ends onto the rows.
+projects their ends onto the constraints.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Differences = Callable[[str, int, float], list[Vector]]  # of a method, state an
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene that asks for them."""
+    """Append the rows on `discretize` for each method, if the scene has that function."""
     if not check.system.run.discretize:
         return
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)

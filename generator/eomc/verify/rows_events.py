@@ -1,7 +1,8 @@
-"""Rows of `check` about events: what is zero where each happens, and the states behind jumps.
+"""Rows of `check` about events: event functions and states after jumps.
 
-Both beside the formulas as they stand, in many digits, at states anywhere. When and where events
-happen follows from these values alone; friction that sticks has its own events, which are left out.
+Both are compared with the formulas as they stand, in many digits, at states anywhere. When and
+where events are detected follows from these values alone. Events of stick-slip friction are left
+out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from eomc.verify.sampling import State
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene that has events of its own."""
+    """Append the rows on event functions and jumps, if the scene defines events."""
     system = check.system
     events = system.own_events
     groups = {"events": [Output(e.name, e.when) for e in events]}
