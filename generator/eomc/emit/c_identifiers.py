@@ -42,26 +42,33 @@ _CALLED = frozenset(name + suffix for name in MATHEMATICS for suffix in ("f", "l
 
 
 def may_be_macro(name: str) -> bool:
-    """Return True if a header may define a macro of this name."""
+    """Return True if a header of the C library or of Python may define a macro with this name."""
     return bool(_SHOUTED.fullmatch(name) or _OTHERS.fullmatch(name))
 
 
 def may_be_enumerator_of_others(name: str) -> bool:
-    """Return True if a header may define a macro equal to this enumerator. No macro ends in "_"."""
+    """Return True if a header of the C library or of Python may define a macro equal to an
+    enumerator.
+
+    name: the enumerator, with the scene's prefix.
+    """
     return not name.endswith("_") and bool(_FAMILY.fullmatch(name))
 
 
 def in_c(name: str, prefix: str) -> str:
-    """Return the C name of a name, in a scene with the given prefix."""
+    """Return the C name for a name of the scene, with "_" appended if C cannot use it.
+
+    prefix: the scene's name, with which other C names begin.
+    """
     ours = name.lower().startswith(prefix.lower() + "_")
     return name + "_" if ours or may_be_macro(name) or name in _CALLED else name
 
 
 def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
-    """Rename what C cannot use.
+    """Return the program with names that C can use, and the renamed names of the scene.
 
-    Returns the program, and the author's name by C name of each renamed coordinate, parameter and
-    input.
+    The second result maps each new name of a coordinate, parameter or input to the name in the
+    scene.
     """
     system = program.system
     declared = [c.name for c in system.coordinates]

@@ -15,7 +15,7 @@ from eomc.integrators.tableaux import Method, Row
 
 
 def literal(x: Fraction, real: Real) -> str:
-    """Return a coefficient as a C literal."""
+    """Return a coefficient as a C literal in the type of numbers."""
     return c_expression.number(Rational(x.numerator, x.denominator), real)
 
 
@@ -26,11 +26,10 @@ def _nearest(x: Fraction, real: Real) -> Fraction:
 
 
 def rounded(weights: Row, real: Real) -> Row:
-    """Round weights such that their sum is exact, since an error of the sum would accumulate over
-    steps.
+    """Return weights rounded to the type of numbers, such that their sum is exact.
 
-    The smallest weight takes the rounding error of the sum; for symmetric methods, two equal ones
-    share it.
+    An error of the sum would accumulate over steps. The smallest weight takes the rounding error of
+    the sum; for symmetric methods, two equal weights share it.
     """
     if not real.dtype:  # 113 bits, for references
         return weights
@@ -46,18 +45,24 @@ def rounded(weights: Row, real: Real) -> Row:
 
 
 def numbers(row: Row, real: Real) -> tuple[str, ...]:
-    """Return a row of coefficients as literals."""
+    """Return a row of coefficients as C literals."""
     return tuple(literal(x, real) for x in row)
 
 
 def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
-    """Return the rows of a square matrix as initialisers, a triangle padded with zeros."""
+    """Return the rows of a square matrix as lines of a C initialiser; short rows are padded with
+    zeros.
+    """
     padded = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
     return c_function.in_braces(numbers(row, real) for row in padded)
 
 
 class Tableau(TypedDict):
-    """Coefficients of a method for second-order equations: nodes, A and A A by rows, b and b A."""
+    """Coefficients of a Runge-Kutta method for second-order equations, as C literals.
+
+    They are the nodes c, the matrices A and A A by rows (lines of C initialisers), and the weights
+    b and b A.
+    """
 
     c: tuple[str, ...]
     A: tuple[str, ...]
@@ -67,7 +72,7 @@ class Tableau(TypedDict):
 
 
 def tableau(m: Method, real: Real) -> Tableau:
-    """Return the coefficients of a method as literals."""
+    """Return the coefficients of a method as C literals in the type of numbers."""
     return Tableau(
         c=numbers(m.c, real),
         A=matrix(m.a, real),

@@ -16,8 +16,10 @@ MAX_NEWTON_ITERATIONS = 50  # for the stages
 
 
 def derivatives(plain: Functions) -> Iterator[Derivative]:
-    """Yield the view for each method where the scene requests it. The first has the shared
-    functions.
+    """Yield the data for the template of the derivatives of a step, for each integration method.
+
+    Yields nothing if the scene does not request derivatives. The first method's data include
+    functions that all methods share.
     """
     target, real = plain.target, plain.target.real
     run = target.system.run

@@ -11,18 +11,20 @@ from eomc.integrators.tableaux import METHODS
 
 
 def cmake(target: Target) -> CMake:
-    """Return the view of CMakeLists.txt."""
+    """Return the data for CMakeLists.txt, which builds the generated C as a library."""
     return CMake(tuple(stamp(target)), target.prefix, target.PREFIX, __version__)
 
 
 def pkg_config(target: Target) -> PkgConfig:
-    """Return the view of NAME.pc.in."""
+    """Return the data for NAME.pc.in, a pkg-config file of the generated C library."""
     return PkgConfig(tuple(stamp(target)), target.prefix, __version__)
 
 
 def costs(target: Target) -> Costs:
-    """Return the view of costs.txt: functions in the order of the header, then steps of the
-    methods.
+    """Return the data for costs.txt, a table with the operation counts of one call of each C
+    function.
+
+    The functions are in the order of the header; the steps of the integration methods follow.
     """
     names = (*KINDS, "acceleration", "linearization")
     functions = tuple(Counted(f.name, f.cost) for name in names if (f := source(target, name)))
@@ -32,7 +34,7 @@ def costs(target: Target) -> Costs:
 
 
 def _step(name: str) -> str:
-    """Return a description of the calls of one step."""
+    """Return a text that tells how many accelerations one step of the method `name` computes."""
     m = METHODS[name]
     if m.implicit:
         return f"{m.stages} accelerations an iteration, until the stages settle"

@@ -186,8 +186,8 @@ def refuses(target: Target, name: str) -> bool:
 
 
 def takes_qdd(target: Target, name: str) -> bool:
-    """Return True if the evaluation function `name` reads accelerations although not all scenes
-    need them.
+    """Return True if the evaluation function `name` reads accelerations in this scene, but not in
+    all.
 
     Functions that take accelerations in every scene have them as `Kind.extra_argument`.
     """

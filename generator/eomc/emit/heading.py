@@ -10,7 +10,10 @@ from eomc.emit.c_names import Target
 
 
 def stamp(target: Target) -> list[FreeText]:
-    """Return the version of eomc, the source file and the command as lines; no date."""
+    """Return comment lines that state the origin of generated files.
+
+    They are the version of eomc, the scene file with its digest, and the command; there is no date.
+    """
     s = target.system
     source = s.file.replace("\\", "/").rsplit("/", 1)[-1]
     digest = f"(sha256 {s.digest[:16]})"
@@ -25,12 +28,12 @@ def stamp(target: Target) -> list[FreeText]:
 
 
 def notes(target: Target) -> list[str]:
-    """Return where unusual terms of K appear, as lines of a comment."""
+    """Return comment lines that state where unusual terms of the kinetic energy K appear."""
     return [line for note in target.program.notes for line in textwrap.wrap(note, 92)]
 
 
 def description(target: Target) -> list[FreeText]:
-    """Return the scene's note and the renamed names, as lines of a comment."""
+    """Return comment lines with the scene's note and with the names that differ in C."""
     s = target.system
     lines = textwrap.wrap(flat(s.note), 92) if s.note else []
     if lines:
@@ -42,10 +45,14 @@ def description(target: Target) -> list[FreeText]:
 
 
 def words(unit: str, note: str) -> FreeText:
-    """Return unit and note of a coordinate, input or parameter."""
+    """Return the unit and the note of a coordinate, input or parameter as one text, for
+    comments.
+    """
     return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
 
 
 def solved(target: Target) -> list[str]:
-    """Return how D qdd = tau - bias is solved, as lines of a comment."""
+    """Return comment lines that state how D qdd = tau - bias is solved for the accelerations
+    qdd.
+    """
     return textwrap.wrap(target.program.solved, 92)

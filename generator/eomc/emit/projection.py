@@ -25,14 +25,20 @@ STARTS = 16  # random starts, if the search from a state does not converge
 
 
 def near(target: Target) -> float:
-    """Return the square of the relative change of a coordinate above which a correction is
-    large.
+    """Return the square of the relative change of a coordinate above which a correction is large.
+
+    It is a few times the rounding error of the type of numbers.
     """
     return 8 * target.real.epsilon
 
 
 def width(target: Target) -> int:
-    """Return the number of results of the projection: corrections of q and qd, inverse pivots."""
+    """Return the number of results of the C function that computes the corrections onto the
+    constraints.
+
+    These are corrections of q and qd, and inverse pivots of the
+    constraint equations.
+    """
     return len(target.program["projection"].outputs)
 
 
@@ -42,7 +48,31 @@ def view(
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
     sines: str = "", sines_call: str = "", onto: CFunction | None = None,
 ) -> Projection:  # fmt: skip
-    """Return the view for one form and one lane. state: the arguments of `rate_terms`."""
+    """Return the data for the template of the projection onto the constraints.
+
+    Parameters
+    ----------
+    projection
+        The C function for the corrections of q and qd.
+    function
+        Prototype of the function that applies them.
+    call
+        C call of `projection`.
+    rate_terms, state
+        The C function for the rates of dropped constraint equations, and its arguments that differ
+        from their names.
+    lane, L, mask
+        C type of the numbers, suffix of C names and C type of failures, where several instances are
+        computed together in a vector register (a lane); "" for single instances.
+    extent
+        Length of C arrays for coordinates; the number of coordinates by default.
+    increments
+        Whether the state at the end of a step is passed as its increments in the step.
+    sines, sines_call
+        C type of precomputed sines and cosines, and the C call that computes them; "" for none.
+    onto
+        Prototype of the function that projects a stage to first order; None if not needed.
+    """
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
     row_fraction, largest_fraction = LEFT_OUT[target.system.run.real]
@@ -78,7 +108,9 @@ def view(
 
 
 def plain(functions: Functions) -> Projection | None:
-    """Return the projection view of portable C; None without constraints."""
+    """Return the data for the projection onto the constraints in portable C; None without
+    constraints.
+    """
     projection = functions.projection
     if projection is None:
         return None
@@ -91,7 +123,9 @@ def plain(functions: Functions) -> Projection | None:
 
 
 def project(functions: Functions) -> Project:
-    """Return the view of the public function `project`."""
+    """Return the data for the public C function `project`, which projects a state onto the
+    constraints.
+    """
     target, public = functions.target, functions.public
     end, eps = target.real.function_suffix, target.real.epsilon
     D, A, phi, rates = (

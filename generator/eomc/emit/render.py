@@ -1,7 +1,6 @@
-"""Rendering of a program to files by Jinja templates: header, source, example, self-test, Python
-package.
+"""Rendering of a program to files by Jinja templates: header, source, example, self-test, package.
 
-This is the only module that uses Jinja for C. Each template gets one view.
+This is the only module that uses Jinja for C. Each template gets its data as one frozen dataclass.
 """
 
 from __future__ import annotations
@@ -38,16 +37,20 @@ FAST = "fast"  # the folder of optimised C, from which the Python module is comp
 
 @dataclass(frozen=True)
 class Sources:
-    """The generated files by name, and the sources of the Python extension.
+    """The generated files, and the sources of the compiled extension of the Python package.
 
     Attributes
     ----------
+    name
+        Name of the scene.
+    files
+        Text of each generated file by its path.
     binding, cdef
-        C code between the scene's functions and Python, and its declarations for cffi.
+        C code between the scene's C functions and Python, and its declarations for cffi.
     stub
-        Type stubs of the package.
+        Type stubs of the Python package.
     operations
-        Total operations of all functions, a measure of compile time.
+        Total number of operations of all functions, a measure of compile time.
     """
 
     name: str
@@ -59,15 +62,16 @@ class Sources:
 
     @property
     def embeddable(self) -> dict[str, str]:
-        """The files for use from C, without the Python package."""
+        """The files for use from C, by path, without the Python package."""
         return {file: text for file, text in self.files.items() if not file.endswith(".py")}
 
 
 @cache
 def environment() -> jinja2.Environment:
-    """Return the Jinja environment. Missing variables are errors, and text is inserted unchanged.
+    """Return the Jinja environment, in which undefined variables are errors.
 
-    HTML pages are escaped. The Python package escapes its docstring.
+    Text is inserted into templates unchanged, except that it is escaped in HTML pages. The filter
+    `docstring` escapes text for docstrings, and `block` indents C statements.
     """
     loader = jinja2.FunctionLoader(lambda name: resources.text("templates", name))
     result = jinja2.Environment(
@@ -96,22 +100,22 @@ def _bytecode() -> jinja2.BytecodeCache | None:
 
 
 def show(view: views.View | plain_views.View | fast_views.View | fmu_views.View) -> str:
-    """Render a view by its template."""
+    """Return the text of a file, printed from data by the template that belongs to their class."""
     context = {field.name: getattr(view, field.name) for field in fields(view)}
     return environment().get_template(view.TEMPLATE + ".jinja").render(context)
 
 
 def _plain_names(program: Program) -> None:
-    """Raise ValueError where a name cannot stand in code."""
+    """Raise ValueError if a name of the program is not plain, so that it cannot stand in code."""
     s = program.system
     for item in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
         plain(item.name)
 
 
 def render(program: Program, extension: str) -> Sources:
-    """Return the generated files of a program, whose Python package imports `extension`.
+    """Return all generated files of a program; the same program gives the same text.
 
-    The same program gives the same text.
+    extension: name of the compiled extension module, which the Python package imports.
     """
     _plain_names(program)
     program, written = rename_for_c(program)
@@ -141,6 +145,6 @@ def render(program: Program, extension: str) -> Sources:
 
 
 def unit(program: Program, version: int) -> fmu.Unit:
-    """Return the functional mock-up unit of a program, in FMI version 2 or 3."""
+    """Return the functional mock-up unit (FMU) of a program, in FMI version 2 or 3."""
     _plain_names(program)
     return fmu.unit(program, version, show, show)
