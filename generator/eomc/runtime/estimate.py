@@ -29,20 +29,35 @@ _ROUNDING_RMS = 0.3  # rms rounding error of a sum, relative to eps/2 times its 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Error estimate of a run, |q - exact| and |qd - exact| by step doubling, and its reliability.
+    """Error estimate of a run, by repetition in shorter steps, and its reliability.
 
-    q, qd (n, nq): at every row, in the coordinates' units; inf where a finer run stopped before.
-    end: of the last row, by name, velocities as theta_dot. digits: how many of each coordinate are
-    right there, relative to its scale, its largest value along the run. order: the method's;
-    observed: log2 of what halving h divides the differences by, nan where only rounding is seen.
-    amplification: the largest factor by which the motion has multiplied a small difference of the
-    start at the end, in the norm |d|^2 = dqd' D dqd + (dq/T)' D (dq/T), with the mean mass matrix
-    D and the times T = |dq|/|dqd| of such differences (docs/python.md): 1 of an oscillator. At
-    least so large, where the difference becomes as large as the motion.
-    verdict: the reasons why the motion is not resolved, or "".
-    events: by name the error in time of each event of the run, (n,), s; inf where a finer run does
-    not detect the event. missed: by name the times of events that a finer run detects and this one
-    does not, (n,), s.
+    Attributes
+    ----------
+    q, qd : (n, nq) arrays
+        Estimates of |q - exact| and |qd - exact| at every row of the run, in the units of the
+        coordinates and per s; inf where a run in shorter steps stopped before the row.
+    end : dict
+        The same at the last row, by name; velocities have names such as "theta_dot".
+    digits : dict
+        Number of correct decimal digits at the last row, by name: -log10 of the error relative to
+        the scale of the variable, its largest absolute value along the run.
+    order : int
+        Order of the method.
+    observed : float
+        Observed order: log2 of the factor by which halving h reduces the differences between runs;
+        nan if these are rounding errors.
+    amplification : float
+        Largest factor by which the motion multiplies a small difference of the initial states until
+        the end of the run, in the norm |d|^2 = dqd' D dqd + (dq/T)' D (dq/T) with the mean mass
+        matrix D and times T = |dq|/|dqd| (docs/python.md). It is 1 for a harmonic oscillator. It is
+        a lower bound if the difference becomes as large as the motion itself.
+    verdict : str
+        The reasons why the motion is not resolved; "" if it is resolved.
+    events : mapping
+        Error in time of each occurrence of an event, (n,), s, by the event's name; inf if a run in
+        shorter steps does not detect it.
+    missed : mapping
+        Times (n,), s, by the event's name, of occurrences that only a run in shorter steps detects.
     """
 
     q: Array
@@ -58,12 +73,12 @@ class Estimate:
 
     @property
     def resolved(self) -> bool:
-        """True if the verdict is empty."""
+        """True if the motion is resolved, that is if `verdict` is empty."""
         return not self.verdict
 
     @property
     def warning(self) -> str:
-        """Warning if the motion is not resolved, else ""."""
+        """Text of a warning if the motion is not resolved, else ""."""
         return f"this motion is not resolved: {self.verdict}" if self.verdict else ""
 
     def __str__(self) -> str:
@@ -82,9 +97,11 @@ class Estimate:
 def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None) -> Estimate:
     """Estimate the error of a run, from repetitions at h/2, h/4 and finer until they converge.
 
-    The error of the finest repetition follows from the last difference and the observed order. The
-    estimate is at least the accumulated rounding error. The cost is eight to twelve times that of
-    the run, or forty times if the repetitions do not converge.
+    progress: function that is called with (completed steps, expected number of
+    steps). The error of the finest
+    repetition follows from the last difference and the observed order. The estimate is at least the
+    accumulated rounding error. The cost is eight to twelve times that of the run, or forty times if
+    the repetitions do not converge.
     """
     if not run.steps:
         return _zero_error(run)
@@ -196,11 +213,26 @@ def growth_of(
     model: Stepping, D: Array, differences: list[Array], duration: float, moves: Array,
     place: tuple[Array, float, Array], moved: Callable[[Array], Array],
 ) -> float:  # fmt: skip
-    """Return the growth of a small difference, from given differences and further directions.
+    """Return the factor by which a motion multiplies small differences of its initial state.
 
-    differences: along the motion, (rows, 2 nq) each; the first has the least rounding error.
-    place: the start (2 nq,), its time and parameters. moved: function from a perturbation of the
-    start, (2 nq,), to the difference along the motion.
+    The factor is the largest one over given differences and further directions, in the norm of the
+    module `growth`.
+
+    Parameters
+    ----------
+    D : (nq, nq) array
+        Mean mass matrix along the motion.
+    differences : list of (rows, 2 nq) arrays
+        Differences of the states along the motion; the first has the least rounding error.
+    duration : float
+        Duration of the motion, s.
+    moves : (2 nq,) array
+        1 for states that may be perturbed, 0 for those that only jumps change.
+    place : tuple
+        Initial state (2 nq,), initial time, s, and parameters.
+    moved : callable
+        Function from a perturbation (2 nq,) of the initial state to the difference along the
+        motion.
     """
     n, (start, t0, p) = model.nq - len(model.discrete_coordinates), place
     free = [*range(n), *range(model.nq, model.nq + n)]
@@ -303,19 +335,21 @@ def _counts(run: Trajectory, every: int, rows: int) -> Array:
 
 
 def moving_mask(model: Stepping) -> Array:
-    """Return 1 for states that are perturbed, 0 for those that only jumps change, (2 nq,)."""
+    """Return (2 nq,): 1 for states that are perturbed, 0 for those that only jumps change."""
     return np.tile(np.arange(model.nq) < model.nq - len(model.discrete_coordinates), 2).astype(
         float
     )
 
 
 def scales(x: Array, duration: float, eps: float, discrete: int = 0) -> Array:
-    """Return the scale of each column, its largest absolute value.
+    """Return the scale (2 nq,) of each column of states x (rows, 2 nq): its largest absolute value.
 
-    A scale is at least a millionth of the largest position, or velocity, or of the largest state
-    if all of these are 0. At rest, where velocities change no position beyond its rounding error
+    duration: of the run, s. eps: unit roundoff. discrete: number of coordinates, the last ones,
+    that only jumps change; they have scales of their own.
+
+    A scale is at least a millionth of the largest position, or velocity, or of the largest state if
+    all of these are 0. At rest, where velocities change no position beyond its rounding error
     during the run, the scale of velocities is the largest position divided by the duration.
-    discrete: the number of last coordinates that only jumps change, which have their own scales.
     """
     whole = np.max(np.abs(x), axis=0).reshape(2, -1)
     n = whole.shape[1] - discrete
@@ -356,7 +390,11 @@ def _padded(run: Trajectory, rows: int, every: int) -> Array:
 
 
 def rounding_words(model: Stepping, amplification: float, t_limit: float) -> str:
-    """Explain why rounding reaches a tenth of the motion at the time `t_limit`."""
+    """Return the sentence of a verdict on rounding errors that exceed a tenth of the motion.
+
+    amplification: as in `Estimate`; a large one is reported as chaos. t_limit: time, s, from which
+    the rounding errors are that large.
+    """
     if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
         return (
             f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "

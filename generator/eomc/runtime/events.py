@@ -18,7 +18,15 @@ _EVENTS, _EVENTS_EACH = 1024, 64
 
 @dataclass(frozen=True, repr=False)
 class EventLog:
-    """Times and states at which one event occurred: t (n,), s; q and qd (n, nq), before a jump."""
+    """Occurrences of one event in a run.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Times, s.
+    q, qd : (n, nq) arrays
+        States at these times, before a state jump.
+    """
 
     t: Array
     q: Array
@@ -43,13 +51,26 @@ class EventLog:
 
 @dataclass(frozen=True, repr=False)
 class BatchEventLog(EventLog):
-    """An event's occurrences in all instances of a batch, sorted by `instance` (n,), then time."""
+    """Occurrences of one event in all instances of a batch, sorted by instance, then by time.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Times, s.
+    q, qd : (n, nq) arrays
+        States at these times, before a state jump.
+    instance : (n,) array
+        Index of the instance of each occurrence.
+    """
 
     instance: Array
     _batch: int
 
     def for_instance(self, k: int) -> EventLog:
-        """Return the occurrences in instance k; -1 is the last. Raises IndexError out of range."""
+        """Return the occurrences in instance k as an EventLog; a negative k counts from the end.
+
+        Raises IndexError if there is no instance k, TypeError if k is not an integer.
+        """
         try:
             at = index(k)
         except TypeError:
@@ -65,18 +86,24 @@ class BatchEventLog(EventLog):
 
 
 class BatchEventBuffer:
-    """Events of all instances of a batch, collected from the calls of all threads."""
+    """Collect the events of all instances of a batch from the calls of C in all threads.
+
+    most: largest number of events that fit in memory.
+    """
 
     def __init__(self, model: ModelInfo, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
     def room(self, count: int) -> GroupEventBuffer:
-        """Return the buffer for a call with `count` instances."""
+        """Return a new buffer for a call of C with `count` instances."""
         return GroupEventBuffer(self.model, count)
 
     def keep(self, room: GroupEventBuffer, first: int) -> None:
-        """Copy the events of a call whose first instance is `first`."""
+        """Copy the events that a call of C wrote to the buffer `room`.
+
+        first: index in the batch of the first instance of that call.
+        """
         some = np.arange(room.which.shape[1]) < room.counts[:, None]
         if some.any():
             self.pieces.append((some.nonzero()[0] + first, room.which[some], room.rows[some]))
@@ -84,11 +111,14 @@ class BatchEventBuffer:
 
     @property
     def full(self) -> bool:
-        """Whether the memory limit is reached."""
+        """True if the events exceed the number that fits in memory."""
         return self.count > self.most
 
     def all(self) -> tuple[Array, Array, Array]:
-        """Return (instances, event indices, rows [t, q, qd]) of all events, sorted by instance."""
+        """Return the instances (n,), event indices (n,) and rows (n, 1 + 2 nq) of all events.
+
+        Each row is [t, q, qd]. The events are sorted by instance.
+        """
         none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.nq))
         parts = zip(*self.pieces, strict=True) if self.pieces else [[x] for x in none]
         instances, which, rows = (np.concatenate(list(x)) for x in parts)
@@ -97,7 +127,11 @@ class BatchEventBuffer:
 
 
 class GroupEventBuffer:
-    """Buffer for the events of one call with `count` instances."""
+    """Buffer into which one call of C with `count` instances writes events.
+
+    counts: number of events of each instance. which, rows: index of each event, and its time and
+    state [t, q, qd]. given: the arguments of the C function.
+    """
 
     def __init__(self, model: ModelInfo, count: int) -> None:
         self.counts = np.zeros(count, "l")
@@ -112,7 +146,7 @@ class GroupEventBuffer:
 
 
 class EventBuffer:
-    """Buffer for the events of a call, and the events of all calls so far."""
+    """Collect the events of a run: a buffer for one call of C, and copies from all calls so far."""
 
     def __init__(self, model: ModelInfo) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
@@ -120,19 +154,22 @@ class EventBuffer:
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
 
     def room(self) -> tuple[Any, ...]:
-        """Return the arguments of C: capacity, event indices, rows."""
+        """Return the arguments of the C function: capacity, event indices and rows [t, q, qd]."""
         address, real, _ = self.model._c
         which = self.model._ffi.from_buffer("int[]", self.which)
         return len(self.which), which, address(real, self.rows)
 
     def keep(self, work: Any) -> None:
-        """Copy the events of the last call."""
+        """Copy the events that the last call of C wrote.
+
+        work: workspace of the C function; its number of events is reset to 0.
+        """
         if work.events:
             n, work.events = work.events, 0
             self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
 
     def all(self) -> tuple[Array, Array]:
-        """Return (event indices, rows [t, q, qd]) of all events."""
+        """Return the event indices (n,) and rows [t, q, qd] (n, 1 + 2 nq) of all calls so far."""
         if not self.pieces:
             return self.which[:0], self.rows[:0]
         which, rows = zip(*self.pieces, strict=True)

@@ -23,9 +23,11 @@ def simulate(
     params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None, fixed: tuple[Any, ...], check_stability: Callable[..., None],
 ) -> SteppedRun:  # fmt: skip
-    """Simulate with fixed steps and events.
+    """Simulate by fixed steps with event detection, and return the run.
 
-    fixed: values of the arguments in FIXED_STEP_DEFAULTS. check_stability: warns if h is too large.
+    The arguments are those of `Model.simulate`. fixed: (h, steps, method, every, out).
+    check_stability: function that warns if h is beyond the stability limit. Raises ValueError for
+    invalid arguments.
     """
     h, steps, method, every, out = fixed
     if out is not None:
@@ -65,9 +67,11 @@ def as_rows(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, *, listed: bool = False,
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """Return the times of the rows, and the span, s.
+    """Return the times (n,) of the rows of a run, s, and the span of the run, s.
 
-    The times are None if there is a row after each step, unless `listed`.
+    The times are None if there is a row after each step, unless `listed` is True. times: output
+    times given by the user, or None for a row after every `every` steps. Raises ValueError if
+    arguments exclude each other.
     """
     every = as_count(every, "every", 1)
     if times is not None:
@@ -86,7 +90,10 @@ def as_rows(
 
 
 def as_hold(u: Any, control_period: float | None, h: float) -> float | None:
-    """Return the time over which inputs are constant, whole steps; None for signals."""
+    """Return the time over which inputs are constant, s, a whole number of steps of size h.
+
+    None if the inputs are the scene's signals (u is None) without a control period.
+    """
     if u is None and control_period is None:
         return None
     return as_period(control_period, h) * h

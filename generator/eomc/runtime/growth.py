@@ -23,7 +23,10 @@ _DIRECTIONS = 4  # initial differences, each of which costs a run
 
 
 def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Array:
-    """Return the mean of D (n, n) over some of the rows q (rows, n) at t (rows,)."""
+    """Return the mean (n, n) of the mass matrices D at some of the states q (rows, n).
+
+    t: their times (rows,), s. params: parameters of the model; None: those of the scene.
+    """
     rows = np.unique(np.linspace(0, len(q) - 1, _STATES).astype(int))
     return np.asarray(
         np.mean([model.D(q[k], t=float(t[k]), params=params) for k in rows], axis=0), float
@@ -31,9 +34,10 @@ def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Arra
 
 
 def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
-    """Return W (2n, 2n), the size of d being |W d|; differences: along the motion, (rows, 2n) each.
+    """Return the matrix W (2n, 2n) with which the norm of a difference d = [dq; dqd] is |W d|.
 
-    duration: the largest time T, s.
+    D: mean mass matrix (n, n). differences: arrays (rows, 2n) of differences along the motion, from
+    which the times T follow. duration: largest time T, s.
     """
     values, vectors = np.linalg.eigh((D + D.T) / 2)
     values = np.maximum(values, _DEFINITE * max(float(values[-1]), np.finfo(float).tiny))
@@ -51,9 +55,10 @@ def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
 
 
 def growth(root: Array, first: Array, last: Array) -> float:
-    """Return the largest growth factor from initial (2n, k) to final (2n, k) differences.
+    """Return the largest growth factor of differences, from initial to final ones.
 
-    The maximum is over all linear combinations; inf if a value is not finite.
+    The maximum is over all linear combinations of the k columns of `first` (2n, k), which become
+    those of `last` (2n, k); inf if a value is not finite. root: matrix W (2n, 2n) of `norm_root`.
     """
     if not (np.isfinite(first).all() and np.isfinite(last).all()):
         return float("inf")
@@ -63,9 +68,10 @@ def growth(root: Array, first: Array, last: Array) -> float:
 
 
 def other_directions(root: Array, first: Array, moves: Array, rank: int) -> list[Array]:
-    """Return initial differences (2n,), as large as the first and orthogonal to it in the norm.
+    """Return initial differences (2n,), as large as `first` (2n,) and orthogonal to it in the norm.
 
-    moves (2n,): 1 for states that may differ, else 0; rank: dimension of the space of differences.
+    root: matrix W (2n, 2n) of `norm_root`. moves (2n,): 1 for states that may differ, else 0. rank:
+    dimension of the space of differences.
     """
     random, directions = np.random.default_rng(2), [first]
     size = float(np.linalg.norm(root @ first))

@@ -11,7 +11,7 @@ from .trajectory_data import Trajectory
 
 
 def infinite_at_start(run: Trajectory) -> str:
-    """Name the quantity that is not finite at the initial state, in a sentence.
+    """Return a sentence that names the quantity that is not finite at the initial state of a run.
 
     Returns "" if all accelerations are finite there or the run made a step. An energy that
     overflows while the accelerations are finite does not end a run.

@@ -23,7 +23,17 @@ _VALUE = 200  # bytes of the stored inputs of one period
 
 @dataclass(frozen=True)
 class ZeroOrderHold:
-    """Inputs that are constant over each control period: from a function u(t, q, qd) or rows."""
+    """Inputs that are constant over each control period.
+
+    Attributes
+    ----------
+    source : callable or (n, nu) array
+        Function u(t, q, qd) that is called at the start of each period, or a row for each period.
+    period : float
+        Control period, s.
+    count : int
+        Number of periods of the run, the last of which may be shorter.
+    """
 
     source: Callable[..., Any] | Array  # rows: (n, nu)
     period: float  # s
@@ -33,7 +43,7 @@ class ZeroOrderHold:
 def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array) -> Array:
     """Return the row of `values` (..., n, nu) that applies at each of `times` (m,): (..., m, nu).
 
-    At the start of a period its own row applies.
+    Row k of `values` applies from t0 + k period on, until the next one; times and period in s.
     """
     starts = np.asarray(t0 + period * np.arange(values.shape[-2]), times.dtype)
     index = np.searchsorted(starts, times, side="right") - 1
@@ -44,9 +54,27 @@ def input_schedule(
     model: ModelInfo, u: Any, control_period: float | None, span: float, params: Any,
     duration: float | None = None,
 ) -> Array | ZeroOrderHold | None:  # fmt: skip
-    """Check the inputs of an adaptive run and return them in the form for `InputSchedule`.
+    """Check the inputs of an adaptive run and return them in the form that `InputSchedule` takes.
 
-    duration: a table may cover this time, s, instead of the span. Raises ValueError.
+    Returns None for the scene's signals, (nu,) for constant inputs, else a ZeroOrderHold.
+
+    Parameters
+    ----------
+    u : None, array_like, mapping or callable
+        Inputs as in `Model.simulate`.
+    control_period : float or None
+        Control period, s.
+    span : float
+        Time of the run, s.
+    duration : float, optional
+        Time, s, that a table of inputs may cover instead of `span`, if the run ends earlier.
+
+    Raises
+    ------
+    ValueError
+        If the inputs are invalid or do not fit the number of periods.
+    MemoryError
+        If the inputs of all periods do not fit in memory.
     """
     period = None
     if control_period is not None:
@@ -98,17 +126,25 @@ def _check_memory(model: ModelInfo, hold: ZeroOrderHold) -> ZeroOrderHold:
 
 
 def count_periods(span: float, period: float) -> int:
-    """Return the number of periods in a span; the last one may be shorter."""
+    """Return the number of control periods in a span; the last one may be shorter (both in s)."""
     return max(ceil(span / period * (1 - 1e-12)), 1)
 
 
 def period_end(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
-    """Return the end of period k of a run, rounded to the module's number type."""
+    """Return the end time of control period k, s, rounded to the module's number type `dtype`.
+
+    t0: start of the run, s; the first period is k = 0.
+    """
     return float(dtype.type(t0 + (k + 1) * period))
 
 
 class InputSchedule:
-    """The inputs of a run in progress: the current values, and the time until which they apply."""
+    """Inputs of an adaptive run in progress: current values, and the time until which they apply.
+
+    u: as `input_schedule` returns it. t0, t_end: start and end of the run, s. q, qd: initial state.
+    Attributes: current (nu,) or None for the signals; stop, the time until which it applies, s;
+    values, the inputs of each control period so far.
+    """
 
     def __init__(
         self,
@@ -128,11 +164,14 @@ class InputSchedule:
 
     @property
     def address(self) -> Any:
-        """Address of the current inputs; NULL for the signals."""
+        """Address of the current inputs for C; NULL if C evaluates the scene's signals."""
         return self.model._pointer(self.current)
 
     def advance(self, work: Any) -> bool:
-        """Set the next inputs if a period has ended; return False at the end of the run."""
+        """Compute the inputs of the next control period if one has ended; return False at the end.
+
+        work: workspace of the C function, with the current time and state of the run.
+        """
         if work.t < self.stop:
             return True
         if self.stop >= self.t_end:
@@ -159,6 +198,6 @@ class InputSchedule:
 
     @property
     def u(self) -> Any:
-        """The inputs as a run stores them: a function, or a copy of the values."""
+        """The inputs in the form that a run stores: None, a function, or a copy of the values."""
         source = self.periods.source if self.periods else self.current
         return source if source is None or callable(source) else source.copy()
