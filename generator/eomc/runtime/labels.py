@@ -14,9 +14,10 @@ _DOTS = ("", r"\dot", r"\ddot")
 
 
 def tex(name: str, dots: int = 0) -> str:
-    r"""A name in LaTeX: theta1 and theta_1 as \theta_{1}, m_c as m_{\mathrm{c}}, x_prime as x'.
+    r"""Return a name in LaTeX, such as \theta_{1} for theta1 or theta_1.
 
-    dots: 1 for its rate, 2 for its acceleration. Words of several letters stand upright.
+    m_c becomes m_{\mathrm{c}}, and x_prime becomes x'. Words of several letters are set upright.
+    dots: 1 for the velocity of the name (one dot above it), 2 for its acceleration.
 
     >>> tex("theta_1", 1), tex("arm", 2)
     ('\\dot{\\theta}_{1}', '\\ddot{\\mathrm{arm}}')
@@ -33,7 +34,10 @@ def tex(name: str, dots: int = 0) -> str:
 
 
 def of_words(name: str) -> bool:
-    """Whether a name is words, such as elbow_joint, and not a letter or word with subscripts."""
+    """Return True if a name consists of several words, such as elbow_joint.
+
+    Otherwise it is a word, or a letter or word with subscripts, such as theta_1 or m_cart.
+    """
     words = re.search(r"[a-z]{2,}\d*_.*[a-z]{2,}", name)
     return bool(words) and not {*name.split("_")} & {*GREEK, "prime"}
 
@@ -47,10 +51,10 @@ def _upright(word: str) -> str:
 
 
 def mathtext(name: str, rate: bool = False) -> str:
-    r"""A name as figures print it.
+    r"""Return a name in the mathtext of matplotlib, for labels of figures.
 
-    The rate of a word is d/dt of it: matplotlib sets a dot on one of its letters. Several words
-    stand side by side, which in a product they could not.
+    rate: return its time derivative. That of a word is written d/dt, since matplotlib would set a
+    dot on one of the letters. Several words are separated by spaces.
 
     >>> mathtext("theta_1", rate=True), mathtext("arm", rate=True)
     ('$\\dot{\\theta}_{1}$', '$\\mathrm{d}\\,\\mathrm{arm}/\\mathrm{d}t$')
@@ -65,18 +69,24 @@ def mathtext(name: str, rate: bool = False) -> str:
 
 
 def rate_unit(unit: str, rate: bool) -> str:
-    """The unit, or that of the rate; "" where there is none."""
+    """Return the unit of a quantity, or if `rate` the unit of its time derivative, such as "rad/s".
+
+    Returns "" if the quantity has no unit.
+    """
     if not unit or not rate:
         return unit
     return f"{unit}/s" if re.fullmatch(r"\w+", unit) else f"({unit})/s"
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A text as it is printed, and its unit in brackets."""
+    """Return the text followed by its unit in parentheses, or the text alone if `unit` is ""."""
     return f"{text} ({plain(unit)})" if unit else text
 
 
 def plain(text: str) -> str:
-    """Free text in a figure: in one line, without what steers a terminal; a dollar is a dollar."""
+    """Return free text of a scene for a figure: control characters and dollar signs are escaped.
+
+    The result is one line, and matplotlib reads no part of it as a formula.
+    """
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return shown.replace("$", r"\$")

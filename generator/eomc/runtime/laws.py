@@ -16,7 +16,12 @@ from .package import warn
 def evaluate_law(
     law: Callable[..., Any], inputs: Callable[[Any], Any], t: float, q: Array, qd: Array
 ) -> Array:
-    """Call u(t, q, qd) and check its result; the note of an exception gives the time and state."""
+    """Call the function law(t, q, qd) of a user and return its inputs, (nu,), as an array.
+
+    inputs: function that converts and checks the returned value. t: time, s. An exception in the
+    function has a note with the time and the state; an invalid result raises ValueError or
+    TypeError.
+    """
     try:
         try:
             returned = law(t, q.copy(), qd.copy())
@@ -38,7 +43,7 @@ def evaluate_law(
 
 
 def warn_called_each_step(model: ModelInfo) -> None:
-    """Warn, once, that a function as u is slow."""
+    """Issue a warning, once for each model, that calling a Python function in each step is slow."""
     if "u" not in model._warned:
         model._warned.add("u")
         warn(
@@ -48,7 +53,12 @@ def warn_called_each_step(model: ModelInfo) -> None:
 
 
 class FeedbackLaw:
-    """A function u(t, q, qd) that a run calls every `hold` steps, with its values at the rows."""
+    """A function u(t, q, qd) that a run by fixed steps calls once in each control period.
+
+    law: the function. inputs: function that converts and checks its result. every: number of steps
+    from one row of the run to the next. hold: number of steps of a control period. The inputs that
+    apply at the rows are stored.
+    """
 
     def __init__(
         self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int, hold: int
@@ -58,7 +68,7 @@ class FeedbackLaw:
         self.last: Any = None
 
     def __call__(self, t: float, q: Array, qd: Array) -> Array:
-        """Evaluate the function at the start of a control period."""
+        """Return the inputs (nu,) of the control period that begins at time t, s; they are stored."""
         self.last = evaluate_law(self.law, self.inputs, t, q, qd)
         self.calls += 1
         rows = -(-self.calls * self.hold // self.every)  # of the run before the next call
@@ -66,18 +76,21 @@ class FeedbackLaw:
         return self.last  # type: ignore[no-any-return]
 
     def rows(self, count: int, width: int) -> Array:
-        """Return the inputs applied from each row of the run on, (count, width)."""
+        """Return the inputs that apply from each of the `count` rows of the run on, (count, width).
+
+        width: number of inputs; nan if the function has not been called.
+        """
         last = np.full(width, np.nan) if self.last is None else self.last
         return np.array([*self.values, last][:count], last.dtype)
 
 
 class SampledSignal:
-    """The scene's signals as a feedback law, for a zero-order hold over control periods."""
+    """The scene's input signals as a function u(t, q, qd), for a zero-order hold."""
 
     def __init__(self, model: Functions, params: Any) -> None:
         self.model, self.params = model, params
 
     def __call__(self, t: float, q: Array, qd: Array) -> Array:
-        """Evaluate the signals at a state."""
+        """Return the scene's signals (nu,) at time t, s, and state q, qd."""
         values: Array = self.model.signal(q, qd, t, self.params)
         return values

@@ -15,7 +15,21 @@ SOME = 20  # runs of as many steps are checked against the stability limit, once
 
 
 class ModelInfo(Statics):
-    """A compiled scene with the metadata that runs need."""
+    """A compiled scene with the data that runs need, such as step size, methods and events.
+
+    Attributes
+    ----------
+    h, duration : float
+        Step size and duration of the scene, s.
+    tolerance : float or None
+        Tolerance of adaptive steps; None if the module was built without them.
+    methods : tuple of str
+        Names of the methods for fixed steps; the first is the default.
+    events : tuple of str
+        Names of the events.
+    source : path, System or None
+        What `eomc.load` built the module from; pictures need it.
+    """
 
     source: Any = None  # path or System that eomc.load built it from; pictures need it
 
@@ -24,7 +38,12 @@ class ModelInfo(Statics):
         methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
         events: tuple[str, ...] = (), constrained: tuple[Any, ...] = (), **scene: Any,
     ) -> None:  # fmt: skip
-        """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
+        """Create the model from a compiled extension module (cffi).
+
+        methods: (order, number of stages, stability limit h omega of undamped modes, stability
+        limit h lambda of decaying modes) by the name of the method. constrained: the fields of
+        `ConstraintRows`. scene: arguments of the base class. Others are as in the class docstring.
+        """
         super().__init__(extension, **scene)
         self.h, self.duration, self.tolerance = h, duration, tolerance
         self.events = events
@@ -38,12 +57,15 @@ class ModelInfo(Statics):
 
     @property
     def orders(self) -> dict[str, int]:
-        """The order of each method."""
+        """Order of each method, by its name."""
         return {name: order for name, (order, *_) in self._method_data.items()}
 
     @property
     def stability_limits(self) -> dict[str, tuple[float, float]]:
-        """The stability limits of each method: h omega undamped, h lambda decaying."""
+        """Stability limits of each method, by its name: largest h omega and largest h lambda.
+
+        omega is the frequency of an undamped mode, rad/s, lambda the rate of decay of a mode, 1/s.
+        """
         return {name: (turn, decay) for name, (_, _, turn, decay) in self._method_data.items()}
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -17,7 +17,11 @@ SHOWN = 12  # maximum number of coordinates in the table
 
 
 def html(run: Any) -> str:
-    """Return a run as HTML; free text of the scene is escaped, and nothing is loaded from URLs."""
+    """Return the summary of a run as HTML: status, final state, error and a small picture.
+
+    Free text of the scene is escaped, and nothing is loaded from URLs. The picture needs
+    matplotlib.
+    """
     model = run._model
     words = [f"{run.steps} steps of {run.method}, {run.description}"]
     words += [f"to t = {run.t[-1]:g} s"] if len(run) else []

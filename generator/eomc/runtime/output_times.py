@@ -31,10 +31,10 @@ _RARELY = 2**48  # steps from row to row: C stores the last state only
 
 @dataclass(eq=False, repr=False)
 class TimedRun(Run):
-    """A run by fixed steps with rows at output times.
+    """A run by fixed steps whose rows are at given output times.
 
-    steps: number of steps of size h. A run that stops early ends with its last valid state. All
-    else is as in a Run.
+    The attributes are those of a `Run`; `steps` is the number of steps of size h, not of rows. A
+    run that stops early ends with its last valid state.
     """
 
     _times: Array = field(kw_only=True)
@@ -44,13 +44,25 @@ class TimedRun(Run):
 
     @property
     def t(self) -> Array:
-        """The times of the rows, (n,), s."""
+        """Times of the rows, (n,), s."""
         return self._times
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return (q, qd) at times t (...,) within the run, each (..., nq), by repeating the steps.
+        """Return the state at times t within the run, by repeating the steps of the run.
 
-        Raises ValueError outside of the run.
+        Parameters
+        ----------
+        t : array_like, any shape
+            Times, s.
+
+        Returns
+        -------
+        q, qd : arrays of shape t.shape + (nq,)
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run.
         """
         times = within(self, t)
         unique_times, place = np.unique(times, return_inverse=True)
@@ -113,9 +125,10 @@ def as_times_and_steps(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, out: Any,
 ) -> tuple[Array | None, int | None]:  # fmt: skip
-    """Return the output times (n,) and the number of steps that cover them, or (None, steps).
+    """Return the output times (n,), s, and the number of steps of size h that cover them.
 
-    Raises ValueError if `times` is combined with another argument that determines the rows.
+    If `times` is None, return (None, steps). Raises ValueError if `times` is invalid or combined
+    with `steps`, `every` or `out`, which determine the rows as well.
     """
     if times is None:
         return None, steps
@@ -132,9 +145,30 @@ def run(
     acts: tuple[FeedbackLaw | None, Array | None, int, int], p: Array, method: str,
     progress: Callable[[int, int], None] | None,
 ) -> TimedRun:  # fmt: skip
-    """Run from checked arguments and return the run, whatever its status; times (n,) from t0 on.
+    """Simulate by fixed steps with rows at output times, from checked arguments.
 
-    acts: feedback law, constant inputs, stride of the inputs from step to step, steps per period.
+    Parameters
+    ----------
+    q, qd : (nq,) arrays
+        Initial state.
+    t0, h : float
+        Initial time and step size, s.
+    steps : int
+        Number of steps up to the last output time.
+    times : (n,) array
+        Output times from t0 on, s.
+    acts : tuple
+        Feedback law or None, constant inputs or None, stride of the inputs from step to step,
+        number of steps of a control period.
+    p : (np,) array
+        Parameters.
+    progress : callable or None
+        Function that is called with (completed steps, all steps).
+
+    Returns
+    -------
+    TimedRun
+        The run, whatever its status.
     """
     stepper = _IntervalStepper(model, q, qd, t0, h, steps, acts, p, method)
     rows = np.empty((2, len(times) + 1, model.nq), model.dtype)
@@ -175,7 +209,10 @@ def _count(times: Array, t0: float, h: float) -> int:
 
 
 class _IntervalStepper:
-    """A run in progress: the state after `completed` steps, and the workspace of C."""
+    """A run in progress: the state after `completed` steps, and the workspace of the C function.
+
+    The arguments are those of the function `run`.
+    """
 
     def __init__(
         self, model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int,
@@ -195,19 +232,22 @@ class _IntervalStepper:
 
     @property
     def state(self) -> Array:
+        """Positions and velocities after the last completed step, (2, nq)."""
         return self.pair[:, 1]
 
     @property
     def completed(self) -> int:
+        """Number of completed steps."""
         return int(self.work.completed)
 
     @property
     def evaluations(self) -> int:
+        """Number of evaluations of accelerations so far."""
         own = self.counted(self.work) if self.counted else self.stages * self.completed
         return int(own + self.extra_evaluations)
 
     def step_to(self, n: int, progress: Callable[[int, int], None] | None) -> str:
-        """Step until n steps are completed; return the status."""
+        """Step until n steps are completed; return the status, "ok" or the reason for stopping."""
         while self.completed < n:
             count = min(n - self.completed, self.chunk)
             if self.law:
@@ -223,7 +263,7 @@ class _IntervalStepper:
         return "ok"
 
     def interpolate(self, rest: float) -> tuple[Array, str]:
-        """Return the state `rest` seconds after the last step, and the status."""
+        """Return the state (2, nq) `rest` seconds after the last completed step, and the status."""
         if not rest:
             return self.state, "ok"
         work, pair = self.model._ffi.new(self.work_type), np.repeat(self.pair[:, 1:], 2, axis=1)
@@ -246,7 +286,10 @@ class _IntervalStepper:
         return STATUS[code & 7]
 
     def inputs(self) -> Any:
-        """Return the address of the next step's inputs; call the law if a period begins."""
+        """Return the address of the next step's inputs for C.
+
+        The feedback law is called first if a control period begins.
+        """
         period = self.completed // self.hold
         if self.law and self.period != period:
             self.current = self.law(self.t0 + self.completed * self.h, *self.state)
@@ -256,5 +299,5 @@ class _IntervalStepper:
 
     @property
     def applied(self) -> Any:
-        """Last values of the law; nan without one."""
+        """Inputs (nu,) that the feedback law returned last; nan if there is no law."""
         return np.nan if not self.law or self.current is None else self.current

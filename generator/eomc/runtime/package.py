@@ -25,10 +25,18 @@ MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all o
 
 
 class Identity(NamedTuple):
-    """Identity of the build that pickled a value, stored in the pickle.
+    """Identity of the build that pickled a value; it is stored in the pickle.
 
-    extension: its name ends with the digest of the build. digest: of the scene. The names are in
-    the order of the columns and indices of stored values.
+    Attributes
+    ----------
+    extension : str
+        Name of the extension module; it ends with the digest of the build.
+    digest : str
+        Digest of the scene.
+    dtype : str
+        Number type, such as "float64".
+    coordinates, parameters, inputs, events : tuple of str
+        Names, in the order of the columns and indices of stored values.
     """
 
     extension: str
@@ -42,9 +50,9 @@ class Identity(NamedTuple):
 
 @functools.cache
 def identity() -> tuple[Any, ...]:
-    """The `Identity` of this build, as a plain tuple, which any other build can read.
+    """Return the fields of the `Identity` of this build as a plain tuple, which any build can read.
 
-    () within eomc itself, which is no build.
+    Returns () within the package eomc itself, which is not a build.
     """
     package: Any = import_module(_BUILT)
     if (model := getattr(package, "_model", None)) is None:
@@ -56,12 +64,15 @@ def identity() -> tuple[Any, ...]:
 
 
 def own_model() -> Any:
-    """Return the model of this package."""
+    """Return the `Model` of the built package to which this module belongs."""
     return import_module(_BUILT)._model
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
-    """Return the result of __reduce__ for a value that `call_path(path, arguments)` recreates."""
+    """Return the result of `__reduce__` for a value that `call_path(path, arguments)` recreates.
+
+    path: such as "status.MotionError", relative to this package.
+    """
     if unpickler is None:
         return unpickled, (identity(), path, arguments)
     function, place = unpickler
@@ -69,7 +80,10 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
 
 
 def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
-    """Call the object at a path in this package, such as "status.MotionError"."""
+    """Return the result of the object at a path in this package, such as "status.MotionError".
+
+    The object is called with `arguments`.
+    """
     first, *rest = path.split(".")
     if first.startswith("_"):  # an attribute of the built package, not a module of its runtime
         start, names = import_module(_BUILT), [first, *rest]
@@ -80,17 +94,22 @@ def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
 
 
 def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
-    """Recreate a value that was pickled by a package of this name; pickle calls this."""
+    """Return the value that a package of this name has pickled; pickle calls this function.
+
+    pickled: the fields of the `Identity` of the build that pickled it. path, arguments: as in
+    `call_path`. Returns an `Unreadable` placeholder if this build cannot read the value.
+    """
     if why := refusal(pickled, path):
         return Unreadable(why, RuntimeError, (unpickled, (pickled, path, arguments)))
     return call_path(path, arguments)
 
 
 def refusal(pickled: tuple[Any, ...], path: str) -> str:
-    """Return the reason why this build cannot read a pickle of another build, or "".
+    """Return the reason why this build cannot read a pickle of another build, or "" if it can.
 
-    Code of another build is refused. Data of another build are read, with a warning, if their
-    columns have the same names in the same order.
+    pickled: the fields of the other build's `Identity`. path: what the pickle recreates. Code of
+    another build is refused. Data of another build are read, with a warning, if their columns have
+    the same names in the same order.
     """
     if path.startswith("status."):  # errors have a text alone
         return ""
@@ -160,9 +179,10 @@ _SPELLED = {"true": "True", "method": "methods"}  # of [run], as System.make has
 
 
 def option(key: str, value: str = "true") -> str:
-    """Return the option that a module is built with, as its user writes it.
+    """Return the option with which the user builds a module, as text for a message.
 
-    That is a key of [run] for a scene, an argument for a System.
+    For a scene it is a key of [run], such as "[run] linearize = true"; for a System it is an
+    argument of System.make.
     """
     if not is_built_from_system():
         return f"[run] {key} = {value}"
@@ -172,19 +192,19 @@ def option(key: str, value: str = "true") -> str:
 
 
 def named_outputs() -> str:
-    """Return where the user names the outputs of a module."""
+    """Return text for a message that says where the user names the outputs of a module."""
     where = "System.make(..., outputs={...})" if is_built_from_system() else "[outputs]"
     return f"name them in {where}"
 
 
 def is_built_from_system() -> bool:
-    """Return True if this package is built from a System that `System.make` returned."""
+    """Return True if this package was built from a `System` of Python, not from a scene in TOML."""
     package = import_module(_BUILT)
     return bool(getattr(package, "_from_python", False))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
+    """Return text such as "; did you mean 'm_c'?" if a known name is similar to `name`, else ""."""
     import difflib  # of use here alone
 
     known = [*known]
@@ -194,7 +214,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 
 def initial_value_message(model: Any, name: str) -> str:
-    """Return the message that a name is a coordinate, not a parameter."""
+    """Return a message that `name` is a coordinate, not a parameter, with a remedy."""
     if name in model.discrete_coordinates:
         return (
             f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
@@ -213,7 +233,10 @@ _CALLED = {
 
 
 def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]) -> TypeError:
-    """Return the error for an unknown argument of a function, with a suggestion."""
+    """Return the TypeError for an unknown argument of a function, with a suggestion.
+
+    call: the function. unknown: the unknown arguments by name, of which the first is reported.
+    """
     from inspect import signature  # of use here alone
 
     name, known = next(iter(unknown)), [*signature(call).parameters][:-1]  # all but **unknown
@@ -230,7 +253,7 @@ def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]
 
 
 def warn(words: str) -> None:
-    """Issue a RuntimeWarning at the line outside of built packages that called into them."""
+    """Issue a RuntimeWarning that points to the user's line that called into a built package."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _of_eomc(str(frame.f_globals.get("__package__"))):
         level, frame = level + 1, frame.f_back
@@ -251,10 +274,10 @@ _CONSTRAINED = (*CONSTRAINED, "constraint_names", "loops", "reactions")
 
 
 class Package(ModuleType):
-    """The class of a built package."""
+    """Class of a built package (module): explains missing names and refuses assignments."""
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError, with the reason for names that need constraints."""
+        """Raise AttributeError; for names that exist only with constraints, the message says so."""
         model = self.__dict__.get("_model")
         if model is not None and name in _CONSTRAINED:
             there = "a scene has them by [constraints] or [[loop]]"
@@ -315,7 +338,10 @@ class Package(ModuleType):
 
 
 class Defaults(dict[str, float]):
-    """The scene's parameter values, read-only since the C code would not see a change."""
+    """The scene's parameter values by name.
+
+    Assignments raise TypeError, since the C code would not see a change.
+    """
 
     def _refused(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError(

@@ -11,9 +11,10 @@ from .package import no_argument
 
 
 def require_eomc(module: str, what: str = "runs are drawn") -> Any:
-    """Import eomc.`module`. Raises ImportError with the remedy where eomc is not installed.
+    """Import and return the module `eomc.<module>` of an installed eomc.
 
-    Only pictures, and events that the scene does not define, need it.
+    what: part of the message that needs eomc. Raises ImportError, with the remedy, if eomc is not
+    installed. Only pictures, and events that the scene does not define, need it.
     """
     try:
         return import_module(f"eomc.{module}")
@@ -27,11 +28,12 @@ def require_eomc(module: str, what: str = "runs are drawn") -> Any:
 
 
 def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    """Return the model extended by the events in `arguments`, and the remaining arguments.
+    """Return the model extended by additional events, and the remaining arguments of the call.
 
-    A parameter that a jump sets is a state of the extended model, not a parameter: only the
-    parameters that differ from the scene's values are passed on. Raises TypeError for unknown
-    arguments.
+    call: the method that the user called. arguments: all its local variables, including "self",
+    "events" and "unknown" (arguments that it does not have). A parameter that a jump sets is a
+    state of the extended model, not a parameter: only the parameters that differ from the scene's
+    values are passed on. Raises TypeError for unknown arguments.
     """
     model, events, unknown = (arguments.pop(name) for name in ("self", "events", "unknown"))
     if unknown:
@@ -44,7 +46,10 @@ def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
 
 
 def eventful(model: Any, events: Any) -> Any:
-    """Return the model extended by `events`; it is built at the first call."""
+    """Return the model extended by `events`, a mapping of additional events by name.
+
+    The extended module is compiled at the first call and reused afterwards.
+    """
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = require_eomc("pipeline", "events of a run are compiled").with_events
