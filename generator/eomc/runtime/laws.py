@@ -68,7 +68,7 @@ class FeedbackLaw:
         self.last: Any = None
 
     def __call__(self, t: float, q: Array, qd: Array) -> Array:
-        """Return the inputs (nu,) of the control period that begins at time t, s; they are stored."""
+        """Return, and store, the inputs (nu,) of the control period that begins at time t, s."""
         self.last = evaluate_law(self.law, self.inputs, t, q, qd)
         self.calls += 1
         rows = -(-self.calls * self.hold // self.every)  # of the run before the next call

@@ -24,7 +24,21 @@ MAX_ROWS = 20_000  # of a drawn curve
 
 @dataclass(frozen=True)
 class Curve:
-    """A named quantity over the rows of a run; kind: "coordinates", "velocities", "outputs", ..."""
+    """A named quantity over the rows of a run, with what a figure prints about it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the column, such as "theta_dot".
+    values : (n,) array
+        Value at each row.
+    unit : str
+        Unit, or "".
+    kind : str
+        "coordinates", "velocities", "angles" (wrapped), "inputs", "outputs", "time" or "energy".
+    symbol : str
+        The name in mathtext; by default it follows from `name`.
+    """
 
     name: str
     values: Array
@@ -34,12 +48,12 @@ class Curve:
 
     @property
     def text(self) -> str:
-        """The name in mathtext."""
+        """The name in the mathtext of matplotlib."""
         return self.symbol or mathtext(self.name)
 
 
 def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
-    """Group curves into panels by kind, unit and size, with a few curves per panel."""
+    """Group curves into panels by kind, unit and size; return the list of panels."""
     panels: list[list[Curve]] = []
     for kind in dict.fromkeys((c.kind, c.unit) for c in curves):
         mine = [c for c in curves if (c.kind, c.unit) == kind]
@@ -69,12 +83,15 @@ def _by_size(curves: Sequence[Curve]) -> list[list[Curve]]:
 
 
 def wrapped(values: Array) -> Array:
-    """Angles in [-pi, pi)."""
+    """Return angles, rad, reduced to the interval [-pi, pi)."""
     return np.asarray((values + np.pi) % (2 * np.pi) - np.pi)
 
 
 def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
-    """Insert nan into a curve where an angle jumps by a turn, so that no line is drawn there."""
+    """Return the curve (x, y) with nan inserted where one of `angles` jumps by a turn.
+
+    No line is drawn there. The arrays x, y and each of `angles`, rad, are (n,).
+    """
     jumps = np.flatnonzero(sum(np.abs(np.diff(a)) > np.pi for a in angles)) + 1
     return np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan)
 
@@ -82,7 +99,10 @@ def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
 def against(
     axes: Any, x: Array, curves: Sequence[Curve], suffix: str = "", **style: Any
 ) -> list[Any]:
-    """Curves over x with their labels; its axis says what they are, in which unit."""
+    """Plot curves over x into the Axes of matplotlib and label its y axis; return the new lines.
+
+    suffix: text that is appended to the labels of the curves. style: arguments of `Axes.plot`.
+    """
     every = max(len(x) // MAX_ROWS, 1)
     lines = []
     for curve in curves:
@@ -96,7 +116,11 @@ def against(
 
 
 class Source:
-    """The curves of a run by name, with what they are."""
+    """The columns of a run as curves, with their units, kinds and symbols.
+
+    wrap: names of the angles that are reduced to [-pi, pi); True: all coordinates in rad. Raises
+    KeyError if one of these names is unknown.
+    """
 
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
         model, run = run._model, getattr(run, "_drawn", run)
@@ -117,7 +141,10 @@ class Source:
         return [*self.coordinates, *self._inputs, *self._outputs, "energy"]
 
     def curve(self, name: str) -> Curve:
-        """A column by its name. Raises KeyError with the names there are."""
+        """Return the column `name` of the run as a Curve.
+
+        Raises KeyError, with the known names, for an unknown one.
+        """
         values = np.asarray(self.run[name], float)
         rate = name.removesuffix("_dot")
         if name != rate and rate in self.coordinates:
@@ -140,7 +167,7 @@ def plot(
     labels: Sequence[str] | None, wrap: bool | Collection[str], ax: Any, axes: Any,
     file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
-    """See `Run.plot`."""
+    """Draw a run with matplotlib and return the Axes; the arguments are those of `Run.plot`."""
     no_files(names)
     others = [other] if hasattr(other, "_model") else [*(other or ())]
     sources = [Source(each, wrap) for each in (run, *others)]
@@ -163,14 +190,14 @@ def plot(
 
 
 def no_files(names: Sequence[str]) -> None:
-    """A ValueError where a name is a file's."""
+    """Raise ValueError if one of the names of columns is the name of a picture file."""
     for name in names:
         if str(name).endswith((".png", ".pdf", ".svg")):
             raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
 
 
 def finished(all_axes: Sequence[Any], file: File | None) -> Any:
-    """The Axes, or an array of several; their figure is written to the file, if there is one."""
+    """Write the figure of the Axes to `file`, if given; return the Axes, or an array of several."""
     if file is not None:
         figure = all_axes[0].figure
         getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole
@@ -186,7 +213,7 @@ def _suffixes(count: int, labels: Sequence[str] | None) -> list[str]:
 
 
 def _pairs(phase: Any, source: Source) -> list[tuple[str, str]]:
-    """(x, y) of each portrait: of a coordinate over its rate, or of two names."""
+    """Return the columns (x, y) of each portrait: a coordinate and its velocity, or a pair."""
     if phase is None:
         return []
     if isinstance(phase, tuple) and len(phase) == 2 and all(isinstance(x, str) for x in phase):
@@ -200,7 +227,11 @@ def _pairs(phase: Any, source: Source) -> list[tuple[str, str]]:
 
 
 def new_axes(panels: int, portraits: int = 0) -> list[Any]:
-    """New axes: panels below each other over one time, portraits beside them."""
+    """Return the Axes of a new figure: first those of the panels, then those of the portraits.
+
+    panels: number of panels below each other, with a common time axis. portraits: number of phase
+    portraits, drawn beside them.
+    """
     pyplot = imported("matplotlib.pyplot", "plot")
     width, height = 10.5 if panels and portraits else 6.4, max(4.8, 1.7 * panels, 3.2 * portraits)
     figure = pyplot.figure(figsize=(width, height), layout="constrained")
@@ -214,7 +245,11 @@ def new_axes(panels: int, portraits: int = 0) -> list[Any]:
 
 
 def check_axes(ax: Any, axes: Any, count: int) -> list[Any]:
-    """Return the axes of the user, one for each panel. Raises ValueError for another number."""
+    """Return the user's Axes as a list, one for each of `count` panels.
+
+    ax: one Axes, or None. axes: array of Axes, or None. Raises ValueError if both are given or
+    their number differs from `count`.
+    """
     if ax is not None and axes is not None:
         raise ValueError("ax, axes: give one of them")
     all_axes = [ax] if ax is not None else [*np.ravel(axes)]
@@ -252,7 +287,7 @@ def _portrait(
     axes: Any, sources: Sequence[Source], x: str, y: str, suffixes: Sequence[str],
     section: Mapping[str, Array] | None, style: Mapping[str, Any],
 ) -> None:  # fmt: skip
-    """y over x; of a section, its points alone."""
+    """Draw the column y over the column x of each source; with a section, only its points."""
     for source, suffix in zip(sources, suffixes, strict=True):
         first, second = source.curve(x), source.curve(y)
         if section is not None:

@@ -31,7 +31,7 @@ _KIND = "eomc {} 1"  # name of the class and version of the format
 
 
 def write(run: Any, path: Path) -> None:
-    """Write a run or batch: its columns, and the arguments that reproduce it."""
+    """Write a run or batch to an .npz file: its columns, and the arguments that reproduce it."""
     model = run._model
     arrays: dict[str, Any] = {
         "kind": _KIND.format(type(run).__name__), "scene": model.name, "digest": model.digest,
@@ -58,10 +58,11 @@ def _text(events: Any) -> str:
 
 
 def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
-    """Return the model of a saved run, its kind, one of KINDS, and its arrays.
+    """Return the model of a saved run, the name of the run's class, and its arrays by name.
 
-    The model is extended if the run had additional events. Raises ValueError if the file is not a
-    saved run of the scene; warns if it is of another version of the scene.
+    The class is one of KINDS. The model is extended if the run had additional events. A warning is
+    issued if the run is of another version of the scene. Raises ValueError if the file is not a
+    saved run of the scene, OSError if it cannot be read.
     """
     arrays = _arrays(file)
     kind = next((k for k in KINDS if str(arrays.get("kind")) == _KIND.format(k)), "")

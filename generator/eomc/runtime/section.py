@@ -15,7 +15,11 @@ _ROUNDING = 16  # ulp of the largest value: distance from a level within which a
 def as_section(
     known: Iterable[str], name: str, value: Any, rising: Any, period: Any
 ) -> tuple[float, bool | None, float | None]:
-    """Check value, rising and period, and return them. Raises KeyError and ValueError."""
+    """Check the arguments of `Run.section` and return (value, rising, period).
+
+    known: names of the columns. Raises KeyError if `name` is not among them, ValueError for invalid
+    values.
+    """
     if name not in known:
         raise KeyError(not_one_of("section", name, tuple(known)))
     value = as_number(value, "value")
@@ -29,9 +33,11 @@ def as_section(
 def crossings(
     columns: Mapping[str, Array], name: str, value: float, rising: bool | None, period: float | None
 ) -> dict[str, Array]:
-    """Interpolate all columns where one crosses a value, by cubics through rows; see `Run.section`.
+    """Return all columns (m,) of a run at the times when the column `name` crosses `value`.
 
-    Two rows of the same time are a jump: no cubic spans it, and a jump is no crossing.
+    columns: arrays (n,) by name, including "t". rising, period: as in `Run.section`. Columns are
+    interpolated by cubics through four rows. Two rows of the same time are a state jump: no cubic
+    spans it, and a jump is not a crossing. Raises ValueError for fewer than four rows.
     """
     t, column = columns["t"], columns[name]
     f, n = np.asarray(column, float) - value, len(t)

@@ -10,12 +10,20 @@ _MAX_GROWTH = 16.0  # of a slice over the one before, since the first rows may b
 
 
 def next_chunk(count: int, elapsed: float, seconds: float = _SECONDS) -> int:
-    """Return the size of the next chunk after `count` items took `elapsed` seconds."""
+    """Return the number of items that are expected to take `seconds`.
+
+    The time per item is that of the last chunk, `count` items in `elapsed` seconds. The number
+    grows or shrinks by at most a factor of 16.
+    """
     return int(count * min(_MAX_GROWTH, max(1 / _MAX_GROWTH, seconds / (elapsed + 1e-9)))) + 1
 
 
 def slices(count: int, first: int) -> Iterator[tuple[int, int]]:
-    """Yield (start, size) of slices that cover `count` rows: `first` rows, then some 50 ms each."""
+    """Yield (start, size) of consecutive slices of `count` rows.
+
+    The first slice has `first` rows. The size of each further one follows from the time that the
+    caller spent on the one before, so that a slice takes some 50 ms.
+    """
     start, size = 0, first
     while start < count:
         size = min(size, count - start)

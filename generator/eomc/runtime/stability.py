@@ -13,7 +13,7 @@ from .metadata import ModelInfo
 
 
 def beyond_end(h: float, duration: float) -> str | None:
-    """Return a message if one step is longer than the duration, else None."""
+    """Return a message if the step size h, s, is larger than the duration, s, else None."""
     if not 0 < duration < h * (1 - 1e-12):
         return None
     return (
@@ -26,9 +26,13 @@ def advice(
 ) -> str | None:
     """Return a message if h is beyond the stability limit of the method at a state, else None.
 
-    The limit is that of the eigenvalues of the linearised motion: largest |imaginary part| and
-    fastest decay against the method's two limits. A mode whose speed depends on the width of the
-    finite differences comes from a discontinuity of the forces and does not count.
+    q, qd: state (nq,). h: step size, s. t: time, s. u: inputs (nu,), or None for the scene's
+    signals.
+
+    The limit follows from the eigenvalues of the linearised motion: their largest |imaginary part|
+    and their fastest decay are compared with the two limits of the method. A mode whose speed
+    depends on the width of the finite differences comes from a discontinuity of the forces and is
+    ignored.
     """
     undamped, decaying = model.stability_limits[method]
     modes = _fastest_modes(model, q, qd, t, u, params, 1.0)

@@ -28,18 +28,35 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def is_by_name(q0: Any, qd0: Any) -> bool:
-    """Whether positions or velocities are mappings by name."""
+    """Return True if the initial positions or velocities are mappings by name."""
     return hasattr(q0, "keys") or hasattr(qd0, "keys")
 
 
 def initial_state_for_parameters(
     model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
 ) -> tuple[Any, Any]:
-    """Return the initial state; missing values are the scene's, evaluated at the parameters p.
+    """Return the initial state (q0, qd0) for given parameters, completed from the scene.
 
-    q0, qd0: arrays, which are returned unchanged, mappings from names of coordinates, or None.
-    p: (np,), or (n, np), for which the result has n rows; many_values: values of the mappings may
-    be (n,). Raises ValueError for unknown names, and if a formula has no finite value.
+    Values that are not given are those of the scene, whose formulas are evaluated at the
+    parameters.
+
+    Parameters
+    ----------
+    q0, qd0 : array, mapping or None
+        Arrays are returned unchanged. Mappings give values by the names of coordinates.
+    p : (np,) or (n, np) array
+        Parameters; with (n, np) the completed arrays are (n, nq).
+    many_values : bool
+        Whether values of the mappings may be (n,), one for each instance.
+
+    Returns
+    -------
+    q0, qd0 : (nq,) or (n, nq) arrays
+
+    Raises
+    ------
+    ValueError
+        For unknown names, or if a formula has no finite value.
     """
     mappings = [values_by_name(model, x, half, many_values) for half, x in enumerate((q0, qd0))]
     many = _instances(mappings, p.shape[:-1])
@@ -90,9 +107,11 @@ def _instances(
 def values_by_name(
     model: Constrained, x: Any, half: int, many: bool = False
 ) -> dict[str, Array] | None:
-    """Return the values of a mapping by coordinate; {} for None, and None for an array.
+    """Return the values of a mapping of initial values by the names of coordinates.
 
-    half: 0 for q, 1 for qd. Keys of velocities are names of coordinates, with or without _dot.
+    half: 0 if x are positions q, 1 if they are velocities, whose names may end with "_dot". many:
+    values may be (n,), one for each instance. Returns {} if x is None, and None if x is an array.
+    Raises ValueError for unknown names.
     """
     if x is None:
         return {}

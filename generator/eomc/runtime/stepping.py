@@ -27,17 +27,42 @@ _MOST = 2**60  # steps, so that C can return four times as many
 
 
 class Stepping(ModelInfo):
-    """A compiled scene with step functions."""
+    """A compiled scene with the functions for single steps."""
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Parameters = None, method: str | None = None,
         out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return (q, qd) after one step of size h; u, (nu,) or a dict, is constant over the step.
+        """Return the state (q, qd) after one step of size h. Events are not detected.
 
-        u None: the scene's signals, as functions of time in the step. Events are not detected.
-        Raises MotionError if the step fails; `out` is unchanged then.
+        Parameters
+        ----------
+        q, qd : (nq,) array_like
+            State before the step.
+        h : float, optional
+            Step size, s; by default that of the scene.
+        t : float
+            Time at the start of the step, s.
+        u : (nu,) array_like or mapping by name, optional
+            Inputs, constant over the step. By default the scene's signals, which are evaluated as
+            functions of time and state within the step.
+        params : mapping or (np,) array_like, optional
+            Parameters that differ from those of the scene.
+        method : str, optional
+            Name in `methods`; by default the first.
+        out : (q, qd), optional
+            Arrays (nq,) that receive the result.
+
+        Returns
+        -------
+        q, qd : (nq,) arrays
+            State after the step, at t + h.
+
+        Raises
+        ------
+        MotionError
+            If the step fails; `out` is unchanged then.
         """
         from_q, from_qd, at, moving = self._read(q, qd, many=False)
         h = self.h if h is None else as_step_size(h, self.dtype)

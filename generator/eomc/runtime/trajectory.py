@@ -33,16 +33,36 @@ NOISE = (
 
 @dataclass(eq=False, repr=False)
 class Run(Trajectory):
-    """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
+    """A trajectory: the states at the rows of a simulation, and quantities that follow from them.
 
-    status: "ok", "singular", "not finite", "no convergence", under constraints "locked", or
-    "interrupted". A run with another status than "ok" ends with its last valid state; `message`
-    gives the time and the reason. energy (n,): K + P, computed at the first access. steps: number
-    of steps of size h by `method`, with a row after `every` so many. evaluations: number of
-    evaluations of accelerations. error: an Estimate, if it was requested.
+    Columns are read by name as well: run["theta_dot"].
 
+    Attributes
+    ----------
+    t : (n,) array
+        Times of the rows, s.
+    q, qd : (n, nq) arrays
+        Positions and velocities.
+    u : (n, nu) array
+        Inputs.
+    energy : (n,) array
+        K + P, J, computed at the first access.
+    status : str
+        "ok", "singular", "not finite", "no convergence", with constraints "locked", or
+        "interrupted". A run with another status than "ok" ends with its last valid state.
+    message : str
+        The outcome; if the run stopped, the time and the reason.
+    h, method, steps, every : float, str, int, int
+        Step size, s, method and number of completed steps; there is a row after each `every` steps.
+    evaluations : int
+        Number of evaluations of accelerations.
+    error : Estimate or None
+        Error estimate, if `estimate` was called or requested.
+
+    Notes
+    -----
     Runs are equal if their scenes, settings and rows are equal, bit by bit. A pickled run contains
-    all of these, its parameters and its inputs, except a u that is a function; then estimate()
+    all of these, its parameters and its inputs, except a u that is a function; `estimate` then
     raises ValueError. An unpickled run belongs to the build that pickled it. If that build no
     longer exists, it belongs to the present build, with a warning, if the columns have the same
     names.
@@ -51,11 +71,25 @@ class Run(Trajectory):
     error: Estimate | None = field(default=None, init=False)
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return (q, qd) at times t (...,) within the run, each (..., nq).
+        """Return the state at any time within the run.
 
         A shorter step of the method from the last row before yields the state, with the order of
-        the method. Raises ValueError outside of the run, or if u was a function whose values are
-        not stored at each step.
+        the method.
+
+        Parameters
+        ----------
+        t : array_like, any shape
+            Times, s.
+
+        Returns
+        -------
+        q, qd : arrays of shape t.shape + (nq,)
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run, or if u was a function whose values are not stored at
+            each step.
         """
         return states(self, t)
 
@@ -63,14 +97,18 @@ class Run(Trajectory):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Occurrences of each event by its name; empty for scenes without events."""
+        """Occurrences of each event, as an EventLog by its name; empty for scenes without events."""
         return ByName("events", (), ())
 
     def balance(self) -> Balance | None:
-        """Return the energy balance: work of inputs and forces, losses and the error left, J.
+        """Return the energy balance of the run, J, and the numerical error that it reveals.
 
-        The work of jumps is a separate term. None if the inputs at the rows are unknown, as those
-        of a function with `every`, or if an energy or a force is not finite.
+        Returns
+        -------
+        Balance or None
+            Work of inputs, forces and state jumps, and dissipated energy. None if the inputs at the
+            rows are unknown, as those of a function with `every`, or if an energy or a force is not
+            finite.
         """
         return balance(self)
 
@@ -80,15 +118,45 @@ class Run(Trajectory):
         wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None,
         file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
-        """Curves over time by name; coordinates, inputs, outputs and energy where none is given.
+        """Plot columns of the run over time, or phase portraits, with matplotlib.
 
-        Names of one kind, unit and size share a panel. phase: a coordinate, drawn over its rate, a
-        pair of names, or a list of such; section: what `section` returns, drawn there as points.
-        other: runs beside this one, dashed; labels: names of the runs, in a legend. wrap: angles
-        from -pi to pi, those in rad or the named ones, without lines where they jump. ax: one Axes
-        for all, axes: one a panel. file: where the figure is written, too. style: for matplotlib's
-        `plot`. Returns the Axes, an array of several. Raises ModuleNotFoundError without
-        matplotlib, KeyError for unknown names.
+        Parameters
+        ----------
+        *names : str
+            Names of columns; by default coordinates, inputs, outputs and energy, or none if `phase` is
+            given. Columns of the same kind, unit and size share a panel.
+        phase : str, pair of str, or list of these, optional
+            Phase portraits: a coordinate, drawn with its velocity on the y axis, or a pair (x, y).
+        section : dict, optional
+            Result of `section`, whose points are drawn in the portraits instead of curves.
+        other : Run or sequence of Run
+            Runs that are drawn dashed in the same panels.
+        labels : sequence of str, optional
+            Names of the runs for the legend, that of this run first.
+        wrap : bool, str or sequence of str
+            Angles that are drawn from -pi to pi, without lines where they jump: the named ones, or
+            with True all coordinates in rad.
+        ax : Axes, optional
+            One Axes for all columns.
+        axes : sequence of Axes, optional
+            One Axes for each panel.
+        file : str or path, optional
+            File to which the figure is written as well.
+        **style
+            Arguments of `Axes.plot` of matplotlib.
+
+        Returns
+        -------
+        Axes or array of Axes
+
+        Raises
+        ------
+        ModuleNotFoundError
+            Without matplotlib.
+        KeyError
+            If a name is unknown.
+        ValueError
+            If the number of `axes` or `labels` does not fit.
         """
         return plot(self, names, phase, section, other, labels, wrap, ax, axes, file, style)
 
@@ -96,14 +164,36 @@ class Run(Trajectory):
         self, name: str, value: float = 0.0, *, rising: bool | None = None,
         period: float | None = None,
     ) -> dict[str, Array]:  # fmt: skip
-        """All columns (m,) where one of them crosses a value: a Poincaré section.
+        """Return all columns at the instants when one column crosses a value: a Poincaré section.
 
-        rising: only where it grows, or only where it falls. period: whole periods above and below
-        the value count too, as 2 pi of an angle, or of t that of a drive. Each column is a cubic
-        through four rows: errors go as the fourth power of the time between rows, and crossings
-        closer than rows are missed, so keep every=1. By a tolerance, and of scenes with events,
-        states within the steps place crossings: as exact as these; a jump crosses nothing. Raises
-        ValueError below four rows.
+        Columns are interpolated by cubics through four rows, with an error of fourth order in the
+        time between rows. Crossings closer than rows are missed, so simulate with every=1. Adaptive
+        runs and runs with events use states within the steps, which are as accurate as the steps. A
+        state jump is not a crossing.
+
+        Parameters
+        ----------
+        name : str
+            Column that crosses the value.
+        value : float
+            The value, in the unit of the column.
+        rising : bool, optional
+            True: only crossings where the column increases; False: only where it decreases.
+        period : float, optional
+            Multiples of this period, added to the value, count as well: 2 pi for an angle, or the
+            period of the excitation for the column "t".
+
+        Returns
+        -------
+        dict
+            Arrays (m,) by the name of the column, for m crossings.
+
+        Raises
+        ------
+        ValueError
+            If the run has fewer than four rows.
+        KeyError
+            If the name is unknown.
         """
         return self._crossings(name, *as_section(self._columns(), name, value, rising, period))
 
@@ -124,12 +214,30 @@ class Run(Trajectory):
     def animate(
         self, file: File | None = None, *others: Run, scene: Any = None, title: str | None = None
     ) -> Any:
-        """The motion as a page that plays it, for browsers and notebooks, or as a film.
+        """Animate the motion as a page for browsers and notebooks, or as a film.
 
-        file: where it is written, a page .html, or a film .gif or .mp4, which need matplotlib;
-        others: runs that are shown beside it. scene: the path of the scene, where the module was
-        not loaded by eomc.load. Returns an Animation; see docs/pictures.md. Raises ImportError
-        without eomc, EomcError where it can't be drawn or written.
+        Parameters
+        ----------
+        file : str or path, optional
+            File to write: a page .html, or a film .gif or .mp4, which needs matplotlib.
+        *others : Run
+            Runs that are shown beside this one.
+        scene : path, optional
+            The scene, if the module was not loaded by `eomc.load`.
+        title : str, optional
+            Title of the page.
+
+        Returns
+        -------
+        Animation
+            See docs/pictures.md.
+
+        Raises
+        ------
+        ImportError
+            Without eomc.
+        EomcError
+            If the motion cannot be drawn or the file cannot be written.
         """
         page = require_eomc("report.animation")
         return page.animate([self, *others], file, scene=scene, title=title)
@@ -162,11 +270,27 @@ class Run(Trajectory):
         return pixels
 
     def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:
-        """The run's own error, by doing it again in shorter steps; kept in `error`.
+        """Estimate the error of the run by repeating it in shorter steps; store it in `error`.
 
-        Where u is a function, it is called again, as often as in the run for each finer one.
-        Warns where the motion is not resolved. Raises ValueError where the run was pickled and lost
-        that function, or where this gives other values at the start than it gave: noise.
+        If u is a function, it is called again in each repetition. A warning is issued if the motion
+        is not resolved.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Function that is called with (completed steps, expected number of steps).
+
+        Returns
+        -------
+        Estimate
+
+        Raises
+        ------
+        ValueError
+            If the run was pickled and has lost the function u, or if u returns other values at the
+            start than in the run, as noise does.
+        Interrupted
+            On Ctrl-C.
         """
         self._repeated()
         try:
@@ -191,7 +315,7 @@ class Run(Trajectory):
 
     @property
     def message(self) -> str:
-        """The outcome of the run, in a sentence."""
+        """The outcome of the run in a sentence: number of steps, or time and reason of the stop."""
         if self.status == "ok":
             return f"{self.steps} steps of {self.h:g} s"
         reason = infinite_at_start(self) or STATUS_MESSAGES[self.status]

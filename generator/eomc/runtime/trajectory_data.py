@@ -39,7 +39,23 @@ class _Half:
 
 @dataclass(eq=False, repr=False)
 class Trajectory(ConstrainedRun, Columns):
-    """Data of a run by fixed steps, and quantities that follow from them."""
+    """Data of a run by fixed steps, and quantities that follow from them.
+
+    Attributes
+    ----------
+    t0, h : float
+        Initial time and step size, s.
+    q, qd : (n, nq) arrays
+        Positions and velocities at the rows.
+    steps, every : int
+        Number of completed steps, and of steps from one row to the next.
+    status : str
+        "ok", or the reason for stopping.
+    method : str
+        Name of the method.
+    evaluations : int
+        Number of evaluations of accelerations.
+    """
 
     _model: Stepping
     t0: float
@@ -60,17 +76,17 @@ class Trajectory(ConstrainedRun, Columns):
     q, qd = _Half(0), _Half(1)
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return (q, qd) at any time within the run; subclasses implement it."""
+        """Return (q, qd), each (..., nq), at times t (...,), s; subclasses implement it."""
         raise NotImplementedError
 
     @cached_property
     def t(self) -> Array:
-        """The times of the rows, (n,), s."""
+        """Times of the rows, (n,), s."""
         return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
 
     @property
     def u(self) -> Array:
-        """The inputs applied at each row, (n, nu), within their limits.
+        """Inputs that act at each row, (n, nu), saturated at their limits.
 
         They are the signals at the row, or the inputs of the step that begins there; the last row
         has the inputs of the last step.
@@ -79,7 +95,7 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def saturated(self) -> Array:
-        """True for each input beyond its limits at each row, (n, nu)."""
+        """Array of bool (n, nu): True for each input that exceeds its limits at a row."""
         requested = self._requested_inputs
         return np.asarray(np.abs(requested - self._model._within(requested, self._params)) > 0)
 
@@ -101,14 +117,14 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def energy(self) -> Array:
-        """K + P along the run, (n,), J. The conserved quantity may be `jacobi` instead."""
+        """Energy K + P at each row, (n,), J. The conserved quantity may be `jacobi` instead."""
         if self._energy is None:
             self._energy = self._evaluate(self._model.energy)
         return self._energy
 
     @property
     def jacobi(self) -> Array:
-        """Jacobi's integral qd.dK/dqd - K + P along the run, (n,), J.
+        """Jacobi's integral qd . dK/dqd - K + P at each row, (n,), J.
 
         It equals the energy if K is purely quadratic in qd. Otherwise, as in a rotating frame, it
         is conserved instead of the energy if the power is zero.
@@ -117,7 +133,7 @@ class Trajectory(ConstrainedRun, Columns):
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
-        """The scene's outputs along the run by their names, (n,) each.
+        """The scene's outputs at the rows, arrays (n,) by name.
 
         nan where an output needs accelerations and D is singular.
         """
@@ -224,12 +240,12 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def x(self) -> Array:
-        """The states [q; qd], (n, 2 nq)."""
+        """States [q; qd] at the rows, (n, 2 nq)."""
         return np.hstack([self.q, self.qd])
 
     @property
     def description(self) -> str:
-        """The choice of the steps as text."""
+        """Text that describes the choice of steps, such as "h = 0.01 s"."""
         return f"h = {self.h:g} s"
 
     def __len__(self) -> int:
