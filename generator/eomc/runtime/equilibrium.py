@@ -71,25 +71,30 @@ def equilibrium(
     rows = _Rows(model, moved, t, params) if model.constraint_names else None
 
     def inputs(z: Array) -> Array | None:
+        """Return the inputs in z = [q; qd; u]; None for the signals of the scene."""
         return None if u is None else z[2 * n :]
 
     def forces(z: Array) -> Array:
+        """Return tau - C qd - g (nq,) at z."""
         at, moving = z[:n], z[n : 2 * n]
         tau = model.tau(at, moving, t, inputs(z), params)
         values: Array = tau.astype(float) - model.bias(at, moving, t=t, params=params)
         return values
 
     def residual(z: Array) -> Array:
+        """Return what Newton's method reduces to zero at z."""
         return rows.residual(z, forces(z)) if rows else forces(z)
 
     eps = float(np.finfo(model.dtype).eps)
     onto = rows.onto if rows else lambda z: z
 
     def D(z: Array) -> Array:
+        """Return the mass matrix (nq, nq) at z."""
         matrix: Array = model.D(z[:n], t=t, params=params)
         return matrix.astype(float)
 
     def directions(z: Array) -> Array:
+        """Return the directions (k, len(z)) in which z may change."""
         return rows.tangent_basis(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
 
     z, downhill, tried = onto(z), None, list[tuple[Array, Array]]()

@@ -158,7 +158,7 @@ class Frames(Functions):
     def jacobian(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Return the Jacobian J of a frame, with which J qd is the twist of the frame.
+        """Return the Jacobian J of a frame: J qd is the twist of the frame.
 
         Parameters
         ----------

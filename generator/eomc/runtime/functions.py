@@ -1,7 +1,7 @@
 """D, C, g, accelerations and the other functions of a state: arrays in, arrays out.
 
-Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well, and t (n,), u (n, nu) and
-parameters (n,) may be those of each state.
+q and qd are (nq,), or (n, nq) for n states. For n states the results have a leading axis n, and t
+may be (n,), u (n, nu), and the value of a parameter (n,).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at mo
 
 
 class StateFunction(NamedTuple):
-    """Describe a generated C function of a state.
+    """Shape of the result of a function of the state, and whether the function takes qd.
 
-    shape: function that returns the shape of the result at one state from the model. of_velocity:
-    whether the C function takes the velocities qd as well as q.
+    shape: returns the shape of the result at one state, from the model. of_velocity: whether the
+    generated C function takes the velocities qd as well as q.
     """
 
     shape: Callable[[Any], tuple[int, ...]]

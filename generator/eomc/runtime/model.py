@@ -1,7 +1,7 @@
-"""The Python interface of a compiled scene: arrays in, arrays out, the loop in C.
+"""The Python interface of a compiled scene: arrays in, arrays out; the loops are in C.
 
-This file and its neighbours are copied next to each compiled extension, so that a built scene needs
-NumPy and cffi only. Angles in rad, everything in SI units.
+The modules of this folder are copied into each built package, which therefore needs only NumPy and
+cffi. Angles are in rad, all other quantities in SI units.
 """
 
 from __future__ import annotations

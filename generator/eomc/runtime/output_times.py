@@ -102,6 +102,7 @@ class TimedRun(Run):
         error = estimate(whole, progress)
 
         def at_rows(values: Array) -> Array:
+            """Interpolate errors after each step linearly to the rows of this run."""
             return np.stack([np.interp(self.t, whole.t, column) for column in values.T], axis=1)
 
         return replace(error, q=at_rows(error.q), qd=at_rows(error.qd))

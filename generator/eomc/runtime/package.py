@@ -1,8 +1,8 @@
-"""A built package as a value: it and its results can be pickled, and it refuses assignments.
+"""Built packages as values: pickles of packages and results, and refusal of assignments.
 
-Functions are called with parameters; a
-parameter that is assigned to the module would change nothing there, or replace a function. Whoever
-means to, as a test may, writes to its dictionary: `vars(module)["simulate"] = ...`.
+A parameter is an argument of a call. One that is assigned to the module would change nothing, or
+replace a function, so assignments raise AttributeError. A test that needs an assignment writes to
+the dictionary of the module: `vars(module)["simulate"] = ...`.
 """
 
 from __future__ import annotations

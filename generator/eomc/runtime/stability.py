@@ -71,6 +71,7 @@ def _fastest_modes(
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
 
     def spectrum(ways: Array) -> tuple[float, float]:
+        """Return (largest |Im|, fastest decay) of the linearisation in the directions `ways`."""
         moved = near[:, None] * ways
         if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
             rates = model.linearize(q, qd, t=t, u=u, params=params)[0].astype(float) @ moved

@@ -35,7 +35,7 @@ STATUS_MESSAGES = {
 
 
 class MotionError(ArithmeticError):
-    """No acceleration or step exists at a state.
+    """Error that is raised if no acceleration or step exists at a state.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class MotionError(ArithmeticError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """KeyboardInterrupt (Ctrl-C) during a simulation.
+    """KeyboardInterrupt that is raised on Ctrl-C during a simulation.
 
     Attributes
     ----------

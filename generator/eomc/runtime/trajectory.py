@@ -97,7 +97,7 @@ class Run(Trajectory):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Occurrences of each event, as an EventLog by its name; empty for scenes without events."""
+        """Occurrences of each event, as an EventLog by its name; empty without events."""
         return ByName("events", (), ())
 
     def balance(self) -> Balance | None:
@@ -123,8 +123,8 @@ class Run(Trajectory):
         Parameters
         ----------
         *names : str
-            Names of columns; by default coordinates, inputs, outputs and energy, or none if `phase` is
-            given. Columns of the same kind, unit and size share a panel.
+            Names of columns; by default coordinates, inputs, outputs and energy, or none if `phase`
+            is given. Columns of the same kind, unit and size share a panel.
         phase : str, pair of str, or list of these, optional
             Phase portraits: a coordinate, drawn with its velocity on the y axis, or a pair (x, y).
         section : dict, optional
