@@ -26,18 +26,29 @@ _MAX_ROWS = 400_000  # rows of all pieces
 
 @dataclass(frozen=True)
 class Balance:
-    """Energy balance E(end) - E(0) = inputs + forces - dissipated + jumps, J.
+    """Energy balance of a run: E(end) - E(start) = inputs + forces - dissipated + jumps.
 
-    E is the energy, or the Jacobi integral if it differs.
+    E is the energy, or the Jacobi integral if it differs from the energy. The work is integrated
+    numerically along the rows of the run.
 
-    inputs : work of the inputs, including signals.
-    forces : work of all other forces and of prescribed motion.
-    dissipated : energy dissipated by forces that are odd in the velocities, such as friction.
-    error : largest difference of both sides along the run, the error of the method.
-    uncertainty : error bound of the quadrature of the work; smaller values of `error` cannot be
-        observed.
-    is_resolved : whether `uncertainty` is small compared with the work.
-    jumps : energy added by state jumps; negative for impacts.
+    Attributes
+    ----------
+    inputs : float
+        Work of the inputs, including the scene's signals, J.
+    forces : float
+        Work of all other forces that are not dissipative, and of prescribed motion, J.
+    dissipated : float
+        Energy dissipated by forces that are odd in the velocities, such as friction, J.
+    error : float
+        Largest difference between the two sides of the balance along the run, J. It is the
+        error of the integration method.
+    uncertainty : float
+        Error bound of the numerical integration of the work, J. Values of `error` below it are not
+        significant.
+    is_resolved : bool
+        Whether `uncertainty` is small compared with the work.
+    jumps : float
+        Energy added by state jumps, J; negative for impacts.
     """
 
     inputs: float
@@ -50,7 +61,7 @@ class Balance:
 
     @property
     def words(self) -> str:
-        """Describe supplied and dissipated energy and the numerical error in a sentence."""
+        """Return the supplied and dissipated energy and the numerical error as a sentence, in J."""
         if not self.is_resolved:
             return "steps are too long to tell what was put in and what was lost"
         ways = (
@@ -71,7 +82,10 @@ class Balance:
 
 @dataclass(frozen=True)
 class _PowerSamples:
-    """Samples t (n,), q, qd (n, nq) of a run for its power; u: inputs, (nu,) or (n, nu)."""
+    """States of a run at which the power of its forces is evaluated.
+
+    t : (n,) times, s. q, qd : (n, nq) states. u : (nu,) or (n, nu) inputs; None: the signals.
+    """
 
     model: Stepping
     params: Array
@@ -81,16 +95,19 @@ class _PowerSamples:
     u: Array | None
 
     def values(self, function: Callable[..., Any], **inputs: Any) -> Array:
-        """Evaluate a function of the states, (n, ...)."""
+        """Evaluate a function of the model, such as `model.power`, at all samples: (n, ...).
+
+        inputs: further arguments of the function, such as u.
+        """
         values = function(self.q, self.qd, t=self.t, params=self.params, **inputs)
         return np.asarray(values, float)
 
 
 def balance(run: Trajectory) -> Balance | None:
-    """Return the energy balance of a run.
+    """Return the energy balance of a run, or None if it cannot be computed.
 
-    None if the inputs cannot be determined from the rows, or an energy or force is not finite, as
-    at an initial state from which no step is possible.
+    It cannot be computed if the inputs are unknown, as those of a function u whose values are not
+    stored at each step, or if an energy or a force is not finite at a row.
     """
     if not np.isfinite(run.jacobi).all():
         return None
@@ -235,7 +252,11 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
 
 
 def with_jumps(run: Any) -> Any:
-    """Return the run with both rows of each jump, also if its rows are at requested times."""
+    """Return a run that has two rows at each state jump, before and after it.
+
+    This is the run itself, unless its rows are at requested times and it has events; then it is
+    repeated with a row after each step.
+    """
     event_indices = getattr(run, "_event_data", ((),))[0]
     if not len(event_indices) or (np.diff(run.t) == 0).any():
         return run

@@ -35,7 +35,10 @@ from .status import Interrupted
 
 
 class BatchModel(Instances):
-    """A model whose extension steps many instances at once."""
+    """Compiled scene that simulates many instances (independent copies) at once.
+
+    The instances differ in their initial states, parameters or inputs.
+    """
 
     @property
     def _kinds(self) -> dict[str, Any]:
@@ -52,20 +55,69 @@ class BatchModel(Instances):
         max_evaluations: int | None = None, events: Mapping[str, Any] | None = None,
         **unknown: Never,
     ) -> BatchRun:  # fmt: skip
-        """Simulate many instances; for other arguments see `simulate`.
+        """Simulate many instances of the scene and return their trajectories.
 
-        q0, qd0: (batch, nq), or (nq,) for all instances. params: a dict of numbers or (batch,)
-        arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
-        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step, or
-        over each control_period; a dict of all inputs by name, numbers, (batch,), (batch, steps)
-        or (1, steps).
-        threads: number of threads; by default one for each processor. An instance that cannot
-        continue, or whose start cannot be assembled, has its own status and does not affect the
-        others. Ctrl-C raises Interrupted with the run so far. tol: tolerance of adaptive steps,
-        which differ between instances. times: (n,), times of the rows, within duration; by default
-        adaptive steps have rows at the start and the end. max_evaluations: the number of
-        evaluations of accelerations after which an instance with adaptive steps begins no further
-        step; its status is then "too long". events: as in `simulate`.
+        An instance that cannot continue, or whose initial state cannot be moved onto the
+        constraints, gets its own status and does not affect the others.
+
+        Parameters
+        ----------
+        q0, qd0 : (batch, nq) or (nq,) array, or dict by name, optional
+            Initial positions and velocities of each instance, or the same of all; by default those
+            of the scene.
+        h : float, optional
+            Size of fixed steps, s; by default that of the scene.
+        duration : float, optional
+            Simulated time, s; by default that of the scene.
+        steps : int, optional
+            Number of fixed steps, instead of `duration`.
+        every : int
+            Number of fixed steps between two rows. The first and the last state also have a row.
+        params : dict, Params or (batch, np) array, optional
+            Parameters. The values of a dict are numbers, or arrays (batch,).
+        u : array or dict, optional
+            Inputs: (nu,) or (batch, nu), constant during the run; (batch, steps, nu) or
+            (1, steps, nu), one row for each step or for each `control_period`, constant over it; or
+            a dict of all inputs by name, whose values are numbers or have the shape (batch,),
+            (batch, steps) or (1, steps). By default the scene's signals.
+        threads : int, optional
+            Number of threads; by default one for each processor.
+        method : str, optional
+            Name of the method of fixed steps, one of `methods`; "auto": adaptive steps.
+        t0 : float
+            Time of the initial states, s.
+        control_period : float, optional
+            Time over which each row of `u` is constant, s.
+        progress : callable, optional
+            Called repeatedly with (done, total): the steps of all instances, or with adaptive
+            steps and with events the numbers of instances.
+        tol : float, optional
+            Tolerance of adaptive steps, whose sizes differ between instances. By default that of
+            the scene, if none of h, steps and method is given.
+        times : (n,) array, optional
+            Ascending times of the rows, s, within the duration. By default adaptive steps have rows
+            at the start and at the end only.
+        h_most : float, optional
+            Longest adaptive step, s.
+        stiff : bool
+            Begin adaptive steps with Newton's method.
+        max_evaluations : int, optional
+            Number of evaluations of the accelerations after which an instance with adaptive steps
+            begins no further step. Its status is then "too long".
+        events : dict, optional
+            Additional events by name, as in `simulate`.
+
+        Returns
+        -------
+        BatchRun
+            Trajectories with q and qd (batch, n, nq), and the status of each instance.
+
+        Raises
+        ------
+        ValueError
+            If an argument is invalid.
+        Interrupted
+            At Ctrl-C; its attribute `run` is the run up to that moment.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate_batch, dict(locals()))
@@ -121,34 +173,43 @@ class BatchModel(Instances):
         out: tuple[Array, Array] | None = None, threads: int | None = None,
         method: str | None = None, *, steps: int = 1,
     ) -> Array:  # fmt: skip
-        """Make steps of many instances, in place.
+        """Advance many instances by one or more steps of size h, in place.
 
         Parameters
         ----------
         q, qd : (batch, nq) arrays
-            The states, which are overwritten unless `out` is given.
+            States of the instances, which are overwritten unless `out` is given.
         h : float, optional
-            The step size, s; by default that of the scene.
+            Step size, s; by default that of the scene.
         t : float or (batch,) array
-            The time at the start, s, of all instances or of each.
+            Time before the first step, s, of all instances or of each.
         u : (nu,) or (batch, nu) array, or dict, optional
-            Inputs, held over all steps; by default the scene's signals.
+            Inputs, constant over all steps; by default the scene's signals.
         params : optional
             As in `simulate_batch`.
         out : pair of (batch, nq) arrays, optional
-            Where the new states are written.
+            Arrays into which the new states are written instead.
         threads : int, optional
-            The number of threads; by default one for each processor.
+            Number of threads; by default one for each processor.
         method : str, optional
-            The method; by default the first of the scene.
+            Name of the method, one of `methods`; by default the first of the scene.
         steps : int
-            The number of steps of size h.
+            Number of steps.
 
         Returns
         -------
         (batch,) array of integers
-            The status of each instance: 0 if all steps were made, else `STATUS[number]` says why
-            one could not be made; the state is then that before this step.
+            Status of each instance: 0 if all steps succeeded, else an index into the module's tuple
+            `STATUS`, whose text is the reason of the failure; the state is then that before the
+            failed step.
+
+        Raises
+        ------
+        ValueError
+            If an argument is invalid, or q and qd are not writeable, C-contiguous arrays of the
+            module's number type.
+        KeyboardInterrupt
+            At Ctrl-C.
         """
         if not isinstance(method, (str, NoneType)) or method not in self._batch_steps:
             self._method(method)  # raises, with those there are

@@ -14,7 +14,7 @@ from .starts import initial_state_for_parameters, is_by_name
 
 
 class Instances(Model):
-    """A model that takes arguments of many instances, and steps them."""
+    """Compiled scene whose arguments may describe many instances, with a row for each of them."""
 
     def __init__(self, extension: Any, **scene: Any) -> None:
         super().__init__(extension, **scene)
@@ -26,7 +26,7 @@ class Instances(Model):
         self._paces: dict[Any, float] = {}
 
     def step_batch(self, *_: Any, **__: Any) -> Any:
-        """Step many instances; implemented by `BatchModel`."""
+        """Advance many instances by one or more steps; implemented by `BatchModel.step_batch`."""
         raise NotImplementedError
 
     def _instances(

@@ -16,7 +16,11 @@ _ROWS_PER_CALL = 2**16  # rows of all instances in a call, which fit in the cach
 
 
 class Values:
-    """Mixin of `batch_run.BatchRun`: quantities of a run with the instance as first axis."""
+    """Mixin of `batch_run.BatchRun` with quantities that are evaluated at the rows of a batch.
+
+    The first axis of all results is the instance, the second one the row. Results are nan at rows
+    that are nan, that is, after an instance has failed.
+    """
 
     _model: ModelInfo
     q: Array
@@ -28,19 +32,26 @@ class Values:
 
     @property
     def energy(self) -> Array:
-        """Energy K + P, (batch, n), J. The conserved quantity may be `jacobi` instead."""
+        """Return the energy K + P of each instance at each row, (batch, n), J.
+
+        The conserved quantity may be `jacobi` instead.
+        """
         return self._evaluate(self._model.energy, ())
 
     @property
     def jacobi(self) -> Array:
-        """Jacobi integral qd.dK/dqd - K + P, (batch, n), J; the energy if K is quadratic in qd."""
+        """Return the Jacobi integral qd.dK/dqd - K + P at each row, (batch, n), J.
+
+        It equals the energy if the kinetic energy K is purely quadratic in qd.
+        """
         return self._evaluate(self._model.jacobi, ())
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
-        """Outputs of the scene by name, (batch, n) each, nan where rows are nan.
+        """Return the outputs of the scene as a dict from name to array (batch, n).
 
-        Outputs that depend on accelerations are also nan if D is singular.
+        Values are nan at rows that are nan. Outputs that depend on accelerations are also nan at
+        states with a singular mass matrix D.
         """
         names = self._model.outputs
         if not names:
@@ -50,7 +61,10 @@ class Values:
 
     @property
     def constraints(self) -> Mapping[str, Array]:
-        """Residual of each constraint by name, (batch, n)."""
+        """Return the residual of each constraint equation as a dict from name to array (batch, n).
+
+        Residuals are in the units of the constraint equations. Raises KeyError for unknown names.
+        """
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "constraints", names,
@@ -59,7 +73,10 @@ class Values:
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
-        """Lagrange multiplier of each constraint by name, (batch, n)."""
+        """Return the Lagrange multiplier of each constraint as a dict from name to (batch, n).
+
+        Raises KeyError for unknown names.
+        """
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "multipliers", names,
@@ -68,10 +85,11 @@ class Values:
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """Reaction of each [[loop]] on its second body by name, in world axes.
+        """Return the reaction of the joint of each [[loop]] on its second body, by the loop's name.
 
-        Force and moment about the joint's point, (batch, n, 6); in the plane (batch, n, 3), force
-        (2) and moment.
+        A reaction is the force, N, and the moment about the joint's point, N m, along the axes of
+        the world: (batch, n, 6), or (batch, n, 3) for plane scenes, with two components of the
+        force and the moment.
         """
         model, loops = self._model, self._model.loops
         shape = (len(loops), 3 if model._plane else 6)
