@@ -42,14 +42,23 @@ _ENDS = np.array([*STATUS, FULL])
 
 @dataclass(eq=False, repr=False)
 class AdaptiveBatchRun(BatchRun):
-    """Trajectories with adaptive steps, or with fixed steps and events.
+    """Trajectories of many instances with adaptive steps, or with fixed steps and events.
 
-    In addition to the attributes of a BatchRun, whose rows are at the same times for all instances:
+    All instances have rows at the same times. The attributes of `BatchRun` are supplemented by:
 
-    evaluations, rejected, stiff_steps : (batch,) counts of each instance.
-    reached : (batch,) time that each instance reached, s. Later rows are nan, as after an event
-        that stops an instance, or after max_evaluations (status "too long").
-    events : for each event t, q, qd and instance, by name, for one instance after the other.
+    Attributes
+    ----------
+    tol : float
+        Tolerance of adaptive steps; 0 for fixed steps.
+    evaluations, rejected, stiff_steps : (batch,) arrays of int
+        Numbers of evaluations of the accelerations, of rejected steps, and of steps by Newton's
+        method of each instance.
+    reached : (batch,) array
+        Time that each instance reached, s. Its later rows are nan, as after an event that stops it,
+        or after `max_evaluations` (status "too long").
+    events : dict of BatchEventLog
+        Times t, states q, qd and instances of the occurrences of each event, by the event's name,
+        sorted by instance.
     """
 
     tol: float = field(kw_only=True)
@@ -70,17 +79,21 @@ class AdaptiveBatchRun(BatchRun):
 
     @property
     def t(self) -> Array:
-        """The time of each row, (n,), s."""
+        """Return the times of the rows, (n,), s, which are the same for all instances."""
         return self._times
 
     @cached_property
     def status(self) -> Array:
-        """Status of each instance, (batch,)."""
+        """Return the status of each instance as text, (batch,), such as "ok" or "singular"."""
         return np.asarray(_ENDS[self._codes])
 
     @cached_property
     def events(self) -> dict[str, BatchEventLog]:
-        """Times, states and instances of each event of the scene, by name."""
+        """Return the occurrences of each event of the scene as a dict from name to `BatchEventLog`.
+
+        A log has the times t (m,), s, the states q, qd (m, nq) and the indices of the instances
+        (m,).
+        """
         if self._event_data is None:
             return ByName("events", (), ())
         nq, (instances, which, rows) = self._model.nq, self._event_data
@@ -115,18 +128,22 @@ class AdaptiveBatchRun(BatchRun):
 
     @property
     def stopped(self) -> Array:
-        """The event that ended each, (batch,), or ""."""
+        """Return the name of the event that ended each instance, (batch,); "" if none did."""
         codes = np.zeros(len(self), int) if self._stopped is None else self._stopped
         return np.asarray(np.array(["", *self._model.events])[codes])
 
     @property
     def limit(self) -> Array:
-        """The time at which events of each instance accumulate, (batch,), s; nan if they do not."""
+        """Return the time at which the events of each instance accumulate, (batch,), s.
+
+        Such an instance (status "accumulated") shows Zeno behaviour: its events follow one another
+        ever sooner. The time is nan for other instances.
+        """
         return np.full(len(self), np.nan) if self._limit is None else self._limit
 
     @property
     def message(self) -> str:
-        """Result of the run in a sentence."""
+        """Return a sentence with the numbers of instances, of steps and of each status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -177,7 +194,13 @@ def simulate(
     h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
     max_evaluations: int | None,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """Simulate with adaptive steps. Returns the run and False if Ctrl-C interrupted it."""
+    """Check the arguments of `BatchModel.simulate_batch` and simulate with adaptive steps.
+
+    fixed: the caller's values of the arguments in FIXED_STEP_DEFAULTS, which are for fixed steps
+    only and must have their default values. The other arguments are those of `simulate_batch`.
+    Return (run, completed); completed is False if Ctrl-C interrupted the run. Raises ValueError for
+    invalid arguments.
+    """
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     limit = 0
     if max_evaluations is not None:
@@ -221,7 +244,11 @@ def stepped(
     progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """Simulate with fixed steps and event location. Returns the same as `simulate`."""
+    """Check the arguments of `BatchModel.simulate_batch`; simulate with fixed steps and events.
+
+    Return (run, completed); completed is False if Ctrl-C interrupted the run. Raises ValueError for
+    invalid arguments.
+    """
     h = model.h if h is None else as_step_size(h, model.dtype)
     method, t0 = model._method(method), as_number(t0, "t0")
     rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
@@ -283,7 +310,10 @@ def _run(
 
 
 def no_signals(model: Instances, u: Any, control_period: Any) -> None:
-    """Raise ValueError if a control period is given without inputs u."""
+    """Raise ValueError if a batch has a control period but no inputs u, for a scene with inputs.
+
+    A batch cannot hold the scene's signals constant over control periods.
+    """
     if u is None and control_period is not None and model.nu:
         raise ValueError("control_period: a batch follows the signals: give u, a row a period")
 
@@ -318,18 +348,24 @@ class _Work:
             self.rows[:, :, 0] = begin
 
     def limit(self, evaluations: int) -> None:
-        """Limit the evaluations of each instance approximately; 0: no limit."""
+        """Set the number of evaluations after which an instance begins no further step; 0: none."""
         for memory in self.memory if evaluations else ():
             memory.max_evaluations = evaluations
 
     def leave(self, codes: Array | None) -> None:
-        """Set the status of each instance; those whose status is not 0 make no step."""
+        """Set the status of each instance to `codes` (batch,), unless None.
+
+        Instances whose status is not 0 make no step.
+        """
         if codes is not None:
             self.status[:] = codes
 
     @property
     def counts(self) -> dict[str, Array]:
-        """Counters of each instance, (batch,), by their names in C."""
+        """Return the counters of each instance, such as "steps", as a dict from name to (batch,).
+
+        The names are those of the members of the C struct `adaptive_memory`.
+        """
         ffi, memory = self.model._ffi, "adaptive_memory"
         kinds = dict.fromkeys(_COUNTERS, "l")
         if self.events:
@@ -343,11 +379,15 @@ class _Work:
 
     @property
     def full(self) -> bool:
-        """Whether there is no memory for more events."""
+        """Return True if there is no memory for more events."""
         return self.events is not None and self.events.full
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
-        """Simulate all instances; return False if Ctrl-C interrupted the run."""
+        """Simulate all instances to their end; return False if Ctrl-C interrupted the run.
+
+        threads: number of threads; None: one for each processor. progress: called with the numbers
+        of finished and of all instances.
+        """
         count = len(self.q)
         group = _GROUP_SIZE if count > 8 * _GROUP_SIZE else _SMALL_GROUP_SIZE
         groups = [(at, min(group, count - at)) for at in range(0, count, group)]

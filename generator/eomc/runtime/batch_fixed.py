@@ -25,10 +25,12 @@ _INTERRUPTED = STATUS.index("interrupted")
 
 @dataclass(eq=False, repr=False)
 class TimedBatchRun(BatchRun):
-    """Trajectories with fixed steps and rows at requested times.
+    """Trajectories of many instances with fixed steps and rows at requested times.
 
-    steps: number of steps of size h. Rows after the last successful step of an instance are nan.
-    All other attributes are those of a BatchRun.
+    The state at a time between two steps is computed by a shorter step from the first of them. Rows
+    after the last successful step of an instance are nan. The attribute `steps` (batch,) is the
+    number of steps of size h that each instance completed; the other attributes are those of
+    `BatchRun`.
     """
 
     _times: Array = field(kw_only=True)
@@ -36,7 +38,7 @@ class TimedBatchRun(BatchRun):
 
     @property
     def t(self) -> Array:
-        """The time of each row, (n,), s."""
+        """Return the times of the rows, (n,), s, which are the same for all instances."""
         return self._times
 
     def _states(self, times: Array) -> Array:
@@ -62,9 +64,29 @@ class TimedBatchRun(BatchRun):
 
 
 class FixedStepRequest(NamedTuple):
-    """Checked arguments of a run with fixed steps. times (n,): times of the rows, or None.
+    """Checked arguments of a batch with fixed steps.
 
-    codes: status of each instance at its start, (batch,), if one cannot be assembled.
+    Attributes
+    ----------
+    step : C function
+        Function that steps a group of instances.
+    h, t0 : float
+        Step size and start time, s.
+    steps : int
+        Number of steps.
+    every : int
+        Number of steps between two rows.
+    times : (n,) array or None
+        Requested times of the rows, s. None: rows after every `every` steps.
+    method : str
+        Name of the method.
+    threads : int or None
+        Number of threads; None: one for each processor.
+    progress : callable or None
+        Called with the numbers of completed and of all steps of all instances.
+    codes : (batch,) array or None
+        Status of each initial state: not 0 if it cannot be moved onto the constraints. None if all
+        are 0.
     """
 
     step: Any  # C function
@@ -86,7 +108,25 @@ def simulate(
     table: Array,
     request: FixedStepRequest,
 ) -> tuple[BatchRun, bool]:
-    """Simulate from checked arguments. Returns the run and False if Ctrl-C interrupted it."""
+    """Simulate many instances with fixed steps, from checked arguments.
+
+    Parameters
+    ----------
+    starts : pair of (batch, nq) arrays
+        Initial positions and velocities.
+    inputs : (batch or 1, steps or 1, nu) array or None
+        Inputs of each step; None: the scene's signals.
+    table : (batch or 1, np) array
+        Parameters.
+    request : FixedStepRequest
+        All other arguments.
+
+    Returns
+    -------
+    run : BatchRun
+    completed : bool
+        False if Ctrl-C interrupted the run.
+    """
     run = _by_steps if request.times is None else _at_times
     return run(model, starts, inputs, table, request)
 

@@ -18,25 +18,50 @@ _OF_ONE = {"phase", "section", "other", "labels"}
 
 
 def single_run_hint(runs: Any) -> str:
-    """Return a hint how to repeat an instance as a single run."""
+    """Return a hint for messages: the call that repeats an instance of a batch as a single run."""
     name = runs._model.name
     return f"is of one run: {name}.simulate(runs.q[k, 0], runs.qd[k, 0], params=...)"
 
 
 class Fans:
-    """Plots and animations of a batch."""
+    """Mixin of `batch_run.BatchRun` with its plots and animations."""
 
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
         lines: int | None = None, over: Any = None, wrap: bool | str | Sequence[str] = False,
         ax: Any = None, axes: Any = None, file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
-        """Plot bands of quantiles over time, with a panel for each name; default: coordinates.
+        """Plot the distribution of the instances over time, as bands between quantiles.
 
-        quantiles: limits of the bands of the instances that reached each time; the middle one of an
-        odd number is a line. lines: number of instances to draw as lines instead. over: "instance",
-        a parameter or numbers (batch,), over which the last value of each is drawn instead. Other
-        arguments are those of `Run.plot`.
+        Parameters
+        ----------
+        *names : str
+            Columns to plot, each in its own panel; by default the coordinates.
+        quantiles : sequence of float
+            Limits of the bands, from 0 to 1, of the instances that reached each time. If their
+            number is odd, the middle one is drawn as a line.
+        lines : int, optional
+            Draw this number of instances as lines instead of the bands.
+        over : str or (batch,) array, optional
+            Draw the final value of each instance instead, over "instance" (its index), a parameter
+            or these numbers.
+        wrap, ax, axes, file, **style
+            As in `Run.plot`.
+
+        Returns
+        -------
+        matplotlib Axes, or an array of Axes if there are several panels
+
+        Raises
+        ------
+        TypeError
+            For arguments that apply to single runs only, such as phase.
+        KeyError
+            For unknown names.
+        ValueError
+            If `over` is neither a known name nor has the shape (batch,).
+        ModuleNotFoundError
+            If matplotlib is not installed.
         """
         for name in _OF_ONE & style.keys():
             raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
@@ -46,11 +71,36 @@ class Fans:
         self, file: File | None = None, *, names: Sequence[str] = (),
         instances: int | Sequence[int] = 6, scene: Any = None, title: str | None = None,
     ) -> Any:  # fmt: skip
-        """Animate several instances in different colours; see `Run.animate`.
+        """Animate several instances together in different colours.
 
-        names: names of the curves; by default the coordinates and the energy. instances: a number
-        of evenly spaced instances, or their indices, at most 24. Instances that ended earlier keep
-        their last position. Raises KeyError for unknown names, EomcError for unknown instances.
+        Instances that ended earlier keep their last position.
+
+        Parameters
+        ----------
+        file : path, optional
+            File to write: a page .html, or a film .gif or .mp4.
+        names : sequence of str
+            Columns to draw as curves; by default the coordinates and the energy.
+        instances : int or sequence of int
+            Number of instances, which are evenly spaced in the batch, or their indices; at most 24.
+        scene : path, optional
+            Scene file, if the module was not loaded by `eomc.load`.
+        title : str, optional
+            Title of the page.
+
+        Returns
+        -------
+        Animation or None
+            The page; None for a film.
+
+        Raises
+        ------
+        KeyError
+            For unknown names.
+        EomcError
+            For unknown instances, or if the animation cannot be drawn or written.
+        ImportError
+            If eomc is not installed.
         """
         page = require_eomc("report.animation")
         return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
@@ -60,7 +110,7 @@ def fan(
     run: Any, names: Sequence[str], quantiles: Iterable[float], lines: int | None, over: Any,
     wrap: bool | Collection[str], ax: Any, axes: Any, file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
-    """See `Fans.plot`."""
+    """Draw the plot of a batch and return its Axes; implements `Fans.plot` with its arguments."""
     no_files(names)
     source = Source(run, wrap)
     curves = [source.curve(name) for name in ([*names] or source.coordinates)]

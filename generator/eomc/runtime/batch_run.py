@@ -32,14 +32,33 @@ _OF_ONE = {
 
 @dataclass(eq=False, repr=False)
 class BatchRun(Values, Fans, Columns):
-    """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
+    """Trajectories of many instances of a scene, returned by `simulate_batch`.
 
-    status: "ok", "singular", "not finite", "no convergence", "locked" or "interrupted", one an
-    instance. The rows of an instance after its failure are nan: a row is stored if the instance
-    completed the steps to its time. If a start cannot be assembled (status "locked"), the first row
-    is the initial state of the caller. steps: number of completed steps of each instance. Columns
-    are available by name: run["theta_dot"], (batch, n). Two runs are equal if scene, settings and
-    rows are equal bit by bit.
+    All instances have rows at the same n times. A row is stored if the instance completed the steps
+    to its time; the rows of an instance after its failure are nan. Columns are available by name:
+    run["theta_dot"] has the shape (batch, n). Two runs are equal if scene, settings and rows are
+    equal bit by bit.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Times of the rows, s.
+    q, qd : (batch, n, nq) arrays
+        Positions and velocities.
+    u : (batch, n, nu) array
+        Applied inputs.
+    status : (batch,) array of str
+        "ok", "singular", "not finite", "no convergence", "locked" or "interrupted". For an initial
+        state that cannot be moved onto the constraints ("locked"), the first row is the initial
+        state of the caller.
+    steps : (batch,) array of int
+        Number of steps that each instance completed.
+    t0, h : float
+        Start time and step size, s.
+    every : int
+        Number of steps between two rows.
+    method : str
+        Name of the integration method.
     """
 
     _axes = ("instance", "t")
@@ -59,27 +78,30 @@ class BatchRun(Values, Fans, Columns):
 
     @cached_property
     def t(self) -> Array:
-        """The time of each row, (n,), s."""
+        """Return the times of the rows, (n,), s, which are the same for all instances."""
         steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._requested_steps)
         return np.asarray(self.t0 + self.h * steps)
 
     @cached_property
     def status(self) -> Array:
-        """Status of each instance, (batch,)."""
+        """Return the status of each instance as text, (batch,), such as "ok" or "singular"."""
         return np.asarray(_ENDS[self._codes])
 
     @property
     def u(self) -> Array:
-        """Applied inputs at each row, (batch, n, nu), saturated at their limits.
+        """Return the inputs applied at each row, (batch, n, nu), saturated at their limits.
 
-        These are the signals at the row, or the constant inputs of the step that begins there; in
-        the last row those of the last step.
+        These are the scene's signals at the row, or the constant inputs of the step that begins
+        there; the last row has the inputs of the last step.
         """
         return self._within(self._requested_inputs)
 
     @property
     def saturated(self) -> Array:
-        """True for inputs beyond their limits at each row, (batch, n, nu); False for nan."""
+        """Return True for each input that exceeds its limits at a row, (batch, n, nu).
+
+        Rows that are nan have False.
+        """
         inputs = self._requested_inputs
         return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
 
@@ -97,11 +119,25 @@ class BatchRun(Values, Fans, Columns):
         return inputs
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return (q, qd), each (batch, ..., nq), at times t (...,) within the run, s.
+        """Return the positions and velocities of all instances at any times within the run.
 
         The steps from the preceding row, or all steps, are repeated, so the states are as accurate
-        as the run; nan after the end of an instance. Raises ValueError for times outside of the
-        run.
+        as the run.
+
+        Parameters
+        ----------
+        t : array_like, (...)
+            Times, s.
+
+        Returns
+        -------
+        q, qd : (batch, ..., nq) arrays
+            nan at times after the end of an instance.
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run.
         """
         times = within(self, t)
         asked, place = np.unique(times, return_inverse=True)
@@ -132,7 +168,7 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Times and states of events by name; empty for scenes without events."""
+        """Return the occurrences of events as a dict by name; empty for scenes without events."""
         return ByName("events", (), ())
 
     def _to_arrays(self) -> dict[str, Any]:
@@ -150,7 +186,7 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def message(self) -> str:
-        """Result of the run in a sentence."""
+        """Return a sentence with the numbers of instances, of steps and of each status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -216,12 +252,20 @@ class BatchRun(Values, Fans, Columns):
 
 
 def initial_failures(run: BatchRun) -> Array:
-    """Return the status of instances that failed at their start, (batch,); 0 for others."""
+    """Return the status number of each instance that failed at its initial state, (batch,).
+
+    All other instances have 0.
+    """
     return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
 def stepper_for(run: BatchRun, both: Array, inputs: Array | None, first: int = 0) -> BatchStepper:
-    """Return the stepper that continues a run from its states `both` after `first` steps."""
+    """Return a stepper that continues a batch with fixed steps from some of its states.
+
+    both: states [q, qd] of all instances after `first` steps, (2, batch, nq). inputs: inputs of the
+    steps, (batch or 1, steps or 1, nu); None: the scene's signals. Instances that failed at their
+    initial state make no step.
+    """
     model: Any = run._model
     stepper = BatchStepper(model, run.method, both, run.t0, run.h, inputs, run._params, None, first)
     stepper.work.leave(initial_failures(run))

@@ -24,7 +24,37 @@ _FIRST_POLL_SECONDS = 0.02  # before the first check
 
 
 class Work:
-    """A batch with fixed steps: groups of instances, simulated in chunks of steps."""
+    """Simulation of a batch with fixed steps.
+
+    Threads simulate groups of instances. Each group advances in chunks of steps, so that Ctrl-C is
+    handled between two calls of C.
+
+    Parameters
+    ----------
+    step : C function
+        Function that steps a group of instances.
+    q, qd : (batch, nq) arrays
+        Current states, which are overwritten.
+    h : float
+        Step size, s.
+    t0 : float or (batch,) array
+        Start time, s.
+    steps, every : int
+        Numbers of steps, and of steps between two rows.
+    inputs : (batch or 1, steps or 1, nu) array or None
+        Inputs; None: the scene's signals.
+    table : (batch or 1, np) array
+        Parameters.
+    q_rows, qd_rows : (batch, n, nq) arrays or None
+        Memory for the rows.
+    starts : pair of (batch, nq) arrays, optional
+        Initial states, which are copied to q and qd; by default q and qd contain them.
+
+    Attributes
+    ----------
+    done, status : (batch,) arrays of int
+        Number of completed steps and status of each instance.
+    """
 
     def __init__(
         self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: Any,
@@ -55,12 +85,16 @@ class Work:
         return q + first, qd + first, q_rows + row, qd_rows + row
 
     def leave(self, codes: Array | None) -> None:
-        """Set the status of instances whose code is not 0; these make no step."""
+        """Mark instances that make no step: set their status to `codes` (batch,) where not 0."""
         if codes is not None:
             self.status[codes != 0], self.failed = codes[codes != 0], True
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
-        """Simulate all instances; return False if Ctrl-C interrupted the run."""
+        """Simulate all instances through all steps; return False if Ctrl-C interrupted the run.
+
+        threads: number of threads; None: one for each processor. progress: called with the numbers
+        of completed and of all steps of all instances.
+        """
         count = self.count
         threads = as_threads(threads)
         if count * (self.steps - self.first) < MIN_STEPS_FOR_THREADS:
@@ -148,7 +182,25 @@ class Work:
 
 
 class BatchStepper:
-    """Steps instances by whole steps, and by shorter ones to times between them."""
+    """Compute states of a batch at any times: by whole steps, and a shorter one to the time.
+
+    Parameters
+    ----------
+    method : str or None
+        Name of the method; None: the first of the scene.
+    both : pair of (batch, nq) arrays
+        Current positions and velocities, which are overwritten.
+    t0, h : float
+        Start time and step size, s.
+    inputs : (batch or 1, steps or 1, nu) array or None
+        Inputs; None: the scene's signals.
+    table : (batch or 1, np) array
+        Parameters.
+    starts : pair of (batch, nq) arrays, optional
+        Initial states, which are copied to `both`; by default `both` contains them.
+    first : int
+        Number of steps that have led to the current states.
+    """
 
     def __init__(
         self, model: Instances, method: str | None, both: Any, t0: float, h: float,
@@ -164,9 +216,11 @@ class BatchStepper:
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> bool:  # fmt: skip
-        """Write states after whole steps and a remainder in s; return False if interrupted.
+        """Advance to n times and write the states there; return False if Ctrl-C interrupted this.
 
-        places: numbers of steps (n,) and remainders (n,). into: q and qd, (batch, n, nq) each.
+        places: for each time the number of whole steps before it (n,), ascending, and the remaining
+        time (n,), s. into: arrays for q and qd, (batch, n, nq) each. Rows that are not reached
+        become nan.
         """
         work, (whole, rest) = self.work, places
         last = work.count * int(whole[-1])
@@ -196,7 +250,10 @@ class BatchStepper:
 
 
 class Grouped(Protocol):
-    """Work in groups: `_group` processes one and returns early if `stop` is set."""
+    """Interface of work that `run_groups` distributes over threads.
+
+    The method `_group` processes one group of instances and returns early if `stop` is set.
+    """
 
     stop: bool
 
@@ -206,9 +263,11 @@ class Grouped(Protocol):
 def run_groups(
     work: Grouped, groups: list[tuple[int, int]], threads: int, look: Callable[[], object]
 ) -> bool:
-    """Process all groups in threads; return False if Ctrl-C interrupted them.
+    """Process all groups of instances in threads; return False if Ctrl-C interrupted them.
 
-    look: called at regular intervals.
+    groups: (index of the first instance, number of instances) of each group. threads: number of
+    threads. look: function without arguments that is called at regular intervals, such as to
+    update a progress bar.
     """
     if threads == 1 or len(groups) == 1:
         try:
@@ -237,7 +296,10 @@ def run_groups(
 
 
 def as_threads(threads: Any) -> int:
-    """Return the number of threads; None: one for each processor."""
+    """Return the number of threads; if `threads` is None, the number of available processors.
+
+    Raises ValueError unless it is a whole number >= 1.
+    """
     if threads is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     return as_count(threads, "threads", 1)
