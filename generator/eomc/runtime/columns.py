@@ -21,7 +21,12 @@ from .functions import Functions
 
 
 class Columns:
-    """The columns of a run, (n,), or of a batch, (batch, n); t is (n,) in both."""
+    """Mixin of runs: access to columns by name, and their conversion to tables and files.
+
+    A column is a quantity at all rows: the time t (n,), a coordinate, its velocity (`theta_dot` for
+    the coordinate theta), an input, an output, the energy or the Jacobi integral. For a batch all
+    columns but t have the shape (batch, n).
+    """
 
     _model: Functions
     outputs: Any  # by name
@@ -83,7 +88,11 @@ class Columns:
 
     @property
     def params(self) -> dict[str, Any]:
-        """Parameters by name, as in the arguments of `simulate`; for a batch (batch,) each."""
+        """Return the parameters of the run as a dict from name to number.
+
+        For a batch, the values are arrays (batch,). The dict has the form of the argument `params`
+        of `simulate` and `simulate_batch`.
+        """
         names, table = self._model.parameters, self._params
         if table.ndim == 1:
             return dict(zip(names, table.tolist(), strict=True))
@@ -91,15 +100,31 @@ class Columns:
         return dict(zip(names, columns, strict=True))
 
     def to_dict(self) -> dict[str, Array]:
-        """Return all columns by name: t, coordinates, rates, inputs, outputs, energy, jacobi."""
+        """Return all columns as a dict from name to array (n,), for a batch (batch, n).
+
+        The order is: t (always (n,)), coordinates, velocities, inputs, outputs, energy, and jacobi
+        if the Jacobi integral differs from the energy.
+        """
         return {name: column() for name, column in self._columns().items()}
 
     def save(self, file: File) -> None:
-        """Write the columns to NAME.csv, or all of the run to NAME.npz, which `load_run` reads.
+        """Write the columns to a .csv file, or the whole run to an .npz file.
 
-        An .npz contains arrays only and nothing pickled: numpy.load(file)["q"] reads it without a
-        module. If u is a function, its values at the rows are saved, not the function. Raises
-        ValueError for other file names, and for the .csv of a batch.
+        `load_run` reads the .npz file. It contains arrays only and nothing pickled, so that
+        numpy.load(file)["q"] reads it without the module. If u is a function, its values at the
+        rows are saved, not the function.
+
+        Parameters
+        ----------
+        file : path
+            A name that ends in .csv (single runs only) or .npz.
+
+        Raises
+        ------
+        ValueError
+            If the name has another suffix, or for the .csv of a batch.
+        FileExistsError
+            If `file` exists and is a scene, or its content does not match its suffix.
         """
         path = Path(file)
         if path.suffix == ".csv" and self._axes == ("t",):
@@ -122,7 +147,11 @@ class Columns:
                 writer.writerow(map(repr, row))
 
     def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame of the columns over t, for a batch over instance and t."""
+        """Return a pandas.DataFrame with one column for each column of the run.
+
+        The index is t, for a batch (instance, t). Raises ModuleNotFoundError if pandas is not
+        installed.
+        """
         pandas = imported("pandas", "to_pandas")
         columns = self.to_dict()
         t = columns.pop("t")
@@ -133,9 +162,11 @@ class Columns:
         return pandas.DataFrame({n: c.ravel() for n, c in columns.items()}, index=index)
 
     def to_xarray(self) -> Any:
-        """Return an xarray.Dataset of the columns with units, for a batch over instance and t.
+        """Return an xarray.Dataset with one variable for each column of the run.
 
-        Parameters that differ between the instances of a batch are coordinates over instance.
+        The dimension is t, for a batch (instance, t). The attribute `units` of a variable is its
+        unit. Parameters that differ between the instances of a batch become coordinates along
+        instance. Raises ModuleNotFoundError if xarray is not installed.
         """
         xarray = imported("xarray", "to_xarray")
         model, columns = self._model, self.to_dict()
@@ -165,7 +196,10 @@ class Columns:
 
 
 def imported(package: str, function: str) -> Any:
-    """Import an optional package; ModuleNotFoundError says how to install it."""
+    """Import an optional package for the function `function` and return the module.
+
+    Raises ModuleNotFoundError that says how to install the package if it is missing.
+    """
     try:
         return import_module(package)
     except ModuleNotFoundError as fault:

@@ -1,7 +1,8 @@
 """Constraints of a compiled scene: residuals, multipliers, reactions and projection.
 
-D qdd + C qd + g = tau + A^T lambda, with A = dphi/dq of holonomic rows phi(q, t) = 0 and dpsi/dqd
-of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in the scene's order.
+D qdd + C qd + g = tau + A^T lambda, with A = dphi/dq for holonomic constraint equations
+phi(q, t) = 0 and A = dpsi/dqd for nonholonomic ones, psi(q, qd, t) = 0, which are linear in qd. nc
+is the number of constraint equations; results are in their order in the scene.
 """
 
 from __future__ import annotations
@@ -22,12 +23,26 @@ REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/
 
 
 class ConstraintRows(NamedTuple):
-    """Names of constraints and of loops with reactions; which of q, then qd a start fixes.
+    """Facts about the constraint equations of a scene and about its discrete coordinates.
 
-    holonomic: how many of the constraints are; they come first. redundant: which of them were left
-    out, as the others imply them. modes: of friction that sticks, places of the modes among the
-    coordinates, the last of these, and of what slides. discrete: how many parameters that jumps set
-    are coordinates, before the modes.
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the constraint equations.
+    loops : tuple of str
+        Names of the loops that have reactions.
+    fixed : tuple of bool
+        For each of q, then of qd, whether the assembly of an initial state leaves it unchanged.
+    holonomic : int
+        Number of holonomic constraint equations, which come first.
+    redundant : tuple of int
+        Indices of the constraint equations that follow from the others and are not solved for.
+    modes : tuple of (int, int)
+        For each Coulomb friction with sticking: the index of the coordinate that contains its mode
+        (sticking, or the sliding direction), and that of the coordinate that slides. The modes are
+        the last coordinates.
+    discrete : int
+        Number of parameters that state jumps set. They are coordinates, before the modes.
     """
 
     names: tuple[str, ...] = ()
@@ -40,30 +55,66 @@ class ConstraintRows(NamedTuple):
 
 
 class Constrained(Frames):
-    """Methods of scenes with [constraints] or [[loop]]."""
+    """Methods of a compiled scene on its constraint equations, from [constraints] and [[loop]].
+
+    In all methods q and qd are one state (nq,) or n states (n, nq). For n states the results have n
+    as an additional first axis, t may be an array (n,), and params may contain arrays (n,).
+    """
 
     _rows = ConstraintRows()
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """The constraints, in the order of results."""
+        """Return the names of the constraint equations, in the order of results."""
         return self._rows.names
 
     @property
     def loops(self) -> tuple[str, ...]:
-        """The loops that have reactions, in the order of results."""
+        """Return the names of the loops that have reactions, in the order of results."""
         return self._rows.loops
 
     def constraints(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Residuals (nc,): phi of holonomic constraints and psi of others."""
+        """Return the residuals of the constraint equations at a state, or at many states.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities.
+        t : float or (n,) array
+            Time, s.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        (nc,) or (n, nc) array
+            phi(q, t) of holonomic and psi(q, qd, t) of nonholonomic constraints, in the units of
+            the constraint equations.
+        """
         return self._of_rows("constraints", q, qd, t, params)
 
     def constraint_rates(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Rates (nc,): A qd + dphi/dt of holonomic constraints and psi of others."""
+        """Return the residuals of the constraint equations at velocity level.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities.
+        t : float or (n,) array
+            Time, s.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        (nc,) or (n, nc) array
+            The time derivative A qd + dphi/dt of holonomic constraints, and psi(q, qd, t) of
+            nonholonomic ones.
+        """
         return self._of_rows("constraint_rates", q, qd, t, params)
 
     def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
@@ -71,20 +122,54 @@ class Constrained(Frames):
         return values
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
-        """Jacobian A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
+        """Return the constraint Jacobian A at positions q.
+
+        Parameters
+        ----------
+        q : (nq,) or (n, nq) array
+            Positions.
+        t : float or (n,) array
+            Time, s.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        (nc, nq) or (n, nc, nq) array
+            dphi/dq of holonomic constraints phi(q, t) = 0, dpsi/dqd of nonholonomic ones,
+            psi(q, qd, t) = 0.
+        """
         jacobian: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
         return jacobian
 
     def tangent(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Return an orthonormal basis T, (2 nq, k), of changes of [q; qd] within the constraints.
+        """Return an orthonormal basis of the changes of the state that satisfy the constraints.
 
-        For many states, (n, nq), T is (n, 2 nq, k); k must be equal for all of them.
+        The state is x = [q; qd]. Near an equilibrium x0, with A and B of `linearize`, the reduced
+        model dz/dt = T^T A T z + T^T B u, x - x0 = T z, has only independent states z.
 
-        Near an equilibrium with A, B of `linearize`, dz/dt = T^T A T z + T^T B u has no more
-        states than the motion, x - x0 = T z. Raises ValueError where the scene was built without
-        derivatives.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities.
+        t : float or (n,) array
+            Time, s.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        T : (2 nq, k) or (n, 2 nq, k) array
+            Its k columns are the basis.
+
+        Raises
+        ------
+        ValueError
+            If the scene was built without derivatives, or k differs between the states.
+        MotionError
+            If a derivative of a constraint is not finite.
         """
         if not hasattr(self._lib, "constraint_slopes"):
             raise ValueError(
@@ -115,9 +200,28 @@ class Constrained(Frames):
     def multipliers(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """Lagrange multipliers lambda, (nc,). u None: the scene's signals.
+        """Return the Lagrange multipliers of the constraints at a state, or at many states.
 
-        Redundant constraints have 0. Raises MotionError as `acceleration` does.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities.
+        t : float or (n,) array
+            Time, s.
+        u : (nu,) or (n, nu) array, or dict, optional
+            Inputs; by default the scene's signals.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        lambda : (nc,) or (n, nc) array
+            0 for redundant constraints. A^T lambda is the generalized constraint force.
+
+        Raises
+        ------
+        MotionError
+            If D is singular, or a multiplier is not finite.
         """
         values = self._multipliers(q, qd, t, u, params)
         if not np.isfinite(values).all():
@@ -138,11 +242,32 @@ class Constrained(Frames):
     def reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> dict[str, Array]:
-        """Return the reaction of each [[loop]] on its second body by name, in world axes.
+        """Return the reaction of the joint of each [[loop]] on its second body.
 
-        Force and moment about the joint's point: (6,), in the plane (3,), the force (2) and the
-        moment; N and N m. Raises ValueError where the scene has no loops, MotionError as
-        `acceleration` does.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities.
+        t : float or (n,) array
+            Time, s.
+        u : (nu,) or (n, nu) array, or dict, optional
+            Inputs; by default the scene's signals.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+
+        Returns
+        -------
+        dict of (6,) or (n, 6) arrays
+            By the loop's name: the force, N, and the moment about the joint's point, N m, along the
+            axes of the world. For plane scenes (3,) or (n, 3), with two components of the force and
+            the moment.
+
+        Raises
+        ------
+        ValueError
+            If the scene has no loops.
+        MotionError
+            If D is singular, or a multiplier is not finite.
         """
         if not self._rows.loops:
             raise ValueError(f"reactions: {self.name} has no [[loop]]")
@@ -166,10 +291,32 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         fixed: Sequence[str] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Project (q, qd) onto the constraints by the smallest change in the metric of D.
+        """Project a state, or many states, onto the constraints and return the result.
 
-        fixed: names of coordinates and velocities that are fixed; None: all may change.
-        Raises MotionError, status "locked", if no such state is found.
+        The change is the smallest one in the metric of the mass matrix D.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) arrays
+            Positions and velocities, which are not overwritten.
+        t : float or (n,) array
+            Time, s.
+        params : dict, Params or array, optional
+            Parameters; by default those of the scene.
+        fixed : sequence of str, optional
+            Names of coordinates and velocities, such as "theta_dot", that stay unchanged. By
+            default all may change.
+
+        Returns
+        -------
+        q, qd : arrays of the same shapes
+
+        Raises
+        ------
+        ValueError
+            For unknown names in `fixed`.
+        MotionError
+            If no such state is found near the given one (status "locked").
         """
         if isinstance(fixed, str):
             fixed = (fixed,)
@@ -293,7 +440,10 @@ class Constrained(Frames):
 
     @property
     def discrete_coordinates(self) -> tuple[str, ...]:
-        """Coordinates that only state jumps change: the last ones, without velocities."""
+        """Return the names of the coordinates that only state jumps change.
+
+        They are the last coordinates and have no velocities.
+        """
         return self.coordinates[self.nq - len(self._rows.modes) - self._rows.discrete :]
 
     def _completed(self, x: Any, half: int) -> Any:

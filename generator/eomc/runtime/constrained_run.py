@@ -17,11 +17,15 @@ _MIN_SCALE = 1e-9  # smallest scale of the terms
 
 
 class ConstrainedRun:
-    """Mixin of `trajectory.Run` with the quantities of constraints.
+    """Mixin of `trajectory.Run` with residuals, multipliers and reactions of constraints.
 
-    singular_steps: number of steps at whose end a constraint depends on others. Its multiplier is
-    large or 0 there, and joint forces are not unique; the motion is correct. first_singular: end
-    time of the first of these steps, s; nan without one.
+    Attributes
+    ----------
+    singular_steps : int
+        Number of steps at whose end a constraint equation depends on others (a singular position).
+        Its multiplier is large or 0 there, and joint forces are not unique; the motion is correct.
+    first_singular : float
+        End time of the first of these steps, s; nan if there is none.
     """
 
     _model: Any
@@ -37,7 +41,10 @@ class ConstrainedRun:
 
     @property
     def constraints(self) -> Mapping[str, Array]:
-        """Residual of each constraint along the run by name, (n,)."""
+        """Return the residual of each constraint at all rows as a dict from name to array (n,).
+
+        Residuals are in the units of the constraint equations. Raises KeyError for unknown names.
+        """
         names = self._model.constraint_names
         return ByName(
             "constraints", names, self._evaluate(self._model.constraints).T if names else ()
@@ -45,16 +52,21 @@ class ConstrainedRun:
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
-        """Lagrange multiplier of each constraint along the run by name, (n,)."""
+        """Return the Lagrange multiplier of each constraint at all rows, (n,), in a dict by name.
+
+        Values are nan at rows where they do not exist. Raises KeyError for unknown names.
+        """
         names = self._model.constraint_names
         values = self._evaluate_with_inputs(self._model._multipliers).T if names else ()
         return ByName("multipliers", names, np.ascontiguousarray(values))
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """Reaction of each [[loop]] on its second body along the run by name, in world axes.
+        """Return the reaction of the joint of each [[loop]] on its second body, by the loop's name.
 
-        Force and moment about the joint's point, (n, 6); in the plane (n, 3), force (2) and moment.
+        A reaction is the force, N, and the moment about the joint's point, N m, at all rows, along
+        the axes of the world: (n, 6), or (n, 3) for plane scenes, with two components of the force
+        and the moment.
         """
         loops = self._model.loops
         if not loops:

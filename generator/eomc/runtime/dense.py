@@ -15,7 +15,10 @@ _STEP_TOLERANCE = 1e-12  # times closer to a step than this fraction of h coinci
 
 
 def within(run: Any, t: ArrayLike) -> Array:
-    """Return times as an array. Raises ValueError if one is outside of the run."""
+    """Return the times t, s, as an array of the same shape, limited to the interval of the run.
+
+    Raises ValueError if a time is outside of the run by more than rounding.
+    """
     times = as_numbers(t, "t", np.dtype(float))
     begin, end = run.t0, float(run.t[-1])
     slack = 1e-12 * max(abs(begin), abs(end), end - begin)
@@ -25,10 +28,26 @@ def within(run: Any, t: ArrayLike) -> Array:
 
 
 def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
-    """(q, qd), each of the shape of t with nq behind, by the run's method from the row before.
+    """Return the positions and velocities of a run with fixed steps at any times within it.
 
-    As exact as the run, where its forces are smooth: of the method's order. Inputs are held as in
-    the run. Raises ValueError outside of it, or where rows don't tell what a function gave as u.
+    A shorter step of the run's method, from the last step before each time, yields the state. Its
+    error has the order of the method if the forces are smooth. Inputs are constant over the same
+    steps as in the run.
+
+    Parameters
+    ----------
+    t : array_like, (...)
+        Times, s.
+
+    Returns
+    -------
+    q, qd : (..., nq) arrays
+
+    Raises
+    ------
+    ValueError
+        If a time is outside of the run, or if u was a function whose values are not stored at each
+        step.
     """
     times = within(run, t)
     nq, (whole, rest) = run._model.nq, parts(times.ravel(), run.t0, run.h, run.steps)
@@ -40,7 +59,11 @@ def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
 
 
 def parts(times: Array, t0: float, h: float, most: int = 2**60) -> tuple[Array, Array]:
-    """Return the number of whole steps to each time (n,), and the remaining time, s."""
+    """Return the number of whole steps before each of `times` (n,), and the remaining time, s.
+
+    Both results have the shape (n,). t0: start of the run, s. h: step size, s. most: largest number
+    of steps, as of the run.
+    """
     steps = (times - t0) / h
     near = _STEP_TOLERANCE + 4 * np.finfo(float).eps * steps  # times are rounded
     whole = np.minimum((steps + near).astype(int), most)

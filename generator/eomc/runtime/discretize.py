@@ -19,10 +19,36 @@ def discretize(
     model: Stepping, method: str, q: Array, qd: Array, h: float, hold: int | None, t: Any, u: Any,
     params: Any,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return (Phi, Gamma) of one step, or of `hold` steps with constant inputs.
+    """Return the derivatives of the state after a step with respect to the state and the inputs.
 
-    q, qd: (nq,) or (n, nq), checked; t, u, params: of all, or a row for each state. If u is None
-    the inputs are the signals at the start of the period. Raises MotionError, ValueError.
+    With x = [q; qd], a small change of the state and the inputs changes the next state by
+    dx_next = Phi dx + Gamma du.
+
+    Parameters
+    ----------
+    method : str
+        Name of the integration method.
+    q, qd : (nq,) or (n, nq) arrays
+        State, or n states, already checked.
+    h : float
+        Step size, s.
+    hold : int or None
+        Number of steps, over which the inputs are constant. None: one step.
+    t, u, params
+        Time, inputs and parameters: the same for all states, or a row for each state. If u is None,
+        the inputs are the scene's signals: within the step, or with `hold` at its start.
+
+    Returns
+    -------
+    Phi : (2 nq, 2 nq) or (n, 2 nq, 2 nq) array
+    Gamma : (2 nq, nu) or (n, 2 nq, nu) array
+
+    Raises
+    ------
+    ValueError
+        If the module was built without these derivatives, or an argument is invalid.
+    MotionError
+        If a step fails or a derivative is not finite.
     """
     if not hasattr(model._lib, f"{method}_derivative"):
         raise ValueError(

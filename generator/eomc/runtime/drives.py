@@ -18,7 +18,10 @@ _RESIDUAL = {"float64": 1e-6, "float32": 1e-3}
 
 
 def actuated_coordinates(model: Constrained, drives: Sequence[str] | None) -> list[int]:
-    """Return the indices of the coordinates with drives; None: all. Raises ValueError."""
+    """Return the sorted indices of the coordinates along which actuators act.
+
+    drives: names of these coordinates; None: all coordinates. Raises ValueError for unknown names.
+    """
     if drives is None:
         return [*range(model.nq)]
     names = (drives,) if isinstance(drives, str) else tuple(drives)
@@ -29,10 +32,24 @@ def actuated_coordinates(model: Constrained, drives: Sequence[str] | None) -> li
 
 
 class Motion(NamedTuple):
-    """States of a motion and the forces they require; one state, or arrays (n, ...) of many.
+    """States of a motion and the generalized forces that it requires.
 
-    force: sum of actuator and constraint forces. A: constraint Jacobian. free: accelerations
-    without drives, which only scenes with constraints need. All but q and qd are doubles.
+    The shapes are those for one state; for n states all arrays have n as an additional first axis.
+    All arrays but q and qd are of type float64.
+
+    Attributes
+    ----------
+    q, qd, qdd : (nq,) arrays
+        Positions, velocities and accelerations.
+    force : (nq,) array
+        Required sum of the actuator forces and the constraint forces.
+    D : (nq, nq) array
+        Mass matrix.
+    A : (nc, nq) array
+        Jacobian of the constraint equations; (0, nq) without constraints.
+    free : (nq,) array
+        Accelerations by `Constrained.acceleration`, which satisfy the constraint equations; qdd for
+        scenes without constraints.
     """
 
     q: Array
@@ -47,7 +64,12 @@ class Motion(NamedTuple):
     def from_states(
         cls, model: Constrained, q: Array, qd: Array, qdd: Array, force: Array, t: Any, params: Any
     ) -> Motion:
-        """Evaluate the motion at states q, qd (..., nq). Raises MotionError."""
+        """Evaluate D, A and the accelerations `free` at the states, and return the motion.
+
+        q, qd, qdd: (nq,) or (n, nq), positions, velocities and accelerations. force: required sum
+        of actuator and constraint forces, of the same shape. t: time, s. params: parameters. Raises
+        MotionError if an acceleration does not exist.
+        """
         D, A, free = model.D(q, t=t, params=params), np.zeros((*q.shape[:-1], 0, model.nq)), qdd
         if len(model._rows.names) > len(model._rows.redundant):
             A = model.constraint_jacobian(q, t=t, params=params)
@@ -55,16 +77,36 @@ class Motion(NamedTuple):
         return cls(q, qd, *(np.asarray(x, float) for x in (qdd, force, D, A, free)))
 
     def state(self, k: tuple[int, ...]) -> Motion:
-        """Return the motion at state k."""
+        """Return the motion at the single state with index k, such as (3,); () for one state."""
         return Motion(*(x[k] for x in self))
 
 
 def drive_forces(model: Constrained, which: list[int], motion: Motion) -> tuple[Array, Array]:
-    """Solve tau + A^T lambda = force at one state; return (tau, lambda).
+    """Separate the forces that a motion requires into actuator and constraint forces, at one state.
 
-    tau acts along the coordinates `which`. If the solution is not unique, tau minimises
-    tau^T D^-1 tau, which does not depend on the units of the coordinates. Raises ValueError if
-    there is no solution, MotionError if D is not positive definite or a value is not finite.
+    Solve tau + A^T lambda = force. If the solution is not unique, tau minimises tau^T D^-1 tau,
+    which does not depend on the units of the coordinates.
+
+    Parameters
+    ----------
+    which : list of int
+        Indices of the coordinates along which actuators act.
+    motion : Motion
+        Motion at one state.
+
+    Returns
+    -------
+    tau : (nq,) array
+        Actuator forces; 0 for the other coordinates.
+    lambda : (nc,) array
+        Lagrange multipliers; 0 for redundant constraints.
+
+    Raises
+    ------
+    ValueError
+        If there is no solution, or the accelerations violate a constraint.
+    MotionError
+        If D is not positive definite or a value is not finite.
     """
     kind, force, D = str(model.dtype), motion.force, motion.D
     rows, least = model._rows, _DEPENDENT[kind]
