@@ -52,7 +52,7 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
     ----------
     file : path
     parameters : mapping from names to numbers, optional
-        Replace the values of parameters.
+        Values that replace those of the scene's parameters, in the same units.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
     Raises
     ------
     SceneError
-        With all errors in the scene.
+        If the scene has errors; the exception contains all of them, with their places.
     EomcError
         If the file can't be read.
     """
@@ -90,7 +90,11 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
 def parse(
     data: bytes | str, file: str = "scene.toml", parameters: Mapping[str, float] | None = None
 ) -> Scene:
-    """Check the text of a scene, as `read` does. Raises SceneError with all errors."""
+    """Parse and check the TOML text of a scene, and return the checked scene.
+
+    file: name of the scene in messages. parameters: values that replace those of the scene's
+    parameters. Raises SceneError with all errors in the scene.
+    """
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     text, tree = toml_text.text_and_tree(data, file)
@@ -99,7 +103,11 @@ def parse(
 
 
 def check_tree(tree: dict[str, Any], name: str) -> Scene:
-    """Check a scene given as a tree, as `parse` does a text; errors have no line numbers."""
+    """Check a scene that is given as a tree of dicts and lists, and return the checked scene.
+
+    tree: as TOML text would be parsed; it may be changed. name: name of the scene in messages.
+    Raises SceneError with all errors in the scene, without line numbers.
+    """
     return _SceneChecker(tree, SourceMap("", name), {}).scene("")
 
 
@@ -119,7 +127,10 @@ class _SceneChecker(Checker):
         self.tables = self._names()
 
     def scene(self, digest: str) -> Scene:
-        """Return the checked scene. Raises SceneError with all errors."""
+        """Return the checked scene. Raises SceneError with all errors in it.
+
+        digest: SHA-256 of the scene's text, stored in the scene.
+        """
         doc = self.doc
         self.kinds |= {
             **dict.fromkeys((*doc.constants, *doc.parameters), NOTHING),

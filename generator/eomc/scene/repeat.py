@@ -42,7 +42,11 @@ _WRITTEN = 'is written repeat = "i = 1..n"'
 
 
 def expand(tree: dict[str, Any], check: Checker) -> bool:
-    """Expand all repetition in `tree`. Returns False after errors that prevent further checks."""
+    """Expand all repeated entries and indexed names in the tree of a scene, which is changed.
+
+    tree: the scene as parsed from TOML. check: collects the errors. Returns False if there were
+    errors that prevent further checks.
+    """
     return _Expansion(tree, check).run()
 
 

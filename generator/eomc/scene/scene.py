@@ -15,11 +15,12 @@ from eomc.scene.source_map import SourceMap
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A generalized coordinate, with its initial value in `unit` and velocity in unit/s.
+    """A generalized coordinate of a scene.
 
-    The velocity is named `<name>_dot`. start_fixed, rate_fixed: True if assembly keeps the initial
-    value or velocity. friction: Coulomb friction, N or N m. friction_width: rate over which it is
-    smoothed.
+    start: initial value in `unit`. rate: initial velocity in unit/s; formulas call the velocity
+    `<name>_dot`. start_fixed, rate_fixed: True if the initial value or velocity must not be changed
+    to satisfy the constraints. friction: Coulomb friction, N or N m. friction_width: velocity
+    within which the friction is smoothed.
     """
 
     name: str
@@ -35,7 +36,10 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A parameter (variable at run time) or a constant (folded into the code)."""
+    """A parameter, which can be changed at run time, or a constant, which is fixed in the code.
+
+    value: its value in `unit`. formula: the formula in the scene that gives this value.
+    """
 
     name: str
     unit: str
@@ -46,9 +50,10 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Input:
-    """An input, given from outside at every step; `signal` is its default as a formula.
+    """An input, whose value can be given at every step.
 
-    limits: smallest and largest value that acts, None if unbounded.
+    signal: formula of its value if none is given. limits: formulas of the smallest and the largest
+    value to which the input is clipped, None if unbounded.
     """
 
     name: str
@@ -60,7 +65,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """An output: a formula of any quantities of the motion."""
+    """An output: a named quantity that is computed by a formula of any quantities of the motion."""
 
     name: str
     unit: str
@@ -70,9 +75,9 @@ class Output:
 
 @dataclass(frozen=True)
 class Constraint:
-    """A constraint: a formula that is zero along every motion.
+    """A constraint equation: a formula that is zero along every motion.
 
-    It depends on coordinates and t, or is linear in the velocities.
+    The formula depends on coordinates and t (holonomic), or is linear in the velocities.
     """
 
     name: str
@@ -83,10 +88,10 @@ class Constraint:
 
 @dataclass(frozen=True)
 class Event:
-    """An event, where a formula crosses zero.
+    """An event, which is triggered when a formula crosses zero.
 
-    direction: "rising", "falling" or "both". action: "record", "stop" or "jump". jump: formulas of
-    the coordinates and velocities after a jump.
+    when: the formula. direction: "rising", "falling" or "both". action: "record", "stop" or "jump".
+    jump: pairs (name, formula) of the coordinates, velocities and parameters that a jump sets.
     """
 
     name: str
@@ -99,10 +104,12 @@ class Event:
 
 @dataclass(frozen=True)
 class Run:
-    """Settings of a run; step size h and duration in s are defaults for callers.
+    """Settings of the table [run] of a scene: what code is generated, and defaults of simulations.
 
     Attributes
     ----------
+    h, duration : float
+        Default step size and duration of a simulation, s.
     methods : tuple of str
         The steppers to generate; the first is the default.
     real : str
@@ -139,15 +146,23 @@ class Run:
 
     @property
     def needs_derivatives(self) -> bool:
-        """True if derivatives of the accelerations are needed, also for derivatives of steps."""
+        """True if derivatives of the accelerations must be generated.
+
+        They are needed for `linearize` and, to differentiate steps, for `discretize`.
+        """
         return bool(self.linearize) or self.discretize
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A checked scene: all names are declared, no definition is circular, all kinds are right.
+    """A checked scene: the mechanical system and the settings that a TOML file describes.
 
-    `used` maps each name to the places where it is used.
+    All names in its formulas are declared, and no definition is circular. file: name of the file.
+    digest: SHA-256 of its text. kinetic, potential, dissipation: formulas of the energies in J and
+    of the dissipation function. forces: formulas of generalized forces, by coordinate. assembly:
+    bodies and what acts on them, None if there are none. places: lines of all keys in the file.
+    warnings: problems that are not errors. used: for each name, the keys of the formulas that use
+    it.
     """
 
     name: str
@@ -176,15 +191,16 @@ class Scene:
 
     @property
     def constrained(self) -> bool:
-        """True if there are constraints or loops."""
+        """True if the scene has constraint equations, from [constraints] or from loops."""
         return bool(self.constraints or (self.assembly and self.assembly.loops))
 
     def start(
         self, parameters: Mapping[str, float] | None = None
     ) -> tuple[list[float], list[float]]:
-        """Return the initial q and q_dot, for the given values of parameters.
+        """Return the initial coordinates q and velocities q̇, each a list in the scene's order.
 
-        Raises EomcError if one has no value, such as 1/l with l = 0.
+        parameters: values that replace those of the scene's parameters. Raises EomcError if an
+        initial value can't be computed, such as 1/l with l = 0.
         """
         values = {p.name: p.value for p in (*self.parameters, *self.constants)}
         values.update(parameters or {})
@@ -207,6 +223,10 @@ class Scene:
         formula: Formula | None = None,
         severity: str = "error",
     ) -> Problem:
-        """Return a problem at a key such as `energy.kinetic`, with its line and formula marked."""
+        """Return a problem (error or warning) at a key of the scene such as "energy.kinetic".
+
+        It contains the line of the key in the file. formula: the formula to mark in that line.
+        severity: "error" or "warning".
+        """
         text = formula.text if formula else None
         return self.places.problem(tuple(key.split(".")), message, text=text, severity=severity)

@@ -274,7 +274,10 @@ class Document(_Table):
 
 
 def read(tree: Mapping[str, Any]) -> Document:
-    """Return the document of a tree. Raises pydantic.ValidationError if its layout is wrong."""
+    """Check the layout of a scene given as a tree of dicts and lists, and return its document.
+
+    Raises pydantic.ValidationError if the layout is wrong.
+    """
     energy = tree.get("energy", {})
     if tree.get("body") and isinstance(energy, dict):  # bodies have energies of their own
         tree = {**tree, "energy": {"kinetic": 0.0, **energy}}
@@ -307,19 +310,23 @@ _MODELS: Mapping[str, type[_Table]] = {
 
 
 def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
-    """Return the table at `path`; an empty one if there is none."""
+    """Return the table (dict) in a tree that the keys `path` lead to, or {} if there is none."""
     for part in path:
         tree = tree.get(part) if isinstance(tree, dict) else None
     return tree if isinstance(tree, dict) else {}
 
 
 def has_entry(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
-    """True if there is an entry at `path`."""
+    """Return True if the tree has an entry that the keys `path` lead to."""
     return path[-1] in table_at(tree, path[:-1])
 
 
 def error_path(error: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the path of a pydantic error, without the branch of a union."""
+    """Return the keys that lead to the faulty entry of a pydantic error.
+
+    error: an item of ValidationError.errors(). The name of a union's alternative, which pydantic
+    appends to the keys, is removed.
+    """
     path = tuple(map(str, error["loc"]))
     if path[:2] == ("run", "method"):  # whichever of a list
         return path[:2]
@@ -337,7 +344,10 @@ def _keys(path: tuple[str, ...]) -> list[str]:
 
 
 def intended_key(path: tuple[str, ...]) -> str:
-    """Return the key that the last one of `path` may stand for, or ""."""
+    """Return the valid key that was probably meant by an unknown key, or "".
+
+    path: the keys that lead to the unknown key, which is the last of them.
+    """
     known, last = _keys(path), path[-1]
     alias = ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
     alias = alias or ALIASES.get(last, "")
@@ -348,7 +358,10 @@ def intended_key(path: tuple[str, ...]) -> str:
 
 
 def explain(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    """Return the message for a pydantic error, with its remedy."""
+    """Return the message, with a remedy, for a pydantic error in the layout of a scene.
+
+    error: an item of ValidationError.errors(). path: the keys that lead to the faulty entry.
+    """
     kind, received, last = str(error["type"]), error.get("input"), path[-1]
     here = spelling.short_toml(received)
     if kind == "missing":
@@ -428,7 +441,10 @@ _REQUIRED = ("name", "stiffness", "damping", "when")  # keys of entries of array
 
 
 def repair(tree: dict[str, Any], path: tuple[str, ...]) -> None:
-    """Replace a faulty entry by a harmless one, so that all others can be checked."""
+    """Replace the faulty entry at `path` in the tree by a valid one, or remove it.
+
+    The tree is changed so that all other entries can be checked; the error is reported elsewhere.
+    """
     table, last = table_at(tree, path[:-1]), path[-1]
     value = table.get(last)
     if len(path) == 1 and isinstance(value, list) and all(isinstance(g, dict) for g in value):

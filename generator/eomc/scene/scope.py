@@ -30,7 +30,10 @@ Path = tuple[str, ...]
 
 
 def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
-    """Return the value of a formula and "", or nan and why it has no value."""
+    """Evaluate a formula with the values in `known`, by name.
+
+    Returns the value and "", or nan and the reason why the formula has no real, finite value.
+    """
     try:
         value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
         if isinstance(value, (int, float)) and math.isfinite(value):
@@ -62,16 +65,20 @@ def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
 
 
 def cycle_text(cycle: list[str]) -> str:
-    """Return a cycle as text, shortened in the middle if it is long."""
+    """Return a cycle of names as text such as "a -> b -> a", shortened if it is long."""
     return " -> ".join(cycle if len(cycle) <= 20 else [*cycle[:10], "...", *cycle[-9:]])
 
 
 class Checker:
-    """The names of a scene known so far, and the problems found so far.
+    """Checks formulas of a scene against the declared names, and collects the problems.
 
-    tables: table of every declared name. kinds: kinds of quantities that each usable name depends
-    on. used: places where each name is used. centers: names defined by bodies, such as link_x.
-    repaired: places whose faulty entry was replaced by a harmless one.
+    A path is the tuple of keys that lead to an entry of the scene, such as ("energy", "kinetic").
+
+    places: lines of all keys in the file. problems: errors and warnings found so far. tables: the
+    table in which each name is declared. kinds: for each name that formulas may use, the kinds of
+    quantities that it depends on. used: for each name, the paths of the formulas that use it.
+    centers: names of positions that bodies define, such as link_x. definitions: the checked
+    definitions. repaired: paths of faulty entries that were reported and replaced by valid ones.
     """
 
     def __init__(self, places: SourceMap) -> None:
@@ -92,7 +99,8 @@ class Checker:
     ) -> None:
         """Allow accelerations, energies and constraint forces in all formulas checked from now on.
 
-        These are computed last, for outputs.
+        Only the formulas of outputs, which are checked last, may use them. accelerations, forces:
+        the names of these quantities.
         """
         self.solved = True
         moving = frozenset({POSITION, VELOCITY})
@@ -111,7 +119,11 @@ class Checker:
         text: str | None = None,
         severity: str = "error",
     ) -> None:
-        """Record a problem, once for a repeated entry; `at` is its place in the formula `text`."""
+        """Add a problem with the entry at `path` to `problems`.
+
+        at: the faulty part of the formula `text`. severity: "error" or "warning". A problem that
+        several copies of a repeated entry have is added once.
+        """
         self.faults += severity == "error"
         origin = self.places.origin(path)
         same = (origin, re.sub(r"\d+", "", message))
@@ -120,7 +132,10 @@ class Checker:
             self.problems.append(self.places.problem(path, message, at, text, severity))
 
     def parse(self, path: Path, value: float | str) -> Formula | None:
-        """Return a formula that passes the whitelist; None after an error, which is reported."""
+        """Parse the number or formula at `path` and return the formula; its names are not checked.
+
+        If its syntax is not permitted, report the error and return None.
+        """
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
             # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
@@ -143,9 +158,10 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> Formula | None:
-        """Return a parsed formula with checked names; None after an error, which is reported.
+        """Parse the number or formula at `path`, check its names, and return the formula.
 
-        `allowed` are the names that it may use, all by default, and `rule` describes them in words.
+        allowed: the names that it may use, by default all names known so far. rule: describes these
+        names in the message of an error. After an error, report it and return None.
         """
         formula = self.parse(path, value)
         return formula if formula and self.check_names(path, formula, allowed, rule) else None
@@ -157,7 +173,10 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> bool:
-        """Return True if the formula uses only names that it may; errors are reported."""
+        """Return True if the formula at `path` uses only permitted names, else report the errors.
+
+        allowed, rule: as in `formula`. Calls dot(...) must also have a rate that can be computed.
+        """
         before = self.faults
         for node in formula.names():
             self.used[node.id].append(path)
@@ -221,7 +240,11 @@ class Checker:
         return ""
 
     def kinds_of(self, node: ast.AST) -> frozenset[str]:
-        """Return the kinds of quantities in a subtree; dot(e) adds velocities if e moves."""
+        """Return the kinds of quantities that a part of a formula depends on.
+
+        node: syntax node of the part. A call dot(e) adds the kind of velocities if e depends on
+        coordinates, and that of accelerations if e depends on velocities.
+        """
         if isinstance(node, ast.Name):
             return self.kinds.get(node.id, NOTHING)
         kinds = NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
@@ -233,13 +256,20 @@ class Checker:
         return kinds | {VELOCITY} if dot and POSITION in kinds else kinds
 
     def where(self, formula: Formula, kind: str) -> ast.expr:
-        """Return the first part of the formula that depends on `kind`."""
+        """Return the syntax node of the first part of the formula that depends on `kind`.
+
+        kind: a kind of quantities, such as VELOCITY.
+        """
         parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
         parts_of_kind = [part for part in parts if kind in self.kinds_of(part)]
         return min(parts_of_kind, key=lambda part: part.col_offset, default=formula.tree)
 
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
-        """Return the formula's value; nan if it has none, which is reported."""
+        """Return the value of the formula at `path`, for the values in `known` by name.
+
+        If it has no finite value, report this and return nan. The result is also nan if the formula
+        is None or uses a value that is nan; nothing is reported then.
+        """
         if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
             return math.nan  # reported already
         value, fault = value_of(formula, known)
@@ -248,7 +278,11 @@ class Checker:
         return value
 
     def check_smooth(self, path: Path, formula: Formula) -> None:
-        """Report jumps in a formula that is differentiated, and in the definitions that it uses."""
+        """Report calls of sign and heaviside in a formula that is going to be differentiated.
+
+        The definitions that the formula uses are checked too. Arguments that do not depend on time
+        or on the state are permitted.
+        """
         queue = [(path, formula)]
         visited: set[str] = set()
         while queue:

@@ -24,7 +24,11 @@ Path = tuple[str, ...]
 
 
 class SourceMap:
-    """Line numbers of keys, found by parsing one TOML statement at a time."""
+    """The lines of all keys in the TOML text of a scene, to show errors at their places.
+
+    A path is the tuple of keys that lead to an entry. The lines are found by parsing one TOML
+    statement at a time.
+    """
 
     def __init__(self, text: str, file: str) -> None:
         self.lines = text.split("\n")
@@ -82,13 +86,19 @@ class SourceMap:
         return start, {}
 
     def rename(self, written: Path, intended: Path) -> None:
-        """Assign the places of the misspelt key `written`, and of all below it, to `intended`."""
+        """Make the lines of a misspelt key `written` also those of the key `intended`.
+
+        This includes all keys below it. Both arguments are paths.
+        """
         for path in list(self._under.get(written[:2], ())):
             if path[: len(written)] == written:
                 self._place_like(intended + path[len(written) :], path)
 
     def repeat(self, entry: Path, copies: Sequence[Path]) -> None:
-        """Assign the places of the repeated `entry`, and of all below it, to each of its copies."""
+        """Make the lines of a repeated entry, and of all keys below it, those of its copies.
+
+        entry: path of the entry as written. copies: paths of the entries that repetition made.
+        """
         under = list(self._under.get(entry, ()))
         name_path = (*entry, "name")
         for path in (path for path in copies if path != entry):
@@ -105,15 +115,18 @@ class SourceMap:
         self._key.setdefault(new, self._key.get(written, written[-1]))
 
     def rewrite(self, text: str, written: str) -> None:
-        """Record how a text that repetition produced is written in the file."""
+        """Record that a text produced by repetition stands in the file as `written`."""
         self._text.setdefault(text, written)
 
     def origin(self, path: Path) -> Path:
-        """Return the path of an entry as written, before repetition."""
+        """Return the path of the entry in the file from which repetition made the entry `path`.
+
+        An entry that is not a copy has its own path as origin.
+        """
         return self._from.get(path[:2], path[:2]) + path[2:]
 
     def source(self, path: Path) -> str:
-        """Return the statement that contains a key."""
+        """Return the lines of the TOML statement that contains the key at `path`, or ""."""
         start, end = self._line.get(path, (0, 0))
         return "\n".join(self.lines[start:end])
 
@@ -125,7 +138,11 @@ class SourceMap:
         text: str | None = None,
         severity: str = "error",
     ) -> Problem:
-        """Return a problem at a key, with the part `at` of its text marked if it can be found."""
+        """Return a problem with the entry at `path`, with its line in the file.
+
+        text: the faulty text. at: the faulty part of this text, which is marked in the line if it
+        is found. severity: "error" or "warning".
+        """
         if path[-1:] == ("value",) and path not in self._line:
             path = path[:-1]  # written short, m = 2.0
         key = ".".join(path)

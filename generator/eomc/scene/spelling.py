@@ -7,7 +7,7 @@ from typing import Any
 
 
 def short_toml(value: object) -> str:
-    """Return a value as TOML, shortened."""
+    """Return a value as it is written in TOML, shortened to 40 characters, for messages."""
     if isinstance(value, bool):
         text = str(value).lower()
     elif isinstance(value, dict):
@@ -18,7 +18,10 @@ def short_toml(value: object) -> str:
 
 
 def entry(value: object) -> float | str:
-    """Return a number or formula."""
+    """Check that a TOML value is a finite number or a text (a formula), and return it.
+
+    Numbers are returned as float. Raises ValueError otherwise.
+    """
     if isinstance(value, str):
         return value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -32,7 +35,10 @@ def entry(value: object) -> float | str:
 
 
 def vector(value: object) -> tuple[float | str, ...]:
-    """Return a list of numbers and formulas as a tuple."""
+    """Check that a TOML value is a list of numbers and formulas, and return it as a tuple.
+
+    Raises ValueError otherwise.
+    """
     if not isinstance(value, list) or not value:
         raise ValueError(
             f"must be a list of numbers and formulas, such as [0, 1.5], here {short_toml(value)}"
@@ -41,12 +47,20 @@ def vector(value: object) -> tuple[float | str, ...]:
 
 
 def each(value: object) -> float | str | tuple[float | str, ...]:
-    """Return one value for all, or a tuple with one value each."""
+    """Check that a TOML value is a number or formula, or a list of these.
+
+    Returns the single value, or a tuple with the values of the list, such as one for each
+    coordinate of a joint. Raises ValueError otherwise.
+    """
     return tuple(map(entry, value)) if isinstance(value, list) else entry(value)
 
 
 def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]:
-    """Return an angle, or a list of turns, each with an axis and an angle."""
+    """Check that a TOML value is an angle, or a list of turns such as [["z", "pi/2"]].
+
+    Returns the angle, or a tuple of pairs (axis, angle). Angles are numbers or formulas in rad.
+    Raises ValueError otherwise.
+    """
     if not isinstance(value, list):
         return entry(value)
     turns = []
@@ -61,7 +75,10 @@ def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]
 
 
 def axes(value: object) -> tuple[tuple[float, ...], ...]:
-    """Return one or more axes; a single one may be written without outer brackets."""
+    """Check that a TOML value is one axis, such as [0, 0, 1], or a list of axes.
+
+    Returns a tuple of axes, each a tuple of floats. Raises ValueError otherwise.
+    """
     axes: list[Any] = [value]
     if isinstance(value, list) and value and isinstance(value[0], list):
         axes = value
@@ -80,7 +97,11 @@ def _is_number(value: object) -> bool:
 
 
 def limits(value: object) -> tuple[float | str | None, ...]:
-    """Return the smallest and largest value, None if infinite."""
+    """Check that a TOML value is a pair of limits, such as [-1, 1] or [0, inf].
+
+    Returns the smallest and the largest value, each a number, a formula, or None if infinite.
+    Raises ValueError otherwise.
+    """
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(
             "must be the least and the largest value, such as [-1, 1] or [0, inf], "
@@ -91,7 +112,10 @@ def limits(value: object) -> tuple[float | str | None, ...]:
 
 
 def names(value: object) -> tuple[str, ...]:
-    """Return a name or a list of names as a tuple."""
+    """Check that a TOML value is a name or a list of names, and return a tuple of the names.
+
+    Raises ValueError otherwise.
+    """
     names_ = value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names_):
         raise ValueError(f"must be a name in quotes, or a list of names, here {short_toml(value)}")
@@ -99,7 +123,10 @@ def names(value: object) -> tuple[str, ...]:
 
 
 def two_names(value: object) -> tuple[str, ...]:
-    """Return the names of two bodies."""
+    """Check that a TOML value is a list of the names of two bodies, and return it as a tuple.
+
+    Raises ValueError otherwise. The bodies need not exist.
+    """
     names_ = names(value)
     if len(names_) != 2:
         raise ValueError(
@@ -109,7 +136,10 @@ def two_names(value: object) -> tuple[str, ...]:
 
 
 def two_coordinates(value: object) -> tuple[str, ...]:
-    """Return the names of two coordinates."""
+    """Check that a TOML value is a list of the names of two coordinates; return it as a tuple.
+
+    Raises ValueError otherwise. The coordinates need not exist.
+    """
     names_ = names(value)
     if len(names_) != 2:
         raise ValueError(
@@ -119,7 +149,10 @@ def two_coordinates(value: object) -> tuple[str, ...]:
 
 
 def points(value: object) -> tuple[tuple[float | str, ...], ...]:
-    """Return two points."""
+    """Check that a TOML value is a list of two points, such as [[0, 0], ["l", 0]].
+
+    Returns a tuple of two vectors of numbers and formulas. Raises ValueError otherwise.
+    """
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(
             f'must be two points, such as [[0, 0], ["l", 0]], here {short_toml(value)}'
@@ -131,14 +164,20 @@ def points(value: object) -> tuple[tuple[float | str, ...], ...]:
 
 
 def linearized(value: object) -> bool | str:
-    """Return whether derivatives are generated, "parameters" for those by parameters too."""
+    """Check the value of `linearize` in [run]: true, false or "parameters"; return it.
+
+    Raises ValueError otherwise.
+    """
     if isinstance(value, bool) or value == "parameters":
         return value
     raise ValueError(f'must be true, false or "parameters", here {short_toml(value)}')
 
 
 def frame_selection(value: object) -> bool | tuple[str, ...]:
-    """Return True for all frames, False for none, or a tuple of names."""
+    """Check the value of `frames` in [run]: true, false or a list of names of bodies and points.
+
+    Returns a bool (all frames or none), or a tuple of the names. Raises ValueError otherwise.
+    """
     if isinstance(value, bool):
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
@@ -153,7 +192,10 @@ Place = str | tuple[float | str, ...]  # a name, or a vector
 
 
 def named_points(value: object) -> dict[str, tuple[float | str, ...]]:
-    """Return a table of vectors."""
+    """Check that a TOML value is a table of points, and return their vectors by name.
+
+    Each vector is a tuple of numbers and formulas. Raises ValueError otherwise.
+    """
     if not isinstance(value, dict):
         raise ValueError(
             f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {short_toml(value)}'
@@ -166,14 +208,21 @@ def _place(value: object) -> Place:
 
 
 def places(value: object) -> tuple[Place, ...]:
-    """Return a list of points, each a name or a vector."""
+    """Check that a TOML value is a list of points, each a name or a vector; return it as a tuple.
+
+    Raises ValueError otherwise.
+    """
     if not isinstance(value, list):
         raise ValueError(f'must be a list of points, such as ["tip"], here {short_toml(value)}')
     return tuple(map(_place, value))
 
 
 def lines(value: object) -> tuple[tuple[Place, ...], ...]:
-    """Return a list of lines, each through two points or more."""
+    """Check that a TOML value is a list of lines, each a list of two points or more.
+
+    Returns a tuple of lines, each a tuple of points (names or vectors). Raises ValueError
+    otherwise.
+    """
     example = 'a list of lines, such as [["cart", "tip"]]'
     if not isinstance(value, list):
         raise ValueError(f"must be {example}, here {short_toml(value)}")
@@ -186,7 +235,10 @@ def lines(value: object) -> tuple[tuple[Place, ...], ...]:
 
 
 def ends(value: object) -> tuple[tuple[Place, ...], ...]:
-    """Return a list of pairs of points."""
+    """Check that a TOML value is a list of pairs of points, such as the ends of springs.
+
+    Returns a tuple of pairs of points (names or vectors). Raises ValueError otherwise.
+    """
     pairs = lines(value)
     for pair in pairs:
         if len(pair) != 2:
@@ -198,12 +250,20 @@ Solid = tuple[Place, tuple[float | str, ...], object]  # place, size, rotation
 
 
 def boxes(value: object) -> tuple[Solid, ...]:
-    """Return a list of boxes."""
+    """Check that a TOML value is a list of boxes, such as { at = "cart", size = [0.4, 0.2] }.
+
+    Returns a tuple of (centre, edges, rotation), where the rotation is None if it is not given.
+    Raises ValueError otherwise.
+    """
     return _solids(value, "size", '{ at = "cart", size = [0.4, 0.2] }')
 
 
 def circles(value: object) -> tuple[Solid, ...]:
-    """Return a list of circles."""
+    """Check that a TOML value is a list of circles, such as { at = "wheel", radius = 0.1 }.
+
+    Returns a tuple of (centre, (radius,), rotation), where the rotation is None if it is not given.
+    Raises ValueError otherwise.
+    """
     return _solids(value, "radius", '{ at = "wheel", radius = 0.1 }')
 
 
@@ -224,7 +284,10 @@ def _solids(value: object, size: str, example: str) -> tuple[Solid, ...]:
 
 
 def plane_axes(value: object) -> str:
-    """Return the names of the axes of a plane picture."""
+    """Check that a TOML value is "xy", "xz" or "yz", the axes of a plane picture; return it.
+
+    The first axis is drawn to the right, the second upwards. Raises ValueError otherwise.
+    """
     if value in ("xy", "xz", "yz"):
         return str(value)
     raise ValueError(

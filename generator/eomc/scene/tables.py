@@ -9,7 +9,10 @@ from eomc.scene.scope import Checker
 
 
 def repair(tree: dict[str, Any], check: Checker) -> None:
-    """Report each table that scenes do not have once, and remove it or move its entries."""
+    """Report unknown tables that newcomers often write, and remove them from the tree of a scene.
+
+    If a valid table was probably meant, their entries are moved there, so that they can be checked.
+    """
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
         if match := messages.merge_array(name, tree[name]):
             table, entries = match

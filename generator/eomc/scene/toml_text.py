@@ -24,7 +24,11 @@ _PARTS = re.compile(rf"\s*[\w-]+(?:\s*\.\s*[\w-]+){{{MAX_KEY_PARTS},}}\s*", re.A
 
 
 def loads(text: str) -> dict[str, Any]:
-    """Return the tree of a text. Raises ValueError if it is not TOML or exceeds the limits."""
+    """Parse TOML text and return its tree of dicts and lists.
+
+    Raises ValueError if the text is not TOML, has a key with more than MAX_KEY_PARTS parts or is
+    nested too deeply.
+    """
     if long_key(text):
         raise ValueError("a key has too many parts")
     try:
@@ -44,7 +48,10 @@ def long_key(text: str) -> int:
 
 
 def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
-    """Return the unchecked tree and digest of a scene file. Raises OSError and ValueError."""
+    """Read a scene file; return its tree of dicts and lists, unchecked, and its SHA-256 digest.
+
+    Raises OSError if the file can't be read, and ValueError if it is too large or not TOML.
+    """
     with path.open("rb") as stream:
         data = stream.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
@@ -53,7 +60,11 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def events_to_toml(definitions: Any, what: str) -> str:
-    """Return events as TOML, given formulas or dicts of keys of [[event]] by name."""
+    """Return the TOML text of [[event]] tables for events that are given in Python.
+
+    definitions: by the name of the event, its formula or a dict with keys of [[event]]. what: the
+    beginning of error messages. Raises EomcError if `definitions` is not of this form.
+    """
     if not isinstance(definitions, Mapping):
         raise EomcError(
             f'{what}: give a dict, such as {{"section": "theta"}}, here {definitions!r}'
@@ -73,7 +84,11 @@ def events_to_toml(definitions: Any, what: str) -> str:
 
 
 def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
-    """Return a scene's text and tree. Raises SceneError with the place of the error."""
+    """Decode and parse the contents of a scene file; return its text and its unchecked tree.
+
+    file: name of the file in messages. Raises EomcError if it is too large, and SceneError with the
+    place of the error if it is not a TOML text.
+    """
     if len(data) > MAX_BYTES:
         shown = texts.line(file)
         raise EomcError(f"{shown}: it has more than the {MAX_BYTES} bytes a scene may have")

@@ -26,7 +26,11 @@ _JOINT_KEYS = (
 
 
 def center_names(doc: Document) -> set[str]:
-    """Return the names of the positions of points, and of centres of mass of jointed bodies."""
+    """Return the names, such as link_x, by which formulas refer to positions of bodies and points.
+
+    They are the components of the position of each [[point]], and of the centre of mass of each
+    body that is held by a joint.
+    """
     letters = "xy" if doc.gravity and len(doc.gravity) == 2 else "xyz"
     named = [body.name for body in doc.body.values() if body.position is None]
     named += [point.name for point in doc.point.values()]
@@ -34,10 +38,10 @@ def center_names(doc: Document) -> set[str]:
 
 
 def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
-    """Return the bodies of a scene and what acts on them; None if the scene has no such tables.
+    """Check the bodies, points, springs, dampers, forces and loops of a scene and return them.
 
-    `known` maps constants and parameters to values. Errors are reported to `check`; after an error
-    the assembly must not be used.
+    known: values of constants and parameters by name. Errors are reported to `check`; after an
+    error the result must not be used. Returns None if the scene has no such tables.
     """
     if not (doc.body or doc.point or doc.spring or doc.damper or doc.force or doc.loop):
         if doc.gravity is not None:

@@ -16,7 +16,10 @@ _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
 def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
-    """Yield the checked constraints of a document; errors are reported to `check`."""
+    """Check the table [constraints] of a document and yield its constraint equations.
+
+    Errors are reported to `check`; faulty entries may be left out.
+    """
     for name, entry in doc.constraints.items():
         if why := row_name_fault(check, doc, name):
             end = "" if names.fault(name) else ": give the constraint a name of its own"
@@ -53,7 +56,10 @@ def _equation_remedy(text: str) -> str:
 
 
 def row_name_fault(check: Checker, doc: Document, name: str) -> str:
-    """Return why a constraint equation can't have this name; "" if it can."""
+    """Return the reason why a constraint equation can't be called `name`, or "" if it can.
+
+    A name is refused if it is not valid or if the scene uses it already.
+    """
     taken = {n: f"stands in [{table}]" for n, table in check.tables.items()}
     taken |= dict.fromkeys(doc.outputs, "stands in [outputs]")
     taken |= {f"{c}_dot": f"is the velocity of '{c}'" for c in doc.coordinates}
@@ -66,7 +72,11 @@ def row_name_fault(check: Checker, doc: Document, name: str) -> str:
 
 
 def force_names(doc: Document, assembly: Assembly | None) -> list[str]:
-    """Return the names by which outputs refer to multipliers and reactions."""
+    """Return the names by which outputs refer to constraint forces.
+
+    They are the Lagrange multipliers, such as lambda_rod, also those of friction that sticks, and
+    the components of the reactions of loops, such as hinge_force_x.
+    """
     plane, loops = (assembly.plane, assembly.loops) if assembly else (True, ())
     rows = [*doc.constraints, *(row for loop in loops for row in loop.rows(plane).values())]
     if doc.run.friction == "stick":
@@ -86,9 +96,10 @@ def _coordinates_of(body: BodyTable) -> tuple[str, ...]:
 def reports_unknown_multiplier(
     check: Checker, doc: Document, path: Path, text: float | str, known: Sequence[str]
 ) -> bool:
-    """Report an output that names a multiplier or reaction by a name not in `known`.
+    """Check that the formula of an output calls multipliers and reactions by known names.
 
-    Returns True if there was one.
+    path: keys of the output in the scene. text: its formula. known: the names of all multipliers
+    and reactions. Returns True, after reporting an error, if the formula uses another name for one.
     """
     rows = {name.removeprefix("lambda_") for name in known}
     rows |= {entry.name for entry in doc.loop.values()}
@@ -108,7 +119,10 @@ def reports_unknown_multiplier(
 
 
 def check_guesses(check: Checker, doc: Document) -> None:
-    """Warn of each `guess` in a scene without constraints, where it has no effect."""
+    """Report a warning for each key `guess` in a scene without constraint equations.
+
+    There it has no effect: it marks initial values that may be changed to satisfy constraints.
+    """
     if not (doc.constraints or doc.loop):
         for name, entry in doc.coordinates.items():
             if entry.guess:

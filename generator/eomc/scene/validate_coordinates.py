@@ -18,7 +18,11 @@ FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 def check_coordinates(
     check: Checker, doc: Document, known: Mapping[str, float]
 ) -> Iterator[Coordinate]:
-    """Yield the checked coordinates of a document; `known` maps parameters to values."""
+    """Check the table [coordinates] of a document and yield its coordinates.
+
+    known: values of constants and parameters by name. Errors are reported to `check`; faulty
+    entries may be left out.
+    """
 
     def formula(name: str, key: str, value: float | str) -> tuple[Formula | None, float]:
         path = ("coordinates", name, key)
@@ -50,7 +54,10 @@ def check_coordinates(
 
 
 def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
-    """Warn of an angle of more than a turn given as a number, since degrees may be meant."""
+    """Report a warning if an angle in rad is larger than one turn, since degrees may be meant.
+
+    path: keys of the entry in the scene.
+    """
     if SUSPICIOUS_ANGLE <= abs(angle) < math.inf:
         message = (
             f"{angle:.6g} rad are {abs(angle) / math.tau:.3g} turns; for degrees write "
@@ -62,7 +69,11 @@ def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
 def check_width(
     check: Checker, path: tuple[str, ...], value: float, width: Formula | None, friction: object
 ) -> None:
-    """Report a width of friction that is not positive, or that has no friction."""
+    """Report an error if the entry `friction_width` is not positive or has no `friction` with it.
+
+    path: keys of the coordinate or body. value: value of the width (rad/s or m/s). width: its
+    formula. friction: the entry `friction`, None if it is missing.
+    """
     path = (*path, "friction_width")
     if value <= 0:
         check.report(

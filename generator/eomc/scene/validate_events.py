@@ -17,7 +17,10 @@ CONSTANT_REMEDY = ", and does not change in a run: make it a parameter"
 
 
 def check_events(check: Checker, doc: Document) -> Iterator[Event]:
-    """Yield the checked events of a document; errors are reported to `check`."""
+    """Check the [[event]] tables of a document and yield the events.
+
+    Errors are reported to `check`; faulty entries may be left out.
+    """
     names_so_far: set[str] = set()
     for k, entry in doc.event.items():
         if why := names.fault(entry.name):

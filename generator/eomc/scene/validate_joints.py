@@ -14,7 +14,10 @@ from eomc.scene.validate_values import ZERO, ValueChecker
 
 
 class JointChecker:
-    """Checks how bodies are attached and moved."""
+    """Checks the joints by which bodies are attached to their parents.
+
+    A path is the tuple of keys of an entry in the scene, such as ("body", "arm", "joint").
+    """
 
     def __init__(self, values: ValueChecker) -> None:
         self.values = values
@@ -22,13 +25,17 @@ class JointChecker:
         self.first_body: dict[str, str] = {}  # first body that each coordinate moves
 
     def entry(self, name: str) -> BodyTable | PointTable:
-        """Return the table of a body or point."""
+        """Return the table in the scene of the body or point `name`."""
         array, label = self.values.names[name]
         entries: Mapping[str, BodyTable | PointTable] = getattr(self.doc, array)
         return entries[label]
 
     def kind(self, path: Path, entry: BodyTable) -> str:
-        """Return the kind of joint; "" if it is unknown, which is reported."""
+        """Return the kind of joint of a body, a key of `joints.JOINTS`.
+
+        path: keys of the body. entry: its table. If the kind is missing or unknown, or does not
+        exist in plane scenes, report this and return "".
+        """
         check, joint = self.check, entry.joint
         known = [k for k, kind in JOINTS.items() if kind.plane or self.values.dimension != 2]
         if joint is None:
@@ -56,7 +63,10 @@ class JointChecker:
         return joint
 
     def parent(self, path: Path, name: str, parent: str | None) -> str | None:
-        """Return the parent of body `name`; None if it can't be a parent, which is reported."""
+        """Check the parent of the body `name` and return it, "world" if it is not given.
+
+        If it can't be a parent, report this and return None.
+        """
         if parent is None or parent == WORLD:
             return WORLD
         if parent not in self.values.names:
@@ -78,7 +88,11 @@ class JointChecker:
         return None
 
     def coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[Formula, ...] | None:
-        """Return the checked formulas of the joint's displacements; None after an error."""
+        """Check the entry `coordinates` of a body and return its formulas.
+
+        There is one formula of coordinates for each motion of the joint. joint: kind of the joint.
+        After an error, report it and return None.
+        """
         check, written, count = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
         if path in check.repaired:
             return None
@@ -125,14 +139,17 @@ class JointChecker:
         return formula
 
     def coordinates_in(self, formulas_: Iterable[Formula]) -> dict[str, None]:
-        """Return the coordinates that occur in formulas."""
+        """Return the names of the coordinates that occur in formulas, as keys of a dict."""
         names_used = (node.id for formula in formulas_ for node in formula.names())
         return dict.fromkeys(name for name in names_used if name in self.doc.coordinates)
 
     def axes(
         self, path: Path, joint: str, entry: BodyTable
     ) -> tuple[tuple[float, float, float], ...]:
-        """Return the checked unit axes; the joint's defaults if none are given."""
+        """Check the entry `axis` of a body and return the axes of its joint as unit vectors.
+
+        joint: kind of the joint. If no axes are given, return its defaults. Errors are reported.
+        """
         check, axis_count = self.check, JOINTS[joint].axis_count
         if path in check.repaired or self.values.dimension is None:
             return ()
@@ -163,7 +180,12 @@ class JointChecker:
         return tuple(axes)
 
     def per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
-        """Return one checked formula for each coordinate of the joint."""
+        """Check an entry with one value for each coordinate of a joint, such as `damping`.
+
+        joint: kind of the joint. written: a number or formula for all coordinates, a tuple with one
+        for each, or None. Returns a formula for each coordinate, or () if there is no entry or
+        after an error, which is reported.
+        """
         count, key = len(JOINTS[joint].motions), path[-1]
         if written is None:
             return ()

@@ -20,7 +20,10 @@ _AXES_IN_WORDS = {
 
 
 class LoopChecker:
-    """Checks the entries of [[loop]]; the names of their constraint equations differ."""
+    """Checks the [[loop]] tables of a scene, also that their constraint equations differ in name.
+
+    Errors are reported to the `check` of `values`.
+    """
 
     def __init__(self, values: ValueChecker) -> None:
         self.values = values
@@ -28,7 +31,10 @@ class LoopChecker:
         self.rows = {*values.doc.constraints}  # names of constraint equations so far
 
     def loop(self, path: Path, entry: LoopTable) -> Loop | None:
-        """Return the checked loop; None if its joint is unknown, which is reported."""
+        """Check a [[loop]] table and return the loop, or None if its kind of joint is unknown.
+
+        path: keys of the table in the scene. entry: the table. Errors are reported.
+        """
         kind = self._kind(path, entry)
         if not kind or self.values.dimension is None:
             return None

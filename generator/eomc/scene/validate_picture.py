@@ -18,9 +18,9 @@ _SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", 
 
 
 def check_picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
-    """Return the checked picture; None if the scene has none. Errors are reported to `check`.
+    """Check the table [picture] of a scene and return the picture, or None if there is no table.
 
-    `known` maps constants and parameters to values.
+    known: values of constants and parameters by name. Errors are reported to `check`.
     """
     return _Picture(check, doc, known).checked() if doc.picture else None
 

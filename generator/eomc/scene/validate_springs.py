@@ -12,7 +12,10 @@ from eomc.scene.validate_values import ORIGIN, ZERO, ValueChecker
 
 
 def check_spring(values: ValueChecker, path: Path, entry: SpringTable) -> Spring:
-    """Return the checked entry of [[spring]]."""
+    """Check a [[spring]] table and return the spring.
+
+    path: keys of the table in the scene. entry: the table. Errors are reported to `values.check`.
+    """
     return Spring(
         stiffness=values.formula((*path, "stiffness"), entry.stiffness),
         length=values.formula((*path, "length"), entry.length),
@@ -21,14 +24,21 @@ def check_spring(values: ValueChecker, path: Path, entry: SpringTable) -> Spring
 
 
 def check_damper(values: ValueChecker, path: Path, entry: DamperTable) -> Damper:
-    """Return the checked entry of [[damper]]."""
+    """Check a [[damper]] table and return the damper.
+
+    path: keys of the table in the scene. entry: the table. Errors are reported to `values.check`.
+    """
     return Damper(
         damping=values.formula((*path, "damping"), entry.damping), **_between(values, path, entry)
     )
 
 
 def check_force(values: ValueChecker, path: Path, entry: ForceTable) -> Force:
-    """Return the checked force, torque or both; their formulas may use all names."""
+    """Check a [[force]] table and return the force and torque that it applies to a body.
+
+    path: keys of the table in the scene. entry: the table. The formulas of force and torque may use
+    all names. Errors are reported to `values.check`.
+    """
     check = values.check
     if entry.body not in values.names:
         remedy = suggest(entry.body, values.names) or ": declare it as a [[body]]"

@@ -22,7 +22,11 @@ ORIGIN: Vector = (ZERO, ZERO, ZERO)
 
 
 class ValueChecker:
-    """Checks vectors, rotations, masses and inertias; errors are reported to `check`."""
+    """Checks vectors, rotations, masses and inertias in a scene; errors are reported to `check`.
+
+    doc: the whole scene. known: values of constants and parameters by name. A path is the tuple of
+    keys of an entry in the scene, such as ("body", "arm", "mass").
+    """
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         self.check = check
@@ -35,7 +39,11 @@ class ValueChecker:
         self.has_inertia: dict[str, bool] = {}
 
     def value(self, path: Path, value: float | str) -> tuple[Formula, float]:
-        """Return a checked formula of parameters and its default value; (0, nan) after an error."""
+        """Check an entry that may use constants and parameters; return its formula and its value.
+
+        value: the entry, a number or the text of a formula. The returned value is that for the
+        scene's parameters. After an error, report it and return (formula of 0, nan).
+        """
         if value not in self.checked:
             rule = f"'{path[-1]}' is made of numbers, constants and parameters"
             formula = self.check.formula(path, value, self.known, rule)
@@ -46,11 +54,19 @@ class ValueChecker:
         return self.checked[value]
 
     def formula(self, path: Path, value: float | str) -> Formula:
-        """Return a checked formula of parameters; 0 after an error."""
+        """Check an entry that may use constants and parameters, and return its formula.
+
+        value: a number or the text of a formula. After an error, report it and return the formula
+        of 0.
+        """
         return self.value(path, value)[0]
 
     def position_formula(self, path: Path, value: float | str) -> Formula:
-        """Return a checked formula of all names except inputs and velocities, without dot."""
+        """Check a formula of a position or angle, and return it.
+
+        It must not depend on inputs or velocities, and not contain dot(...). value: a number or the
+        text of the formula. Errors are reported; if the formula can't be parsed, return 0.
+        """
         check = self.check
         formula = check.formula(path, value)
         if formula is None:
@@ -81,7 +97,11 @@ class ValueChecker:
         entries: Sequence[float | str] | None,
         formula: Callable[[Path, float | str], Formula] | None = None,
     ) -> Vector:
-        """Return three checked formulas, by `formula` if it is given; zeros after an error."""
+        """Check a vector and return its three components; in a plane scene, the third is 0.
+
+        entries: two or three numbers or formulas; None for a vector of zeros. formula: the method
+        that checks each entry, by default `self.formula`. Errors are reported.
+        """
         if entries is None or not self.fits(path, len(entries)):
             return ORIGIN
         checked = [(formula or self.formula)(path, entry) for entry in entries]
@@ -89,7 +109,10 @@ class ValueChecker:
         return x, y, z
 
     def fits(self, path: Path, entries: int) -> bool:
-        """Return True if a vector has as many entries as the scene has dimensions."""
+        """Return True if a vector with this number of entries fits the dimension of the scene.
+
+        Vectors have two entries in a plane scene and three in space. Otherwise, report the error.
+        """
         if self.dimension is None or entries == self.dimension:
             return self.dimension is not None
         scene = "a plane scene" if self.dimension == 2 else "space"
@@ -102,7 +125,11 @@ class ValueChecker:
         return False
 
     def unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
-        """Return the axis normalised to length one; None after an error."""
+        """Return an axis as a unit vector of three components.
+
+        axis: two numbers in a plane scene, three in space. After an error, report it and return
+        None.
+        """
         if not self.fits(path, len(axis)):
             return None
         size = math.hypot(*axis)
@@ -113,7 +140,11 @@ class ValueChecker:
         return x, y, third[0] if third else 0.0
 
     def two_bodies(self, path: Path, bodies: tuple[str, ...], kind: str) -> tuple[str, str]:
-        """Check that two bodies, one of which may be the world, exist and differ."""
+        """Check that the two bodies named by an entry exist and differ, and return their names.
+
+        One of them may be "world". kind: the beginning of a message, such as "a spring acts".
+        Errors are reported.
+        """
         for name in bodies:
             if name != WORLD and name not in self.names:
                 remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
@@ -126,7 +157,11 @@ class ValueChecker:
     def rotation(
         self, path: Path, rotation: Any, formula: Callable[[Path, float | str], Formula]
     ) -> tuple[Turn, ...]:
-        """Return the checked turns of a rotation, whose angles are checked by `formula`."""
+        """Check a rotation and return its successive turns, each about an axis.
+
+        rotation: an angle about z in a plane scene, or a tuple of pairs (axis, angle), or None for
+        no rotation. formula: the method that checks an angle. Errors are reported.
+        """
         if rotation is None:
             return ()
         if not isinstance(rotation, tuple):
@@ -142,7 +177,11 @@ class ValueChecker:
         return tuple(Turn(axis, formula(path, angle)) for axis, angle in rotation)
 
     def mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
-        """Return the checked mass and inertia."""
+        """Check the mass and the inertia of a body, and return their formulas.
+
+        path: keys of the body in the scene. The inertia has the six components Ixx, Iyy, Izz, Ixy,
+        Ixz, Iyz in kg m^2; those that are not given are 0. Errors are reported.
+        """
         mass, value = self.value((*path, "mass"), entry.mass)
         if value < 0:
             self.check.report(
