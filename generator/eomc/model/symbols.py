@@ -19,14 +19,14 @@ PARTS = ("_lack_", "_pivot_")  # suffixes of the numerator and denominator of a 
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
-    """The total time derivative of its argument, not evaluated."""
+    """SymPy function dot(e) for the total time derivative of e, which is not evaluated."""
 
     nargs = 1
     is_real = True
 
     @classmethod
     def eval(cls, inner: Any) -> Any:
-        """Return zero for a number."""
+        """Return zero if `inner` is a number, else None (no simplification)."""
         return sympy.S.Zero if inner.is_number else None
 
     def _latex(self, printer: Any, exp: str = "") -> str:
@@ -35,35 +35,43 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
 
 
 class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as the tape has it
-    """The function (pivot, limit): 1/pivot if the pivot exceeds the limit, else 0."""
+    """SymPy function pivot_inverse(pivot, limit): 1/pivot if pivot > limit, else 0."""
 
     nargs = 2
     is_real = True
 
     @classmethod
     def eval(cls, pivot: Expr, limit: Expr) -> Expr | None:
-        """Evaluate for numbers."""
+        """Return the value if both arguments are numbers, else None (no simplification)."""
         if not (pivot.is_number and limit.is_number):
             return None
         return 1 / pivot if pivot > limit else sympy.S.Zero
 
     def fdiff(self, argindex: int = 1) -> Expr:
-        """Return the derivative of 1/pivot; the limit is constant."""
+        """Return the derivative: -1/pivot^2 (or 0) by the pivot (argument 1), 0 by the limit."""
         return -(self**2) if argindex == 1 else sympy.S.Zero
 
 
 @lru_cache(maxsize=10_000)  # SymPy takes ten times as long for a symbol that exists
 def symbol(name: str) -> Symbol:
-    """Return the symbol of a name; all symbols of a system are real."""
+    """Return the real SymPy symbol with a name; all symbols of a system are real."""
     return Symbol(name, real=True)
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s.
+    """A generalized coordinate with its initial values.
 
-    start_fixed, rate_fixed: whether the assembly of consistent initial values keeps them as given.
-    follows, rate_follows: formulas of start and rate if these depend on parameters, else "".
+    Attributes
+    ----------
+    name, unit, note
+        Name, unit and description.
+    start, rate
+        Initial value in `unit` and initial velocity in `unit`/s.
+    start_fixed, rate_fixed
+        Whether these values are kept when initial values are adjusted to the constraints.
+    follows, rate_follows
+        Formulas of start and rate if these depend on parameters, else "".
     """
 
     name: str
@@ -78,17 +86,17 @@ class Coordinate:
 
     @property
     def q(self) -> Symbol:
-        """The coordinate's symbol."""
+        """The symbol of the coordinate."""
         return symbol(self.name)
 
     @property
     def qd(self) -> Symbol:
-        """The velocity's symbol, `<name>_dot`."""
+        """The symbol of the velocity, `<name>_dot`."""
         return symbol(f"{self.name}_dot")
 
     @property
     def qdd(self) -> Symbol:
-        """The acceleration's symbol, `<name>_ddot`, which occurs in outputs only."""
+        """The symbol of the acceleration, `<name>_ddot`, which occurs in outputs only."""
         return symbol(f"{self.name}_ddot")
 
 
@@ -98,13 +106,16 @@ class _Named:
 
     @property
     def symbol(self) -> Symbol:
-        """The symbol of its name."""
+        """The symbol with the name of the quantity."""
         return symbol(self.name)
 
 
 @dataclass(frozen=True)
 class Parameter(_Named):
-    """A number that may change at run time."""
+    """A parameter of a system: a number that can be set at run time.
+
+    value: its default, in `unit`.
+    """
 
     value: float
     unit: str = ""
@@ -113,7 +124,10 @@ class Parameter(_Named):
 
 @dataclass(frozen=True)
 class Output(_Named):
-    """An output of the model; its formula may use all variables, accelerations too."""
+    """An output of a system, a quantity computed from the state.
+
+    formula: its value in `unit`, over all variables of the system and the accelerations.
+    """
 
     formula: Expr
     unit: str = ""
@@ -122,9 +136,10 @@ class Output(_Named):
 
 @dataclass(frozen=True)
 class Input(_Named):
-    """An external input, given at each step; `signal` is its default value.
+    """An external input of a system, such as the force of an actuator.
 
-    limits: saturation limits (lower, upper), None where there is none.
+    signal: its default value, an expression. limits: lower and upper limit at which the input is
+    saturated; None for no limit.
     """
 
     unit: str = ""
@@ -134,7 +149,7 @@ class Input(_Named):
 
     @property
     def limited(self) -> Expr:
-        """The input saturated at its limits."""
+        """The expression of the input saturated at its limits, min(max(u, lower), upper)."""
         lower, upper = self.limits
         value = self.symbol if lower is None else sympy.Max(self.symbol, lower)
         return value if upper is None else sympy.Min(value, upper)
@@ -142,12 +157,23 @@ class Input(_Named):
 
 @dataclass(frozen=True)
 class Event(_Named):
-    """An event with the event function `when`; direction: "rising", "falling" or "both".
+    """An event, which is triggered when its event function crosses zero.
 
-    action: "record", "stop" or "jump". jump: new values of coordinates, velocities and parameters,
-    by name. begins: an expression that triggers the event if it is positive at the start of a run
-    or after a jump. above: whether `when` cannot become negative immediately after it was zero; a
-    sign change there means that it was positive for a short time.
+    Attributes
+    ----------
+    when
+        The event function.
+    direction
+        Crossings that trigger the event: "rising", "falling" or "both".
+    action
+        "record" the event, "stop" the run, or let the state "jump".
+    jump
+        Pairs (name, new value) of coordinates, velocities and parameters that a jump sets.
+    begins
+        Expression that triggers the event if it is positive at the start of a run or after a jump.
+    above
+        Whether `when` cannot become negative immediately after it was zero; a sign change there
+        means that it was positive for a short time.
     """
 
     when: Expr
@@ -162,15 +188,25 @@ class Event(_Named):
 
 @dataclass(frozen=True)
 class Constraint(_Named):
-    """A constraint equation formula = 0 over t, coordinates, parameters and definitions.
+    """A constraint equation, formula = 0.
 
-    holonomic: whether it depends on positions and t only; else it is linear in the velocities.
-    loop: name of the [[loop]] to which it belongs. redundant: whether other constraints imply it,
-    so that it has no multiplier. switched: whether it is active in some friction modes only and
-    identically zero in the others. rotation_error: for an axis equation of a loop, the component of
-    2 tan(a/2) n along the axis after which it is named, where the rotation error is an angle a
-    about n, and cos(a/2)^2. It is zero only if the joint is closed; initial values are assembled
-    with it.
+    Attributes
+    ----------
+    formula
+        Expression over t, coordinates, velocities, parameters and definitions.
+    holonomic
+        Whether it depends on positions and t only; else it is linear in the velocities.
+    loop
+        Name of the [[loop]] to which it belongs, or "".
+    redundant
+        Whether other constraints imply it, so that it has no multiplier.
+    switched
+        Whether it is active in some friction modes only and identically zero in the others.
+    rotation_error
+        For an equation that aligns axes of a loop joint, the pair (component of 2 tan(a/2) n along
+        the axis after which the equation is named, cos(a/2)^2), where the rotation error of the
+        joint is an angle a about the unit vector n. The component is zero only if the joint is
+        closed; initial values that satisfy the constraints are computed with it.
     """
 
     formula: Expr
@@ -184,20 +220,24 @@ class Constraint(_Named):
 
     @property
     def multiplier(self) -> Symbol:
-        """The constraint's Lagrange multiplier, in reactions."""
+        """The symbol of the Lagrange multiplier, which occurs in reactions and outputs."""
         return multiplier_of(self.name)
 
     @property
     def parts(self) -> tuple[Symbol, ...]:
-        """For a switched constraint, in events: multiplier times pivot, and the pivot (>= 0)."""
+        """Two symbols in events of a switched constraint: multiplier times pivot, and the pivot.
+
+        The pivot is >= 0; the multiplier of the constraint is their quotient.
+        """
         return tuple(symbol(f"{self.name}{part}") for part in PARTS)
 
 
 @dataclass(frozen=True)
 class FrictionMode:
-    """A discrete coordinate: 1, -1 or 0 as another one slides forwards, backwards or sticks.
+    """The friction mode of a coordinate with stick-slip friction, which is a discrete coordinate.
 
-    at: index of the discrete coordinate. of: index of the other one.
+    Its value is 1 if the coordinate slides forwards, -1 if it slides backwards, and 0 if it sticks.
+    at: index of the discrete coordinate. of: index of the coordinate with friction.
     """
 
     at: int
@@ -206,11 +246,16 @@ class FrictionMode:
 
 @dataclass(frozen=True)
 class Reaction(_Named):
-    """The reaction of a [[loop]] on its second body, over definitions and multipliers.
+    """The force and moment that the joint of a [[loop]] exerts on its second body.
 
-    values: force (2) and moment about the joint's point in the plane; force (3) and moment (3) in
-    space, in world axes. branches: expressions that are 1 if the joint is closed. At other
-    rotations that satisfy the axis equations, one of them is 0 or -1.
+    Attributes
+    ----------
+    values
+        Expressions over definitions and multipliers, in world axes. In the plane: two components
+        of the force (N) and the moment about the joint's point (N m); in space: three of each.
+    branches
+        Expressions that are 1 if the joint is closed. They detect a wrong solution of the equations
+        that align axes: one of them is then 0 or -1.
     """
 
     values: tuple[Expr, ...]
@@ -219,12 +264,15 @@ class Reaction(_Named):
 
 
 def multiplier_of(row: str) -> Symbol:
-    """Return the Lagrange multiplier of the constraint with a name."""
+    """Return the symbol of the Lagrange multiplier of a constraint. row: name of the constraint."""
     return symbol(f"{row}{MULTIPLIER}")
 
 
 def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
-    """Return each definition with the others substituted, by its symbol."""
+    """Return a dict from the symbol of each definition to its expression without other definitions.
+
+    definitions: pairs (symbol, expression), each over the symbols before it.
+    """
     known: dict[Expr, Expr] = {}
     for name, e in definitions:
         known[name] = e.xreplace(known)
@@ -234,7 +282,10 @@ def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
 def needed(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:
-    """Return the definitions on which `ends` depend, in their order."""
+    """Return the definitions on which expressions depend, in the order of `definitions`.
+
+    definitions: pairs (symbol, expression), each over the symbols before it. ends: the expressions.
+    """
     known: Mapping[Symbol, Expr] = dict(definitions)
     required: set[Symbol] = set()
     queue = [s for end in ends for s in end.free_symbols]

@@ -48,9 +48,10 @@ __all__ = [
 
 
 class System(Mechanics):
-    """d/dt dL/dqd - dL/dq + dR/dqd = Q, from a scene or, by `make`, from expressions.
+    """A mechanical system in SymPy symbols: d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd.
 
-    Its fields are those of `Mechanics`.
+    It is read from a scene by `eomc.read`, or made from expressions by `System.make`. Its
+    attributes are those of `Mechanics`.
     """
 
     def __repr__(self) -> str:
@@ -58,7 +59,7 @@ class System(Mechanics):
 
     @property
     def size(self) -> str:
-        """The numbers of coordinates, inputs and parameters, as text."""
+        """Text with the numbers of coordinates, inputs and parameters."""
         counts = {
             "coordinate": self.coordinates, "input": self.inputs, "parameter": self.parameters,
         }  # fmt: skip
@@ -97,27 +98,80 @@ class System(Mechanics):
         friction: Mapping[Any, Any] | None = None,
         **unknown: Never,
     ) -> System:
-        r"""Make a system from SymPy expressions.
+        r"""Make a system from SymPy expressions and return it.
 
-        coordinates: symbols, names or dynamicsymbols, or a mapping from these to initial values or
-        pairs (value, velocity), as numbers or formulas of parameters. Names may replace symbols,
-        and formulas as in scenes may replace expressions. With plain symbols the velocity of
-        `theta` is the symbol `theta_dot`; with dynamicsymbols it is `theta.diff()`. parameters,
-        inputs (to their default signal) and definitions are mappings from symbols, outputs from
-        names; `theta_ddot`, or the second derivative of a dynamicsymbol, is an acceleration there.
-        potential: P, or a generalized potential with terms linear in the velocities, such as
-        e*B*(y*x_dot - x*y_dot)/2 of a charge in a magnetic field, which are no part of the energy.
-        constraints: mapping from names to expressions that are zero, over coordinates and t, or
-        linear in the velocities. Assembly changes coordinates without an initial value (None, or a
-        plain list of coordinates) and those in `guess`. limits: mapping from inputs to saturation
-        limits (lower, upper), None for no limit. events: mapping from names to event functions, or
-        to dicts as in [[event]], {"when": y, "direction": "falling", "action": "jump", y_dot:
-        -e*y_dot}. tolerance: of adaptive steps, 1e-9 by default if there are events. picture: a
-        dict as in [picture] of a scene, with expressions or formulas: {"lines": [[[0, 0], [x,
-        -l]]]}. Names that are invalid in C (`\theta`, `lambda`) are replaced, as listed in
-        `renamed`. friction: mapping from coordinates to Coulomb friction (N or N m) with stick-slip
-        transitions, as [run] friction = "stick". Raises EomcError for undeclared names.
+        Names as text may replace symbols, and formulas in the syntax of scenes may replace
+        expressions. The velocity of a symbol `theta` is the symbol `theta_dot`; the velocity of a
+        dynamicsymbol is `theta.diff()`. Units are SI units and radians.
 
+        Parameters
+        ----------
+        name
+            Name of the system, of its Python module and of its C files.
+        coordinates
+            Symbols or dynamicsymbols, or a mapping from these to initial values or to pairs
+            (value, velocity). Initial values are numbers or formulas of parameters.
+        kinetic, dissipation
+            Kinetic energy and Rayleigh's dissipation function.
+        potential
+            Potential energy. It may have terms linear in the velocities, such as
+            e*B*(y*x_dot - x*y_dot)/2 of a charge in a magnetic field, which are not part of the
+            energy.
+        parameters
+            Mapping from symbols to numbers.
+        forces
+            Mapping from coordinates to generalized forces (N or N m).
+        inputs
+            Symbols, or a mapping from symbols to default values.
+        definitions
+            Mapping from symbols to expressions.
+        outputs
+            Mapping from names to expressions. The acceleration of `theta` in them is `theta_ddot`,
+            or the second derivative of a dynamicsymbol.
+        constraints
+            Mapping from names to expressions that are zero. They depend on coordinates and t, or
+            are linear in the velocities.
+        guess
+            Coordinates whose initial values may be changed to satisfy the constraints, as those of
+            coordinates without an initial value are.
+        units
+            Mapping from symbols or names to units, for display.
+        title
+            Title for display; by default the name.
+        h, duration
+            Default step size and duration of a run in s.
+        methods
+            Names of the methods with fixed steps to generate, or "auto" for adaptive steps.
+        real, batch, linearize, discretize, inverse_dynamics
+            Settings of the generated code, as in the table [run] of a scene.
+        limits
+            Mapping from inputs to saturation limits (lower, upper); None for no limit.
+        events
+            Mapping from names to event functions, or to dicts as [[event]] in a scene:
+            {"when": y, "direction": "falling", "action": "jump", y_dot: -e*y_dot}.
+        tolerance
+            Tolerance of adaptive steps. By default 1e-9 (larger in single precision) for systems
+            with events, friction or the method "auto"; other systems then have fixed steps only.
+        picture
+            Dict as the table [picture] in a scene: {"lines": [[[0, 0], [x, -l]]]}.
+        friction
+            Mapping from coordinates to Coulomb friction (N or N m) with stick-slip transitions.
+
+        Returns
+        -------
+        System
+            The system. Names that are invalid in C (`\theta`, `lambda`) are replaced in it, as
+            listed in its attribute `renamed`.
+
+        Raises
+        ------
+        EomcError
+            If an argument is invalid or an expression has an undeclared name.
+        TypeError
+            If there is no argument of a given name.
+
+        Examples
+        --------
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
         >>> System.make("pendulum", {theta: 0.5}, m*l**2*theta.diff()**2/2,

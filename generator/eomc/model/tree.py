@@ -1,4 +1,4 @@
-"""A tree of elementary joints, and the frames on it: what the recursions run along."""
+"""A tree of elementary joints, and frames on it, for the recursive derivation of the equations."""
 
 from __future__ import annotations
 
@@ -11,12 +11,28 @@ from eomc.model.rational import ZERO, Matrix, Vector
 
 @dataclass(frozen=True)
 class Link:
-    """An elementary joint and the mass that moves with it, in the frame that the joint moves.
+    """An elementary joint (one rotation or translation), its frame and the mass fixed in the frame.
 
-    The frame stands at `offset` in the parent's frame, rotated by `rotation` (it takes vectors of
-    the joint's frame to the parent's), and then turns about (`turns`) or slides along its own
-    `axis` (0, 1, 2) by `q`, a coordinate or an expression in coordinates. mass, moment (mass times
-    centre of mass) and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) are about the frame's origin.
+    Attributes
+    ----------
+    name
+        Name of the body to which the joint belongs.
+    parent
+        Index of the parent link; -1 for the world.
+    turns
+        True for a rotation, False for a translation.
+    axis
+        Coordinate axis (0, 1, 2) of the frame about which it turns or along which it slides.
+    q
+        Angle (rad) or displacement (m): a coordinate or an expression in coordinates.
+    offset, rotation
+        Position of the frame in the parent's frame if q is zero, and the rotation that takes
+        vectors from the frame to the parent's frame then.
+    mass, moment, inertia
+        Mass, mass times centre of mass, and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) about the
+        frame's origin, in the axes of the frame.
+    armature
+        Inertia of the joint's rotor: kg m^2, or kg for a translation.
     """
 
     name: str
@@ -34,10 +50,21 @@ class Link:
 
 @dataclass(frozen=True)
 class Tree:
-    """Links, parents first, and the energies of all other parts of the system (other_*).
+    """A tree of elementary joints and the energies of all other parts of the system.
 
-    fixed_moment: first moment of mass that is fixed in the world, for its potential energy. rates:
-    coordinates of joints and their velocities.
+    Attributes
+    ----------
+    links
+        Elementary joints; each parent comes before its children.
+    rates
+        Pairs (coordinate, velocity) of the coordinates that move the joints.
+    gravity
+        Acceleration of gravity in the world, in m/s^2.
+    fixed_moment
+        First moment (mass times centre of mass, kg m) of the bodies that are fixed in the world,
+        for their potential energy.
+    other_kinetic, other_potential
+        Energies of the parts of the system that do not belong to the tree.
     """
 
     links: tuple[Link, ...]
@@ -50,11 +77,22 @@ class Tree:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a body or a point: at `offset`, rotated by `rotation`, in that of its link.
+    """The frame of a body or of a point on a body.
 
-    link -1: in the world, where a body placed by formulas has them in the coordinates, and its
-    mass and inertia (as those of a link) about its centre, where its frame is. angle: in the plane,
-    over definitions.
+    Attributes
+    ----------
+    name
+        Name of the body or point.
+    link
+        Index of the link in whose frame it is fixed; -1 for the world.
+    offset, rotation
+        Position and rotation matrix in the frame of the link. For a body placed by formulas they
+        are expressions in the coordinates, in the world.
+    angle
+        Rotation angle in rad in a planar scene, over definitions.
+    mass, inertia
+        Mass, and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) about the centre of mass, of a body placed
+        by formulas; its frame is at its centre of mass. Zero for other bodies.
     """
 
     name: str
