@@ -1,12 +1,12 @@
-"""M = d(N - 1 - j) + sum f_i: how many freedoms a scene of bodies and joints has, and which.
+"""Degrees of freedom of a scene of bodies and joints: M = d(N - 1 - j) + sum f_i, and ranks.
 
-The count (Chebychev, Grübler, Kutzbach; e.g. Angeles, *Fundamentals of Robotic Mechanical
-Systems*) is compared with ranks: of the poses of all bodies over the coordinates, which shows
-coordinates that move nothing or nothing of their own, and of the mass matrix of the bodies, which
-shows those that move nothing with inertia. Both are taken from plain forward kinematics, of bodies
-placed by formulas from its finite differences, at random states and at the start. Where the joints
-of a tree can be eliminated one by one, nothing is redundant and no rank need be taken, which makes
-thousands of bodies a matter of seconds.
+The mobility formula (Chebychev, Grübler, Kutzbach; e.g. Angeles, *Fundamentals of Robotic
+Mechanical Systems*) is compared with two ranks. The rank of the Jacobian of all body poses shows
+coordinates that move no body, or that move bodies only as other coordinates do. The rank of the
+mass matrix of the bodies shows coordinates that move no inertia. Both are computed by numerical
+forward kinematics at random configurations and at the start, with finite differences for bodies
+that are placed by formulas. If the joints of a tree can be eliminated one by one, no coordinate is
+redundant and no rank is computed, so that thousands of bodies take seconds.
 """
 
 from __future__ import annotations
@@ -35,11 +35,29 @@ COINCIDENCE_TOLERANCE = 1e-12  # relative distance below which two points coinci
 
 @dataclass(frozen=True)
 class Mobility:
-    """Mobility of a mechanism. joints, loops: number of each kind; M: by the mobility formula.
+    """Number of degrees of freedom of a mechanism, by the mobility formula and by rank.
 
-    coordinates: number in the scene; rank: number that move the bodies independently, almost
-    everywhere. constraints: number written as formulas. remarks: messages on redundant or missing
-    coordinates and on singular positions.
+    Attributes
+    ----------
+    scene
+        Name of the scene.
+    d
+        Degrees of freedom of a free body: 3 in the plane, 6 in space.
+    bodies
+        Number of bodies, without the world.
+    joints, loops
+        Number of joints of each kind in the tree, and of those that close loops. Bodies placed by
+        formulas count as joints of a kind of their own.
+    M
+        Degrees of freedom by the mobility formula M = d(N - 1 - j) + sum f.
+    coordinates
+        Number of coordinates in the scene.
+    rank
+        Number of coordinates that move the bodies independently, at almost all configurations.
+    remarks
+        Messages on redundant or missing coordinates and on singular configurations.
+    constraints
+        Number of constraint equations that are written as formulas.
     """
 
     scene: str
@@ -54,7 +72,7 @@ class Mobility:
     constraints: int = 0
 
     def table(self) -> str:
-        """Return the result as text."""
+        """Return the result as text of several lines for the terminal."""
         d, freedoms = self.d, partial(_freedoms, d=self.d)
         kinds = [f"{n} {kind} (f = {freedoms(kind)})" for kind, n in self.joints.items()]
         closing = [
@@ -90,7 +108,10 @@ class Mobility:
 
 
 def count(scene: Scene) -> Mobility:
-    """Compute the mobility of a scene. Raises EomcError for one without bodies."""
+    """Compute the degrees of freedom of a scene and compare them with its coordinates.
+
+    Raises EomcError if the scene has no bodies, or if their positions have no value.
+    """
     assembly = scene.assembly
     if not assembly or not assembly.bodies:
         names = [c.name for c in scene.coordinates]
@@ -130,7 +151,8 @@ def count(scene: Scene) -> Mobility:
 def meeting(scene: Scene) -> list[Problem]:
     """Return a warning for each spring and damper whose ends coincide at the start.
 
-    Its force has no direction there. A spring without rest length does not need one.
+    Its force has no direction there. Springs of rest length zero, whose force needs no direction,
+    are left out.
     """
     assembly = scene.assembly
     if not assembly:
@@ -166,7 +188,7 @@ def meeting(scene: Scene) -> list[Problem]:
 
 
 def _is_zero(formula: Formula, scene: Scene) -> bool:
-    """Whether it is zero whatever the parameters are."""
+    """Return True if a formula is zero for all values of the parameters."""
     constants = {c.name: c.value for c in scene.constants}
     if any(node.id not in constants for node in formula.names()):
         return False

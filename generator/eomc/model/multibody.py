@@ -26,14 +26,41 @@ from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spri
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
-Value = Callable[[str, Formula], Expr]  # the expression of a formula that stands at a key
+Value = Callable[[str, Formula], Expr]  # (key in the scene, formula) -> SymPy expression
 
 
 @dataclass
 class Terms:
-    """Terms that bodies, springs and dampers add to a system.
+    """Terms that bodies, springs, dampers and forces add to a system.
 
-    definitions: may be used by the user's formulas. later: may use the user's definitions.
+    Attributes
+    ----------
+    definitions
+        (symbol, expression) pairs that the user's formulas may use.
+    later
+        (symbol, expression) pairs that may use the user's definitions.
+    tree_kinetic, tree_potential
+        Energies of bodies with joints, as terms of sums.
+    kinetic, potential
+        Energies of bodies placed by formulas; the potential includes springs.
+    dissipation
+        Rayleigh's dissipation function of dampers and joint damping.
+    forces
+        Generalized forces by name of the coordinate.
+    applied
+        Forces F at positions y, as pairs (y, F).
+    links, frames
+        Elementary joints with the bodies that they move, and frames of bodies.
+    closed
+        Constraint equations and reaction of each loop.
+    frictions
+        Stick-slip friction in joints, as pairs (joint position, friction).
+    rates
+        Velocity of each coordinate that moves a joint.
+    fixed_moment
+        First moment of the masses that are fixed in the world, in kg m.
+    gravity
+        Acceleration of gravity, in m/s^2.
     """
 
     definitions: list[tuple[Symbol, Expr]] = field(default_factory=list)
@@ -56,7 +83,11 @@ class Terms:
     gravity: Vector = ZERO
 
     def tree(self, kinetic: Expr, potential: Expr) -> Tree | None:
-        """Return the tree, with energies written as formulas kept apart; None if it is empty."""
+        """Return the tree of bodies with joints, or None if there are none.
+
+        kinetic, potential: energies that the scene adds as formulas. They become the tree's other
+        energies, with those of springs and bodies placed by formulas.
+        """
         if not self.links:
             return None
         return Tree(
@@ -82,7 +113,24 @@ class _Place:
 
 
 class Builder:
-    """Puts bodies together, in the order in which a scene needs the pieces."""
+    """Converter of the bodies, joints, springs and forces of a scene to `terms` of a system.
+
+    Call `build_tree` first, then `build_rest` and `add_forces` once the user's definitions can be
+    evaluated.
+
+    Parameters
+    ----------
+    assembly
+        Bodies, joints, springs, dampers and forces of the scene.
+    value
+        Function that converts a formula to an expression, given its key in the scene.
+    coordinates
+        Symbol of the velocity of each coordinate.
+    taken
+        Names that definitions cannot have.
+    sticks
+        Whether friction in joints is stick-slip friction rather than smooth.
+    """
 
     def __init__(
         self,
@@ -107,7 +155,7 @@ class Builder:
     # --- the tree --------------------------------------------------------------------------------
 
     def build_tree(self) -> None:
-        """Build all bodies with joints."""
+        """Add the bodies with joints, their energies and their definitions to `terms`."""
         for body in self.assembly.bodies:
             if body.joint:
                 self._join(body)
@@ -209,7 +257,7 @@ class Builder:
         terms.tree_potential.append(self._weight(mass, position))
 
     def add_forces(self) -> None:
-        """Add damping, friction and actuators of the joints."""
+        """Add the damping, friction and actuator forces of the joints to `terms`."""
         terms = self.terms
         for body in self.assembly.bodies:
             key, width = f"body.{body.name}", S.One
@@ -236,7 +284,10 @@ class Builder:
     # --- bodies placed by formulas, springs and dampers ------------------------------------------
 
     def build_rest(self) -> None:
-        """Build all elements that may use the user's definitions."""
+        """Add to `terms` the elements that may use the user's definitions.
+
+        They are bodies placed by formulas, frames, springs, dampers, forces and loops.
+        """
         for body in self.assembly.bodies:
             if not body.joint:
                 self._put(body)

@@ -14,7 +14,10 @@ STEEP = (*KINDS, sympy.tanh, sympy.atan)  # tanh and atan act as jumps if they a
 
 
 def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
-    """Return the names of the non-smooth functions in the system; "" if there are none."""
+    """Return the names of the non-smooth functions in a system, separated by commas.
+
+    The result is "" if there are none. kinds: SymPy classes of the functions to look for.
+    """
     s = system
     exprs = (
         *(s.kinetic, s.potential, s.linear_potential, s.dissipation, *s.forces),
@@ -28,11 +31,11 @@ def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
 
 
 def has_steep_terms(system: System) -> bool:
-    """Return True if forces are non-smooth, or may be steep relative to a long step.
+    """Return True if the expressions of a system are non-smooth or may vary fast within one step.
 
-    Steep are tanh and atan of any argument, and functions of the velocities that are not
-    polynomials, sines or cosines, such as friction smoothed by v/sqrt(v**2 + w**2), or the Stribeck
-    term exp(-v**2).
+    Functions that may vary fast are tanh and atan of any argument, and functions of the velocities
+    other than polynomials, sines and cosines, such as friction smoothed by v/sqrt(v**2 + w**2) or
+    the Stribeck term exp(-v**2).
     """
     if nonsmooth_functions(system, STEEP):
         return True

@@ -15,22 +15,22 @@ def compiled(
     modules: Any,
     definitions: Sequence[tuple[Any, Expr]] = (),
 ) -> Callable[..., Any]:
-    """Return a function of the arguments that evaluates an expression, or a list of them.
+    """Return a Python function of numbers that evaluates an expression or a list of expressions.
 
-    The generated code contains names of Python and of `modules`, such as `size` or `e`, which a
-    parameter may have too. Dummy symbols therefore replace the arguments and the definitions.
+    It works for symbols of any name: dummy symbols replace the arguments and definitions, so that
+    a parameter may have the name of something in Python or in `modules`, such as `size` or `e`.
 
     Parameters
     ----------
     arguments : sequence of Symbol
-        The arguments, in their order; names stand for symbols.
+        The arguments of the function, in order.
     expressions : Expr or sequence of Expr
-        What is evaluated.
+        The expressions to evaluate. A sequence gives a function that returns a list.
     modules : as `modules` of `sympy.lambdify`
-        Where functions and constants come from.
+        Modules that contain the functions and constants, such as "math".
     definitions : sequence of (Symbol, Expr), optional
-        Symbols of the expressions that are evaluated first, each over those before it. Without
-        them, common subexpressions are evaluated once.
+        Symbols of the expressions and their values, which are evaluated first and in order; each
+        may use the symbols before it. Without definitions, common subexpressions are eliminated.
     """
     names = [*arguments, *(name for name, _ in definitions)]
     stand_ins: dict[Any, Any] = {name: Dummy(real=True) for name in names}

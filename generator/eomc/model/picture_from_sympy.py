@@ -44,9 +44,22 @@ def picture_scene(
     parameters: Iterable[Parameter], inputs: Iterable[str],
     definitions: Sequence[tuple[Symbol, Expr]],
 ) -> tuple[Scene, str]:  # fmt: skip
-    """Return the scene from which pictures are drawn, and its canonical text.
+    """Return a scene with the picture of a system made in Python, and the picture as JSON text.
 
-    expression: converts a user's expression. Raises EomcError as for a scene with that [picture].
+    Parameters
+    ----------
+    picture
+        The argument `picture` of System.make.
+    expression
+        Function that converts a user's expression, given a description for messages.
+    coordinates, parameters, inputs, definitions
+        Names that the picture may use; they become those of the scene. definitions: pairs (symbol,
+        expression), of which the scene contains those that the picture needs.
+
+    Raises
+    ------
+    EomcError
+        If the picture is invalid.
     """
     if not isinstance(picture, Mapping):
         raise api_arguments.fault("picture", f"give a dict, such as {_EXAMPLE}, here {picture!r}")
@@ -71,7 +84,7 @@ def picture_scene(
 
 
 def in_python(message: str) -> str:
-    """Convert a message about [picture] of a scene to the syntax of Python."""
+    """Replace TOML syntax by Python syntax in a message about [picture]; return the message."""
     for toml, python in _WORDS:
         message = message.replace(toml, python)
     return message
@@ -134,7 +147,7 @@ class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def text(expr: Expr) -> str:
-    """Return an expression as a formula.
+    """Return a SymPy expression as a formula in the syntax of scenes.
 
     >>> x = Symbol("x")
     >>> text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))

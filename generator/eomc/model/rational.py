@@ -14,15 +14,18 @@ from eomc.base.spatial import cross, matrix, transposed
 Vector = spatial.Vector[Expr]
 Matrix = spatial.Matrix[Expr]
 
-DIGITS = 50  # of rounded numbers
-INTEGER_TOLERANCE = 10**40  # reciprocal: numbers closer to an integer are rounded to it
+DIGITS = 50  # decimal digits to which numbers are rounded
+INTEGER_TOLERANCE = 10**40  # numbers closer than 1e-40 to an integer are rounded to it
 
 ZERO: Vector = (S.Zero, S.Zero, S.Zero)
 ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
 
 
 def numeric_entry(e: Expr) -> Expr:
-    """Return a number as a fraction of at most DIGITS digits, or as an integer if it is close."""
+    """Round a number to 50 digits and return it as a fraction; other expressions are unchanged.
+
+    Numbers within 1e-40 of an integer become that integer.
+    """
     if not e.is_number:
         return e
     if not e.is_Rational:
@@ -37,19 +40,19 @@ def numeric_entry(e: Expr) -> Expr:
 
 
 def numeric(v: Vector) -> Vector:
-    """Return a vector with its numbers as fractions."""
+    """Return a vector whose entries that are numbers are rounded to fractions of 50 digits."""
     x, y, z = map(numeric_entry, v)
     return (x, y, z)
 
 
 def clean(matrix: Matrix) -> Matrix:
-    """Return a matrix with its numbers as fractions."""
+    """Return a matrix whose entries that are numbers are rounded to fractions of 50 digits."""
     one, two, three = map(numeric, matrix)
     return (one, two, three)
 
 
 def unit(axis: Sequence[float]) -> list[Expr]:
-    """Return the axis as fractions, normalised to DIGITS digits."""
+    """Return the unit vector along `axis` as fractions, normalised to 50 digits."""
     entries = [Rational(str(x)) for x in axis]
     with mpmath.workdps(DIGITS + 5):
         long = [mpmath.mpf(x.p) / x.q for x in entries]
@@ -58,7 +61,10 @@ def unit(axis: Sequence[float]) -> list[Expr]:
 
 
 def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
-    """Return (k, R) with R e_k = axis; joint axes are thus coordinate axes of their frames."""
+    """Return (k, R): a coordinate axis k (0, 1 or 2) and a rotation R with R e_k along `axis`.
+
+    R is exact to 50 digits. In a frame rotated by R, a joint axis is a coordinate axis.
+    """
     along = unit(axis)
     for k, x in enumerate(along):
         if abs(x) == 1:

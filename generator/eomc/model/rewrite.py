@@ -24,13 +24,15 @@ _ORDERS = (GreaterThan, LessThan, StrictGreaterThan, StrictLessThan)
 
 
 class JumpError(ValueError):
-    """A Piecewise that is discontinuous, or whose continuity cannot be decided."""
+    """Error for a SymPy Piecewise that is discontinuous or whose continuity is undecided."""
 
 
 def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
-    """Return an equal expression over functions of the formula language.
+    """Return an equal expression without Piecewise and without functions such as sec and coth.
 
-    fixed: constant symbols, and whether each is known to be nonnegative. Raises JumpError.
+    The result uses functions that formulas of scenes have. fixed: constant symbols, and whether
+    each is known to be nonnegative. Raises JumpError for a Piecewise that is discontinuous, or
+    whose continuity cannot be decided.
     """
     expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
     return expr.replace(lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, fixed))

@@ -11,7 +11,11 @@ from eomc.model.symbols import symbol
 
 
 def saturate_inputs(system: AnySystem) -> AnySystem:
-    """Return the system with each limited input replaced by a definition, as `force_limited`."""
+    """Return the system with each input that has limits replaced by its saturated value.
+
+    The value of an input `force` is a new definition, named `force_limited`, that replaces the
+    input in definitions, forces, events and outputs.
+    """
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
     limited_symbols: dict[Symbol, Symbol] = {}
     for i in system.inputs:
