@@ -265,17 +265,20 @@ class _Rows:
     params: Any
 
     def onto(self, z: Array) -> Array:
-        """Return z with its free coordinates projected onto the constraints. Raises MotionError."""
+        """Return z = [q; qd; u] with its free coordinates projected onto the constraints.
+
+        Raises MotionError if the projection fails.
+        """
         n = self.model.nq
         fixed = [not x for x in self.moved[:n]] + [False] * n
         q, _ = self.model._projected(z[:n], np.zeros(n), self.t, self.params, fixed)
         return np.concatenate([q, z[n:]])
 
     def tangent_basis(self, z: Array) -> Array:
-        """Return an orthonormal basis (k, len(z)) of free directions tangent to the constraints.
+        """Return an orthonormal basis (k, len(z)) of directions in which z = [q; qd; u] may change.
 
-        Coordinates move tangentially to the position constraints; each free velocity or input adds
-        one direction.
+        Free coordinates change tangentially to the position constraints; each free velocity or
+        input adds one direction.
         """
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
         _, s, V = np.linalg.svd(self._slopes(z)[: self.model._rows.holonomic, moved])
@@ -285,11 +288,11 @@ class _Rows:
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
     def residual(self, z: Array, forces: Array) -> Array:
-        """Return what remains of `forces` (nq,) beyond A^T lambda, and the velocity residuals.
+        """Return the part of `forces` that multipliers cannot balance, and the velocity residuals.
 
-        The result concatenates: forces that no multipliers lambda can balance (nq,), residuals of
-        the velocity constraints (nc,), and their time derivatives at constant velocities (nc,), by
-        a central difference.
+        z: [q; qd; u]. forces: tau - C qd - g at z, (nq,). The result concatenates the part of the
+        forces that no A^T lambda can balance (nq,), the residuals of the velocity constraints
+        (nc,), and their time derivatives at constant velocities (nc,), by a central difference.
         """
         A, (q, qd) = self._slopes(z), self._halves(z)
         forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
@@ -301,7 +304,10 @@ class _Rows:
         return np.concatenate([forces, now, (then - before) / (2 * short)])
 
     def sizes(self, z: Array) -> Array:
-        """Return the magnitudes (2 nc,) of the terms of the velocity residuals and their rates."""
+        """Return the magnitudes (2 nc,) of the terms of the velocity residuals and their rates.
+
+        They are the scales of the last 2 nc entries of `residual`; z: [q; qd; u].
+        """
         sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
         return np.concatenate([sizes, sizes * self._pace(z)])
 

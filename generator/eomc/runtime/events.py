@@ -86,7 +86,7 @@ class BatchEventLog(EventLog):
 
 
 class BatchEventBuffer:
-    """Collect the events of all instances of a batch from the calls of C in all threads.
+    """Collect the events of all instances of a batch from the calls of C functions in all threads.
 
     most: largest number of events that fit in memory.
     """
@@ -127,10 +127,10 @@ class BatchEventBuffer:
 
 
 class GroupEventBuffer:
-    """Buffer into which one call of C with `count` instances writes events.
+    """Buffer into which one call of a C function writes the events of `count` instances.
 
-    counts: number of events of each instance. which, rows: index of each event, and its time and
-    state [t, q, qd]. given: the arguments of the C function.
+    counts: number of events of each instance, (count,). which, rows: index of each event, and its
+    time and state [t, q, qd]. given: the arguments of the C function.
     """
 
     def __init__(self, model: ModelInfo, count: int) -> None:

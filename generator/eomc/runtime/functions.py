@@ -594,7 +594,7 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, *, outputs: bool = False,
     ) -> Any:  # fmt: skip
-        """Derivatives of the accelerations, and of the outputs, with respect to the parameters.
+        """Return the derivatives of the accelerations (and outputs) with respect to the parameters.
 
         Parameters
         ----------

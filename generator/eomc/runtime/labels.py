@@ -1,4 +1,4 @@
-"""Names and units as figures and formulas print them; copied beside a built module."""
+"""Names and units in the form that figures and formulas print; copied into built packages."""
 
 from __future__ import annotations
 

@@ -43,8 +43,10 @@ def html(run: Any) -> str:
 
 
 def _picture(run: Any) -> str:
-    """The mechanism, where eomc is there and the scene says what it looks like, beside the
-    coordinates over time, as an image; "" without matplotlib."""
+    """Return an image (HTML) of the coordinates over time; "" without matplotlib.
+
+    The mechanism is drawn beside them if eomc is installed and the scene describes its shape.
+    """
     if not len(run) or find_spec("matplotlib") is None:
         return ""
     from matplotlib import rc_context

@@ -208,7 +208,7 @@ class Run(Trajectory):
         return self
 
     def _repr_html_(self) -> str:
-        """For notebooks: the end, the verdict, a small picture where matplotlib is there."""
+        """Return the summary of the run that notebooks display, as HTML."""
         return html(self)
 
     def animate(
@@ -243,14 +243,14 @@ class Run(Trajectory):
         return page.animate([self, *others], file, scene=scene, title=title)
 
     def render(self, t: ArrayLike | None = None, *, scene: Any = None) -> Array:
-        """Draw the mechanism at a time within the run.
+        """Draw the mechanism at times within the run and return the pixels.
 
         Parameters
         ----------
         t : float or (n,) array, optional
             Time in s; the end of the run by default. States between rows are interpolated.
         scene : path, optional
-            The scene, where the module was not loaded by `eomc.load`.
+            The scene, if the module was not loaded by `eomc.load`.
 
         Returns
         -------
@@ -262,7 +262,7 @@ class Run(Trajectory):
         ImportError
             Without eomc or matplotlib.
         EomcError
-            If the scene says nothing about its shape.
+            If the scene does not describe the shape of the mechanism.
         ValueError
             If a time lies outside of the run.
         """
