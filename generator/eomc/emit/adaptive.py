@@ -107,7 +107,7 @@ class Stepping:
 
     @property
     def constant_arguments(self) -> Sequence[CArgument]:
-        """The C arguments of an iteration that are constant during a run: u, precomputed c, and
+        """The C arguments that are constant during a run: inputs u, precomputed c and parameters
         p.
         """
         return [a for a in self.form.around if a.name in "ucp"]
@@ -128,9 +128,7 @@ class Stepping:
 
     @cached_property
     def solve_stages(self) -> CFunction:
-        """The prototype of the function that solves for the accelerations at the stages of a
-        step.
-        """
+        """The prototype of the function that solves for the stage accelerations of a step."""
         real = self.functions.real
         out = c.output_array(f"{self.method}_stages", "a")
         measures = (c.output_array(real, name) for name in ("scale", "coarse", "rough", "beyond"))
@@ -152,8 +150,10 @@ class Stepping:
 
     @cached_property
     def rounding_cap(self) -> CFunction:
-        """The prototype of the function for the effect of rounding errors on the accelerations of a
-        step.
+        """The prototype of the function that limits the scales of accelerations by rounding errors.
+
+        The scales weight the changes of accelerations in a step. See `may_rest` for when it is
+        used.
         """
         real = self.functions.real
         values = (c.input_array(f"{self.method}_stages", "a"), c.input_array(real, "scale"))
@@ -170,16 +170,14 @@ class Stepping:
 
     @cached_property
     def slopes(self) -> CFunction:
-        """The prototype of the function that computes the derivatives of the accelerations along q
-        and qd.
-        """
+        """The prototype of the function for the derivatives of the accelerations along q and qd."""
         out = c.output_array(f"{self.method}_newton", "m")
         return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
-        """The prototype of the function that makes the next step, with a size chosen by the
-        tolerance.
+        """The prototype of the function that makes the next step, whose size the tolerance
+        determines.
         """
         arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
@@ -189,9 +187,7 @@ class Stepping:
 
     @cached_property
     def interpolate(self) -> CFunction:
-        """The prototype of the function that computes the state at a fraction z of the last
-        step.
-        """
+        """The prototype of the function for the state at a fraction z of the last step."""
         out = tuple(c.output_array(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.input_array(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
@@ -199,8 +195,8 @@ class Stepping:
 
     @property
     def step_arguments(self) -> Sequence[CArgument]:
-        """The C arguments that are constant during a run, with those that step functions take (u,
-        p).
+        """The C arguments that are constant during a run, including all that step functions
+        take.
         """
         rest = self.constant_arguments
         present = {a.name for a in rest}
@@ -208,8 +204,8 @@ class Stepping:
 
     @cached_property
     def fixed(self) -> CFunction:
-        """The prototype of the function that makes the next step of fixed size, with event
-        detection.
+        """The prototype of the function that makes the next step of fixed size in a run with
+        events.
         """
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
         return c.static(
@@ -223,10 +219,10 @@ class Stepping:
 
     @cached_property
     def state_within(self) -> CFunction:
-        """The prototype of the function that computes the state within the last step, for event
-        detection.
+        """The prototype of the function for the state at a fraction z of the last step, of any
+        kind.
 
-        It also handles steps of fixed size if the scene has events.
+        If the scene has events, the step may be adaptive or of fixed size.
         """
         if not self.functions.target.system.events:
             return self.interpolate
@@ -443,8 +439,9 @@ def call_for_instance(functions: Functions) -> str:
 
 
 def batch(functions: Functions) -> AdaptiveBatch:
-    """Return the data for the template of a batch of adaptive runs, one instance after the
-    other.
+    """Return the data for the template of a batch of adaptive runs.
+
+    The C code steps one instance after the other.
     """
     return AdaptiveBatch(
         prefix=functions.prefix,
@@ -455,10 +452,9 @@ def batch(functions: Functions) -> AdaptiveBatch:
 
 
 def _ends() -> tuple[Row, Row]:
-    """Return weights of the stage values that extrapolate their polynomial to the start and the
-    end.
+    """Return weights that extrapolate from the stages to the start and to the end of a step.
 
-    The polynomial has the given values at the stages of a step.
+    They give the values there of the polynomial through the values at the stages.
     """
     parts = [METHOD.legendre(n) for n in range(METHOD.stages)]
     columns = list(zip(*parts, strict=True))

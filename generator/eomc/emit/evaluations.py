@@ -128,8 +128,9 @@ _SPACE = {
 
 
 def doc(target: Target, name: str) -> str:
-    """Return the comment of the evaluation function `name`, as worded for a planar or a spatial
-    system.
+    """Return the comment of the evaluation function `name` for the C header.
+
+    The wording depends on whether the system is planar or spatial.
     """
     text = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
     if name == "inverse_dynamics" and target.system.constraints:
@@ -168,28 +169,28 @@ def c_array_size(target: Target, shape: str) -> str:
 
 
 def source(target: Target, name: str) -> Function | None:
-    """Return the function of the program from which the C function `name` is generated; None if
-    there is none.
+    """Return the function of the program from which the C function `name` is generated.
 
     It computes all results, or the product of a matrix with a direction, which gives one column.
+    None if the program has neither.
     """
     functions = target.program.functions
     return functions.get(name) or functions.get(f"{name}_column")
 
 
 def refuses(target: Target, name: str) -> bool:
-    """Return True if the C function `name` returns a status, because it factors a matrix that may
-    be singular.
+    """Return True if the C function `name` returns a status.
+
+    It does so if it factors a matrix that may be singular.
     """
     function = source(target, name)
     return KINDS[name].refuses or bool(function and function.checks)
 
 
 def takes_qdd(target: Target, name: str) -> bool:
-    """Return True if the evaluation function `name` reads accelerations in this scene, but not in
-    all.
+    """Return True if the evaluation function `name` reads accelerations in this scene.
 
-    Functions that take accelerations in every scene have them as `Kind.extra_argument`.
+    Functions that take accelerations in every scene are excluded, see `Kind.extra_argument`.
     """
     function = source(target, name)
     optional = "qdd?" in KINDS[name].takes
@@ -197,10 +198,9 @@ def takes_qdd(target: Target, name: str) -> bool:
 
 
 def takes_t(target: Target, name: str) -> bool:
-    """Return True if the evaluation function `name` depends on time, directly or through the
-    signals.
+    """Return True if the evaluation function `name` depends on time.
 
-    The signals are the functions by which the scene defines its inputs.
+    It may do so through the signals, the functions by which the scene defines its inputs.
     """
     function = source(target, name)
     assert function is not None

@@ -69,8 +69,7 @@ class Functions:
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
     def groups_angles(self, function: Function) -> bool:
-        """Return True if the C code computes the sines of several angles together in vector
-        registers.
+        """Return True if the C code computes sines of several angles at once in vector registers.
 
         D is excluded, because selftest.c verifies by it the sines that the steps use.
         """
@@ -78,9 +77,7 @@ class Functions:
 
     @property
     def has_grouped_angles(self) -> bool:
-        """Whether some function computes the sines of several angles together in vector
-        registers.
-        """
+        """Whether some function computes sines of several angles at once in vector registers."""
         functions = self.target.program.functions.values()
         return any(self.groups_angles(f) and group_angles(f) for f in functions)
 
@@ -116,9 +113,7 @@ class Functions:
 
     @cached_property
     def supplied_names(self) -> Mapping[str, frozenset[str]]:
-        """For each C argument (q, qd, u, p, ...), the names of the program's variables that it
-        contains.
-        """
+        """For each C argument (q, qd, u, p, ...), the names of the variables that it contains."""
         return self.target.groups()
 
     def argument(self, name: str) -> CArgument:
@@ -147,8 +142,7 @@ class Functions:
 
     @property
     def moves_stages(self) -> tuple[CArgument, ...]:
-        """The C argument `onto`, a flag that the stages of a step are projected onto the
-        constraints.
+        """The C argument `onto`, a flag to project the stages of a step onto the constraints.
 
         Empty without constraints.
         """
@@ -160,8 +154,9 @@ class Functions:
         return (*STATE, "t") if self.target.driven else STATE
 
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
-        """Return those of the C arguments `names` that a static function reads, with arrays as
-        pointers.
+        """Return those of the C arguments `names` that a function of the program reads.
+
+        Arrays are passed as pointers, as in static functions.
         """
         needed = [n for n in names if function.uses & self.supplied_names[n]]
         arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
@@ -173,7 +168,9 @@ class Functions:
 
     @cached_property
     def signal(self) -> CFunction | None:
-        """The prototype of the C function that computes u by the scene's signals; None without
+        """The prototype of the C function that computes u by the scene's signals.
+
+        A signal is the function of time and state by which the scene defines an input. None without
         inputs.
         """
         if "signal" not in self.target.program:
@@ -199,8 +196,7 @@ class Functions:
         return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
     def read(self, function: Function, follows: bool = True) -> frozenset[str]:
-        """Return the names of the C arguments (q, qd, u, p, ...) that a function of the program
-        reads.
+        """Return the names of the C arguments (q, qd, u, p, ...) that a function reads.
 
         With `follows`, include the arguments of the scene's signals if the function reads inputs.
         """
@@ -232,10 +228,10 @@ class Functions:
         return (*self.statements(function, body), last), body
 
     def statements(self, function: Function, body: Body) -> tuple[Block, ...]:
-        """Return the C statements of a function: local variables for its arguments, then
-        assignments.
+        """Return the C statements of a function: definitions of local variables, then assignments.
 
-        Many statements are divided by stage into blocks with comments; few form one block.
+        body: the assignments in C. Many statements are divided by stage (time, position, velocity)
+        into blocks with comments; few form one block.
         """
         blocks = (self.loads(function), *body.early, *body.blocks)
         lines = tuple(line for b in blocks for line in b.lines)
@@ -292,15 +288,11 @@ class Functions:
 
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
-        """The evaluation functions of the scene, such as D or energy, in the order of the C
-        header.
-        """
+        """The evaluation functions of the scene, such as D or energy, in header order."""
         return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
 
     def evaluation(self, name: str) -> Computed:
-        """Return the C function that evaluates `name`, such as D, bias, energy or signal, with its
-        body.
-        """
+        """Return the C function that evaluates `name`, such as D, bias or signal, with its body."""
         kind, target = KINDS[name], self.target
         function = source(target, name)
         assert function is not None
@@ -338,8 +330,7 @@ class Functions:
         return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
 
     def _status_block(self, name: str) -> Block:
-        """Return the end of a function with a status: copy the results `a` to the output, return
-        OK.
+        """Return the end of a C function with a status: copy the results `a` to the output.
 
         Functions whose results may overflow return NOT_FINITE before they copy.
         """
@@ -417,8 +408,7 @@ class Functions:
 
     @cached_property
     def rotation_errors(self) -> Computed | None:
-        """The static C function for the rotation errors of closed loops and their derivatives along
-        q.
+        """The static C function for the rotation errors of closed loops and their derivatives.
 
         None if no loop has axis equations. See `Constraint.rotation_error` for the definition.
         """
@@ -429,11 +419,11 @@ class Functions:
 
     @cached_property
     def rotated(self) -> CFunction | None:
-        """The static C function that replaces the residuals of axis equations of loops by rotation
-        vectors.
+        """The static C function that replaces residuals of axis equations by rotation vectors.
 
-        It also replaces their rows of the Jacobian A. The body is in a template. None without such
-        loops.
+        Axis equations are the constraint equations of a closed loop for its orientation. The
+        function also replaces their rows of the Jacobian A. Its body is in a template. None without
+        such equations.
         """
         if self.rotation_errors is None:
             return None
@@ -454,10 +444,10 @@ class Functions:
 
     @cached_property
     def projection_along(self) -> Computed | None:
-        """The static C function for the corrections of the projection and their directional
+        """The static C function for corrections onto the constraints and their directional
         derivatives.
 
-        None if the scene does not need derivatives of steps under constraints.
+        None if the scene has no constraints or does not request derivatives of steps.
         """
         function = self.target.program.functions.get("projection_along")
         if function is None:
@@ -477,17 +467,16 @@ class Functions:
 
     @cached_property
     def onto(self) -> CFunction:
-        """The static C function that projects the state at a stage onto the constraints to first
-        order.
+        """The static C function that projects the state at a stage onto the constraints.
 
-        The prototype only; the body is in a template.
+        It makes one correction, of first order. The prototype only; the body is in a template.
         """
         moved, more = self._projection_arguments
         return c.static(f"{self.prefix}_onto", "int", *moved, *more)
 
     @property
     def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
-        """The C arguments of a projection: the state to be changed (r, v), and then t and p if
+        """The C arguments of a projection: the state to be changed (r, v), and t and p if
         needed.
         """
         arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
@@ -558,10 +547,10 @@ def parameters(plain: Functions) -> tuple[Parameter, ...]:
 
 
 def handshake(plain: Functions) -> str:
-    """Return a hexadecimal C constant by which the C source checks that it is compiled with its
-    header.
+    """Return a hexadecimal C constant that the C source and its header must share.
 
-    Optimised C has a different constant, because its workspaces differ in size.
+    The compiler compares them. Optimised C has another constant, since its workspaces differ in
+    size.
     """
     digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
     return f"0x{digest[:8]}u"

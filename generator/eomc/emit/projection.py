@@ -36,8 +36,7 @@ def width(target: Target) -> int:
     """Return the number of results of the C function that computes the corrections onto the
     constraints.
 
-    These are corrections of q and qd, and inverse pivots of the
-    constraint equations.
+    These are corrections of q and qd, and inverse pivots of the constraint equations.
     """
     return len(target.program["projection"].outputs)
 
@@ -63,7 +62,7 @@ def view(
         from their names.
     lane, L, mask
         C type of the numbers, suffix of C names and C type of failures, where several instances are
-        computed together in a vector register (a lane); "" for single instances.
+        computed together in a vector register (a lane). The defaults are for a single instance.
     extent
         Length of C arrays for coordinates; the number of coordinates by default.
     increments

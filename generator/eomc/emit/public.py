@@ -79,10 +79,9 @@ class Public:
 
     @property
     def linearization(self) -> CFunction:
-        """The prototype of the function that computes da/dq, da/dqd and da/du of the accelerations
-        a.
+        """The prototype of the function that computes the derivatives of the accelerations.
 
-        The matrices are called A_q, A_qd and B. The function returns a status.
+        These are the matrices A_q, A_qd and B, along q, qd and u. The function returns a status.
         """
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
         widths = {"A_q": NQ, "A_qd": NQ}
@@ -97,8 +96,9 @@ class Public:
 
     @property
     def project(self) -> CFunction:
-        """The prototype of the function that projects a state onto the constraints and returns a
-        status.
+        """The prototype of the function that projects a state onto the constraints.
+
+        It overwrites the state and returns a status.
         """
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
         t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
@@ -106,8 +106,9 @@ class Public:
         return self._status("project", *self._state, *t, fixed, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
-        """Return the prototype of the function for one step of a method, which overwrites the
-        state.
+        """Return the prototype of the function for one step of a method.
+
+        It overwrites the state and returns a status.
         """
         return self._status(f"{method}_step", *self._state, *self.arguments("t", "h", "u", "p"))
 

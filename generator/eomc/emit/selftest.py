@@ -175,8 +175,7 @@ class _Cases:
         raise NoCaseError
 
     def ordered(self, name: str, values: Vector) -> Vector:
-        """Return results of the program's function `name` in the order in which the C function
-        stores them.
+        """Return results of the program's function `name` in the order of the C function.
 
         Only the linearization differs: C stores its matrices A_q, A_qd and B one after the other.
         """
@@ -185,8 +184,9 @@ class _Cases:
         return self.split([values[k : k + self.width] for k in range(0, len(values), self.width)])
 
     def split(self, rows: Sequence[Sequence[float]]) -> Vector:
-        """Return the entries of A_q, then A_qd, then B, each by rows, from the rows of [A_q, A_qd,
-        B].
+        """Return the entries of A_q, then of A_qd, then of B, each by rows.
+
+        rows: the rows of the matrix [A_q, A_qd, B].
         """
         n = self.nq
         parts = ((0, n), (n, 2 * n), (2 * n, self.width))
@@ -207,8 +207,9 @@ class _Cases:
         return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
 
     def complete(self, point: Point) -> Values:
-        """Return the values of a point by name, with those of the inputs that the scene's signals
-        supply.
+        """Return the values of a point by name, with inputs from the scene's signals.
+
+        Inputs that the point specifies are kept.
         """
         values = dict(point.values)
         if point.signals and "signal" in self.program:
@@ -229,9 +230,7 @@ class _Cases:
     # steps in Python
 
     def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return qdd at the state x = [q; qd] and time t (s), with inputs and parameters from
-        `point`.
-        """
+        """Return qdd at the state x = [q; qd] and time t (s); `point` supplies the rest."""
         return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
 
     def shifted(self, point: Point, x: Vector, t: float) -> Point:
@@ -245,8 +244,8 @@ class _Cases:
         return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
 
     def step(self, m: Method, point: Point, x: Vector, t: float, h: float) -> Vector:
-        """Return the state [q; qd] after one step of size h (s) of method m, from the state x at
-        time t.
+        """Return the state [q; qd] after a step of size h (s) of method m from the state x at time
+        t.
 
         Raises NoCaseError if the iteration over the stages of an implicit method does not converge.
         """
@@ -305,10 +304,9 @@ class _Cases:
         raise NoCaseError
 
     def flow(self, point: Point, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
-        """Return the state [q; qd] after the time `span` (s; may be negative) from the state x at
-        time t.
+        """Return the state [q; qd] that follows the state x at time t after the time `span` (s).
 
-        The integration takes `steps` equal steps of order 8.
+        The integration takes `steps` equal steps of order 8; `span` may be negative.
         """
         for k in range(steps):
             x = self.step(DP8, point, x, t + span * k / steps, span / steps)
@@ -395,9 +393,7 @@ class _Cases:
         return replace(point, values={**point.values, **values}, signals=False)
 
     def index(self, point: Point) -> int:
-        """Return the index of a point in `points`; append the point if it is not yet in the
-        list.
-        """
+        """Return the index of a point in `points`, to which it is appended if it is new."""
         if point not in self.points:
             self.points.append(point)
         self.uses_other |= point.other
@@ -405,9 +401,7 @@ class _Cases:
 
     @property
     def arrays(self) -> tuple[tuple[str, str], ...]:
-        """Name and size (C text) of each array of a test state besides q and qd: qdd, wrenches,
-        lambda.
-        """
+        """Name and size (C text) of each array of a test state besides q and qd."""
         found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
         return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
 
@@ -427,9 +421,7 @@ class _Cases:
         )
 
     def input_names(self, point: Point) -> list[str]:
-        """Return the names of the inputs that a point specifies; none if the signals supply
-        them.
-        """
+        """Return the names of the inputs that a point specifies; none if signals supply them."""
         return [] if point.signals else self.target.input_names
 
     # cases
@@ -495,17 +487,17 @@ class _Cases:
     def written(
         self, name: str, kind: str, call: str, cases: Sequence[Case | None], type: str = ""
     ) -> Tested:
-        """Return a test of the C function `name` by the C text `call`, without the cases that are
-        None.
+        """Return a test of the C function `name`, without those cases that are None.
 
-        kind: form of the test's body in the template, see `views.Tested`. type: C type of the
-        workspace of an adaptive run.
+        call: the tested C call. kind: form of the test's body in the template, see `views.Tested`.
+        type: C type of the workspace of an adaptive run.
         """
         return Tested(name, kind, call, type, tuple(filter(None, cases)))
 
     def call(self, f: CFunction, **passed: str) -> str:
-        """Return a C call of f whose arguments are members of the test state s, except those in
-        `passed`.
+        """Return a C call of f with members of the test state s as arguments.
+
+        passed: C expressions of other arguments, by name.
         """
         fields = ("q", "qd", "qdd", "wrenches", "lambda", "t", "u", "p")
         at = {n: member("s", n) for n in fields}
@@ -533,8 +525,7 @@ class _Cases:
         return [x for x in _large(self.target) if self.is_sharp(x)]
 
     def is_sharp(self, x: Mapping[str, float]) -> bool:
-        """Return True if bias and accelerations in doubles agree with those computed with 40
-        digits.
+        """Return True if bias and accelerations in doubles agree with those of 40 digits.
 
         x: state, time and parameters by name.
         """
@@ -606,11 +597,10 @@ class _Cases:
         return (replace(point, span=1.0),)
 
     def spanned(self, m: Method, point: Point) -> Point | None:
-        """Return the point with the largest suitable step size (as `span`) for method m; None if
-        none is.
+        """Return the point with a step size for method m as its `span`; None if none is suitable.
 
-        A step size is suitable if the error limit of a few steps is small and the state does not
-        grow much.
+        It is the largest of some step sizes with which a few steps can be tested accurately and the
+        state does not grow much.
         """
         h = self.system.run.h
         most = 1 if m.sweeps else 2 if m.implicit else 4
@@ -623,8 +613,8 @@ class _Cases:
         return None
 
     def stepped(self, m: Method, steps: int, point: Point) -> Vector:
-        """Return the states [q; qd] after each of `steps` steps of size `point.span`, in one
-        list.
+        """Return, in one list, the state [q; qd] after each of `steps` steps of size
+        `point.span`.
         """
         x, found, t, h = self.states(point), Vector(), point.values[TIME], point.span
         for n in range(steps):
