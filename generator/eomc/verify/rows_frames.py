@@ -25,7 +25,7 @@ TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 
 
 def report(check: Comparison, scene: Scene) -> None:
-    """Append the checks of those functions that the scene has."""
+    """Append the rows on frames and momentum to the report, for functions that the module has."""
     run, eps = check.system.run, check.eps
     for module, form in check.forms:
         frames = _Frames(check, module, scene)
@@ -45,7 +45,7 @@ def report(check: Comparison, scene: Scene) -> None:
 
 
 def inverse_dynamics(check: Comparison) -> None:
-    """Append the checks of D qdd + bias against the reference."""
+    """Append the rows on `inverse_dynamics`, compared with the reference's D q̈ + bias."""
     for module, form in check.forms:
         measure = partial(check.largest, partial(_inverse, check, module), STATES)
         check.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
@@ -62,7 +62,10 @@ def _inverse(check: Comparison, module: Any, e: Expected) -> float:
 
 
 class _Frames:
-    """Compares frames of a module with those computed from the scene's tables."""
+    """Comparison of a module's frame functions with frames computed from the scene's own tables.
+
+    module: that of one form of C, optimised or portable.
+    """
 
     def __init__(self, check: Comparison, module: Any, scene: Scene) -> None:
         self.check, self.module, self.scene = check, module, scene
@@ -70,7 +73,10 @@ class _Frames:
         self.plane = check.system.plane
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:
-        """Yield lines of several widths, of which the best counts."""
+        """Yield lines of motion through the state `s`, one for each of several widths.
+
+        bend: accelerations along the line, (nq,). See `rows_bodies.Line`.
+        """
         for width in widths(self.check.sampler.spread, s.qd, bend):
             with np.errstate(all="ignore"):
                 yield Line(
@@ -80,7 +86,11 @@ class _Frames:
     def off(
         self, values: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
     ) -> float:
-        """Return the difference relative to the largest number, at least `least`."""
+        """Return the largest error of the module's `values`, relative to the largest exact value.
+
+        exact: a function that computes them from a line of motion. state: arguments of `lines`,
+        which yields several; the smallest error counts. least: lower bound of the divisor.
+        """
         best = np.inf
         for line in self.lines(*state):
             with np.errstate(all="ignore"):
@@ -93,15 +103,18 @@ class _Frames:
         return best
 
     def arguments(self, s: State) -> dict[str, Any]:
-        """How the module is called at a state."""
+        """Return time and parameters of a state as keyword arguments for the module."""
         return {"t": s.t, "params": s.params}
 
     def relevant_components(self, linear: Vector, angular: Vector) -> Vector:
-        """Return the components that exist in the plane, or all in space."""
+        """Return the components (x, y, angle) of a motion in the plane, or all six in space.
+
+        linear, angular: vectors of three components.
+        """
         return np.array([*linear[:2], angular[2]] if self.plane else [*linear, *angular])
 
     def poses(self, e: Expected) -> float:
-        """Positions, and axes of frames."""
+        """Return the relative error of the module's positions and rotations of frames."""
         poses = self.module.pose(e.state.q, **self.arguments(e.state))
 
         def exact(line: Line) -> Vector:
@@ -118,16 +131,16 @@ class _Frames:
         return self.off(both, exact, e.state)
 
     def twists(self, line: Line) -> Vector:
-        """(nf, 6, n): all along the line."""
+        """Return linear and angular velocities of all frames at the nodes of a line, (nf, 6, n)."""
         motions = (line.motion(line.frames[name], np.zeros(3)) for name in self.names)
         return np.array([np.hstack(motion).T for motion in motions])
 
     def relevant_twists(self, twists: Vector) -> Vector:
-        """Return the relevant components of twists."""
+        """Return the components of twists (nf, 6) that exist in the plane, or all in space."""
         return np.array([self.relevant_components(x[:3], x[3:]) for x in twists])
 
     def velocities(self, e: Expected) -> float:
-        """Twists."""
+        """Return the relative error of the module's linear and angular velocities of frames."""
         s = e.state
         twists = self.module.frame_velocity(s.q, s.qd, **self.arguments(s))
         least = self.twist_scale(s, self.check.sampler.speed)
@@ -138,12 +151,15 @@ class _Frames:
         return self.off(twists, exact, s, least=least)
 
     def twist_scale(self, s: State, rates: Vector) -> float:
-        """The largest twist at such rates."""
+        """Return the largest component of frames' velocities at coordinate velocities `rates`."""
         J = np.abs(self.module.jacobian(s.q, **self.arguments(s)))
         return float(np.max(J @ rates, initial=0))
 
     def accelerations(self, e: Expected) -> float:
-        """Return the error of accelerations of frames, at the accelerations of the motion."""
+        """Return the relative error of the module's accelerations of frames.
+
+        The accelerations of the coordinates are those of the motion.
+        """
         s, qdd = e.state, e.value["acceleration"]
         rates = self.module.frame_acceleration(s.q, s.qd, qdd, **self.arguments(s))
 
@@ -155,7 +171,11 @@ class _Frames:
         return self.off(rates, exact, s, qdd, least=least)
 
     def jacobians(self, e: Expected) -> float:
-        """Twists by one rate after the other, less what moves with time alone."""
+        """Return the relative error of the module's Jacobians of frames.
+
+        Each column is compared with the frames' velocities as one coordinate moves, less those at
+        rest, which are due to time alone.
+        """
         s = e.state
         J = np.asarray(self.module.jacobian(s.q, **self.arguments(s)), float)
         at_rest = self.check.sampler.with_discrete_parameters(replace(s, qd=0 * s.qd))
@@ -172,7 +192,10 @@ class _Frames:
         return worst
 
     def forces(self, e: Expected) -> float:
-        """J^T w of the module's own Jacobians."""
+        """Return the relative error of the module's `frame_forces`, Jᵀw for forces w at frames.
+
+        The forces are random, and the expected value follows from the module's own Jacobians J.
+        """
         s, arguments = e.state, self.arguments(e.state)
         J = np.asarray(self.module.jacobian(s.q, **arguments), float)
         w = np.random.default_rng(0).normal(size=J.shape[:2])
@@ -182,7 +205,10 @@ class _Frames:
         return float(np.max(off) / (np.max(size) or 1.0))
 
     def momentum(self, e: Expected) -> float:
-        """Return the error of mass, centre, momentum and angular momentum, from point masses."""
+        """Return the relative error of the module's mass, centre of mass and momenta.
+
+        The expected values follow from the point masses of all bodies.
+        """
         s = e.state
         m = self.module.momentum(s.q, s.qd, **self.arguments(s))
         momentum = np.hstack([m.mass, m.center, m.linear, m.angular])

@@ -1,4 +1,4 @@
-"""Rows of `check` about limits of inputs: what is beyond them acts as they do, to the last bit."""
+"""Rows of `check` about limits of inputs: inputs beyond them act as the limits do, bit by bit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FAR = 3.0  # times what lies between limits
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene with limits."""
+    """Append the rows on limits of inputs, if the scene has limits."""
     if all(x is None for i in check.system.inputs for x in i.limits):
         return
     for module, form in check.forms:
@@ -39,7 +39,10 @@ def _differ(check: Comparison, module: Any) -> float:
 
 
 def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]:
-    """The least and largest values of the inputs, by their formulas; infinite where none."""
+    """Return the least and the largest values of the inputs, both (nu,); infinite without a limit.
+
+    params: the parameters, which the limits' formulas may contain.
+    """
     values = {symbol(name): value for name, value in params.items()}
     ends = [
         [

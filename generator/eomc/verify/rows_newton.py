@@ -1,9 +1,9 @@
-"""Rows of `check` about Newton's method, by which implicit steppers find the stages of long steps.
+"""Rows of `check` about Newton's method, by which implicit steppers solve for stages of long steps.
 
-Steps that are long against the fastest mode, beside an equilibrium, where forces are all but
-linear: there Newton's method needs a few sweeps, plain ones do not get there, and one that solves
-the wrong equations is slow or lost. Compared with Newton's method in NumPy on the reference's
-accelerations.
+Steps are long against the fastest mode, near an equilibrium, where forces are all but linear: there
+Newton's method needs a few iterations, fixed-point iteration does not converge, and an iteration
+for the wrong equations converges slowly or not at all. The iterations are compared with those of
+Newton's method in NumPy on the reference's accelerations.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ class _Equilibrium:
 
 
 def report(check: Comparison) -> None:
-    """Add the rows; single precision leaves a motion beside an equilibrium too few digits.
+    """Append the rows on Newton's method, for each implicit method that has it.
 
-    Not under constraints, where a step is put back onto them after its stages are found.
+    There are none in single precision, which leaves a motion near an equilibrium too few digits,
+    nor under constraints, where a step is corrected after its stages are found.
     """
     if check.system.constraints:
         return
@@ -75,14 +76,20 @@ def report(check: Comparison) -> None:
 
 
 class Newton:
-    """Compares Newton's method of the module with that of the reference."""
+    """Comparison of the iterations of the module's implicit steps with the reference's.
+
+    scale: typical sizes of q and q̇, (2, nq).
+    """
 
     def __init__(self, check: Comparison) -> None:
         self.check = check
         self.scale = check.sampler.scale
 
     def extra_sweeps(self, method: str) -> float | Measurement:
-        """The most sweeps that the module needs beyond the reference's; inf where it ends wrong."""
+        """Return the largest number of iterations per step beyond those of the reference.
+
+        It is inf if the module's steps fail or end at a wrong state.
+        """
         place = self.place()
         if place is None or not place.fastest:
             return Measurement(math.inf if place else math.nan, "no mode turns or decays")
@@ -91,10 +98,11 @@ class Newton:
         return float(np.max(known)) if known else Measurement(math.nan, "no stiff motion is linear")
 
     def sweeps(self, method: str, place: _Equilibrium, h: float) -> float | None:
-        """Return the additional sweeps for one step size; None if the motion is not linear.
+        """Return the module's additional iterations per step, for steps of h seconds.
 
-        None also if plain fixed-point iteration converges, however slowly, since the module may use
-        it.
+        place: the equilibrium near which the run starts. None if the motion is not linear there, or
+        if fixed-point iteration converges, however slowly, since the module may use it. inf if the
+        module's steps fail or end at a wrong state.
         """
         m, s = METHODS[method], place.start
         if one_step.contraction_factor(m, place.slopes, h) < MAX_PLAIN_CONTRACTION:
@@ -123,15 +131,21 @@ class Newton:
         return float(work / m.stages - sum(counts)) / STEPS
 
     def reach(self, place: _Equilibrium) -> Vector:
-        """How far things go, (2, nq): velocities as the fastest mode has them."""
+        """Return how far q and q̇ go in a motion, (2, nq), with velocities of the fastest mode."""
         return np.array([self.scale[0], np.maximum(self.scale[1], self.scale[0] * place.fastest)])
 
     def accelerations(self, q: Vector, qd: Vector, t: Vector) -> Vector:
-        """The reference's, with the scene's own parameters and signals: all (n, nq), t (n,)."""
+        """Return the reference's accelerations at n states, (n, nq).
+
+        q and qd are (n, nq), t is (n,). Parameters and inputs are the scene's own.
+        """
         return self.check.reference.acceleration(q, qd, t)
 
     def place(self) -> _Equilibrium | None:
-        """Beside an equilibrium that Newton's method finds from the start; None: there is none."""
+        """Return an equilibrium, found by Newton's method from the start, with a state near it.
+
+        None if accelerations or their derivatives are not finite on the way.
+        """
         s = self.check.sampler.start
         q, rest = s.q.copy(), np.zeros_like(s.q)
         n = len(q)

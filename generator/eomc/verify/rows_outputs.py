@@ -1,8 +1,8 @@
-"""Rows of `check` about outputs: in eighty digits, their rates by differences along the motion.
+"""Rows of `check` about outputs: values in eighty digits, rates by differences along the motion.
 
 Nothing is differentiated as a formula: q(s) = q + qd s + qdd s^2/2, formulas and definitions are
-evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h. Accelerations and multipliers, which other
-rows look at, are the module's own; slopes of multipliers are differences of the reference's.
+evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h. Accelerations and multipliers, which have
+rows of their own, are the module's; derivatives of multipliers are differences of the reference's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x
 
 
 def report(check: Comparison) -> None:
-    """Add the rows of a scene that has outputs."""
+    """Append the rows on outputs and their derivatives to the report of a scene with outputs."""
     formulas = Formulas(check.system)
     limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
     for module, form in check.forms:
@@ -63,7 +63,11 @@ def _values(check: Comparison, module: Any, formulas: Formulas) -> float:
 def compare_outputs(
     check: Comparison, module: Any, formulas: Formulas, function: Callable[[State], Vector]
 ) -> float:
-    """Return the largest error of a function of the module relative to formulas, in units."""
+    """Return the largest error of a function of the module over some states, in units of rounding.
+
+    function: computes values (ny,) at a state. formulas: the formulas of these values, evaluated in
+    many digits with the module's own accelerations and multipliers.
+    """
 
     def error(e: Expected) -> float:
         s = _with_fixed_inputs(check, module, e.state)
@@ -148,7 +152,7 @@ def _with_fixed_inputs(check: Comparison, module: Any, s: State) -> State:
 
 @dataclass
 class Formulas:
-    """The outputs of a system, evaluated as they stand."""
+    """The outputs of a system, evaluated from their formulas in many digits."""
 
     system: System
     _compiled: dict[Expr, tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]] = field(
@@ -157,23 +161,26 @@ class Formulas:
 
     @cached_property
     def multipliers(self) -> tuple[Symbol, ...]:
-        """Multipliers of all constraints, if an output uses one."""
+        """Symbols of the multipliers of all constraint equations; empty if no output uses one."""
         read = {x for o in self.system.outputs for x in o.formula.free_symbols}
         multipliers = tuple(c.multiplier for c in self.system.constraints)
         return multipliers if read & {*multipliers} else ()
 
     def evaluate(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
-        """(ny,): at a state with inputs, accelerations and multipliers."""
+        """Return the outputs, (ny,), at a state with inputs.
+
+        qdd: accelerations (nq,). forces: multipliers, if the outputs use them.
+        """
         with mpmath.workdps(DIGITS):
             return np.array([float(y) for y in self._values(self._symbol_values(s, qdd, forces))])
 
     def slopes(
         self, s: State, qdd: Vector, forces: Vector = _NONE, by_parameters: bool = False
     ) -> Vector:
-        """Derivatives of the outputs by differences, (ny, 3 nq + nu + nc).
+        """Return difference quotients of the outputs, (ny, 3 nq + nu + nc).
 
-        With respect to q, qd, u, q̈ and the multipliers that are read; to parameters in place of q,
-        qd, u where `by_parameters`.
+        The columns are q, q̇, u, q̈ and the nc multipliers that outputs use. With `by_parameters`,
+        the parameters replace q, q̇ and u. qdd, forces: as in `evaluate`.
         """
         system = self.system
         own = (*system.q, *system.qd, *system.u)
@@ -208,7 +215,11 @@ class Formulas:
         return [_real(motion, o.formula) for o in self.system.outputs]
 
     def compiled(self, e: Expr) -> tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]:
-        """A formula as a function of its symbols and of the rates in it."""
+        """Return a formula as a function of its symbols and of the rates dot(...) in it.
+
+        The results are the function, its symbols, and the expressions inside of dot(...), whose
+        rates are the function's further arguments.
+        """
         if e not in self._compiled:
             rates = [d for d in e.atoms(dot) if not any(d != o and o.has(d) for o in e.atoms(dot))]
             stand_ins = [sympy.Dummy() for _ in rates]
@@ -229,7 +240,7 @@ def _real(motion: _Motion, formula: Expr) -> Any:
 
 
 class _Motion:
-    """Values of formulas near one state, as functions of time."""
+    """Values of formulas in many digits, as functions of time near one state."""
 
     def __init__(self, formulas: Formulas, symbol_values: Mapping[Symbol, Any]) -> None:
         self.formulas, self.symbol_values, system = formulas, symbol_values, formulas.system
@@ -238,14 +249,14 @@ class _Motion:
         self.known: dict[tuple[Symbol, Any], Any] = {}
 
     def value(self, e: Expr, time: Any) -> Any:
-        """Return the value of a formula."""
+        """Return the value of the formula `e` at `time`, s, from that of the state."""
         f, symbols, rates = self.formulas.compiled(e)
         ends = [[self.value(x, time + h) for h in (WIDTH, -WIDTH)] for x in rates]
         slopes = ((a - b) / (2 * WIDTH) for a, b in ends)
         return f(*(self.symbol(x, time) for x in symbols), *slopes)
 
     def symbol(self, x: Symbol, time: Any) -> Any:
-        """Return the value of a name."""
+        """Return the value of a symbol at `time`, s, from that of the state."""
         if (x, time) not in self.known:
             if x in self.definitions:
                 value = self.value(self.definitions[x], time)

@@ -1,7 +1,7 @@
-"""Comparison of the plain form of C with the reference and with the fast form.
+"""Comparison of the portable form of C (plain) with the reference and the optimised form (fast).
 
-Values, one step and a run against the reference, as the fast form is; then all that both forms
-compute, one against the other. In units of rounding, as in `check`, whose rows these are.
+Values, one step and a run are compared with the reference, as for the optimised form; then all that
+both forms compute is compared. Errors are in units of rounding, as in `check`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ COMPARED_VALUES = (*VALUES, "acceleration")
 
 
 def rows(check: Comparison) -> None:
-    """Append the checks of the plain form, if there is one."""
+    """Append the rows on the portable form of C to the report, if there is a module of it."""
     if check.plain is None:
         return
     unit, plain = "units of rounding", check.plain
