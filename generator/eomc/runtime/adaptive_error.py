@@ -31,13 +31,13 @@ _MIN_REFERENCE_STEPS = 512  # of the reference run
 _MIN_CURVE_ROWS = 24  # at which differences between runs are computed
 _MIN_EXTRA_STEPS = 10  # by which the reference run may exceed the event that ended the run
 _EVENT_SHIFT_FACTOR = (
-    4.0  # times that differences of states last, by which the same event may be moved
+    4.0  # largest time shift of an event, relative to the shift that differing states imply
 )
 _END_TOLERANCE = 1e-9  # of a span: times so near an end are at it
 _ZENO_FRACTION = (
-    0.01  # of the time to an accumulation point: jumps that are nearer differ in number
+    0.01  # of the time to an accumulation point: later jumps differ in number between runs
 )
-_MAX_STEP_RATIO = 100  # times the steps, which a moved start takes at most
+_MAX_STEP_RATIO = 100  # limit of the steps of a run from a perturbed start, relative to the run
 
 
 def error_by_tighter_tolerance(
@@ -84,7 +84,7 @@ def error_by_tighter_tolerance(
 
     def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
         """Return the change of the states that results from a perturbation of the start."""
-        # of another motion, not its end
+        # the perturbed motion may differ, so its steps are limited
         most = _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
         return again.states(tol, begin + nudge, own._h_most, most) - base
 
@@ -97,9 +97,9 @@ def error_by_tighter_tolerance(
     elif not events.stops:
         left[-1] = np.inf
     if len(own._event_data[0]) or (left > _UNRESOLVED_ERROR * scale).any():
-        # flights between jumps may be exact by any tolerance: what rounding makes of them tells
+        # motion between jumps may be exact for any tolerance; then only rounding errors matter
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
-        if full.any():  # where so little fills the scale, rounding fills a quarter of it
+        if full.any():  # the first perturbation is too large for a linear estimate
             little = moves * _PERTURBATION_ROUNDINGS * eps * scale * signs
             nearest = again.states(least, begin, own._h_most)
             differences.append(moved(little, least, nearest))
@@ -251,12 +251,15 @@ class _Rerun:
 
 @dataclass(frozen=True)
 class _Events:
-    """Differences between the events of a run and those of a finer run.
+    """Differences between the events of a run and those of a reference run with shorter steps.
 
-    errors: by name |t - t of the finer run| of each event of the run, s, inf of those that the
-    finer run does not detect. missed: by name the times of those that the finer run alone detects.
-    false: the times of those that the run alone detects. stops: whether both runs end in the same
-    way. end: the last state of a finer run that stops at the end of the run.
+    errors: by name, the absolute difference between the times of each event in both runs, s; inf
+    for events that the reference run does not detect.
+    missed: by name, the times, s, of events that only the reference run detects.
+    false: by name, the times, s, of events that only the run detects.
+    stops: whether both runs end in the same way.
+    end: last state [q; qd] of the reference run if an event stops it at the end of the run, else
+    None.
     """
 
     errors: dict[str, Array]
@@ -269,10 +272,15 @@ class _Events:
     def compare(
         cls, own: AdaptiveTrajectory, other: AdaptiveTrajectory | None, left: Array, scale: Array
     ) -> _Events:
-        """Pair the events of both runs up to where their states differ by a tenth of the motion.
+        """Pair the events of a run with those of a reference run and return their differences.
 
-        Two events are the same one if they are nearest to one another, and not further apart than
-        a step, or than the difference of the states lasts. left: this difference at the rows.
+        Events are compared up to the time at which the states of the two runs differ by a tenth of
+        the motion. Two events count as the same one if they are nearest to one another in time, and
+        not further apart than a step, or than the time shift that the difference of the states
+        implies.
+
+        own: the run. other: the reference run, None if there is none. left: absolute difference of
+        the states at the rows, (n, 2 nq). scale: magnitude of the motion in each state, (2 nq,).
         """
         names = own._model.events
         if other is None or not names:
@@ -287,7 +295,7 @@ class _Events:
             late = np.max(left[alike, : len(speed)], axis=0, initial=0.0) / speed
         shift = _EVENT_SHIFT_FACTOR * float(np.max(late[np.isfinite(late)], initial=0.0))
         gap = max(own.h, min(shift, _UNRESOLVED_ERROR * abs(reached - own.t0)))
-        # an event so near the end of a run may be just behind that of the other
+        # an event so near the end of one run may lie just after the end of the other
         edge = abs(reached - own.t0) * max(
             float(np.max(relative_difference[alike], initial=0.0)), _END_TOLERANCE
         )
@@ -296,7 +304,7 @@ class _Events:
             r.limit - _ZENO_FRACTION * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit
         )
         until = min(until, *whole, np.inf)
-        # sticking of friction is a part of the state, and so of its error
+        # sticking of friction is a part of the state; its error is one of the state
         coordinates = (own._model.coordinates[k] for _, k in own._model._rows.modes)
         stick = {f"{c}_{what}" for c in coordinates for what in ("stops", "slips")}
         errors, missed, false = {}, {}, {}
@@ -368,9 +376,11 @@ def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
 
 
 def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
-    """Return the tolerance and longest step of the reference run; for fixed steps (tol, h / 4).
+    """Return the tolerance and the longest step, s, of the reference run.
 
-    If no smaller tolerance exists, a larger one leads to other steps with other rounding errors.
+    For fixed steps, these are the tolerance of the run and h / 4. If the tolerance cannot be
+    reduced, a larger one leads to other steps with other rounding errors. least: smallest
+    tolerance of the module.
     """
     if own._by:
         return own.tol, own.h / 4
@@ -380,7 +390,7 @@ def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
 
 
 def _finite(rows: Array) -> Array:
-    """Return the rows at which both runs have states."""
+    """Return the rows of a difference between two runs at which both runs have states."""
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
@@ -398,7 +408,11 @@ def _filled(rows: Array) -> Array:
 def _verdict(
     own: AdaptiveTrajectory, left: Array, rounding: Array, amplification: float, events: _Events
 ) -> str:
-    """Return reasons to doubt the run. left, rounding: errors relative to the scales."""
+    """Return the reasons why the run is not resolved as text; "" if there is none.
+
+    left, rounding: difference from the reference run and rounding error at the rows, (n, 2 nq),
+    relative to the scale of each state.
+    """
     words = []
     if own.status not in COMPLETE_STATUSES:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")

@@ -179,13 +179,19 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
-    """Split the pieces between times `ends` (n + 1,), with a value each, at times `at` too."""
+    """Split the intervals between the times `ends` (n + 1,) at the times `at` as well.
+
+    values: value in each interval, (n, nu). Return the new times and values.
+    """
     both = np.unique([*ends, *at])
     return both, values[np.searchsorted(ends, both[:-1], side="right") - 1]
 
 
 def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
-    """Return times (n + 1,) and the constant inputs between them, (n, nu); n = 0: unknown."""
+    """Return times (n + 1,) and the constant inputs between them, (n, nu).
+
+    n = 0 if the inputs are unknown.
+    """
     unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
     if hasattr(run, "tol"):
         values = run._period_inputs

@@ -326,9 +326,12 @@ class _Work:
         limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
         stiff: bool, method: str,
     ) -> None:  # fmt: skip
-        """limits: end time, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), period.
+        """Initialise the simulation at t0.
 
-        method: method of fixed steps; "": adaptive steps.
+        begin: initial [q, qd], (2, batch, nq). times: times of the rows, (n,). limits: end time,
+        tolerance and longest step. inputs: inputs of the control periods, (batch or 1, periods or
+        1, nu), or None for the signals, and the period. table: parameters, (batch or 1, np).
+        method: name of the method of fixed steps; "": adaptive steps.
         """
         self.model, (self.q, self.qd), self.times = model, begin, times
         (self.inputs, self.period), self.table, self.limits = inputs, table, limits

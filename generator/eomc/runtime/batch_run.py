@@ -155,7 +155,7 @@ class BatchRun(Values, Fans, Columns):
             stepper = stepper_for(self, np.array([self.q[:, row], self.qd[:, row]]), inputs, first)
             stepper.work.status[self.steps < first] = STATUS.index(
                 "not finite"
-            )  # who never came so far
+            )  # instances that did not reach this row
             here = slice(own[0], own[-1] + 1)
             stepper.rows((whole[own], rest[own]), rows[:, :, here])
         return rows

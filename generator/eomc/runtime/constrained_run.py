@@ -76,7 +76,7 @@ class ConstrainedRun:
 
     @property
     def _broken(self) -> str:
-        """Message on a constraint that is violated at the end, or ""."""
+        """Return a message on a constraint that is violated at the end of the run, or ""."""
         model, names = self._model, self._model.constraint_names
         left_out = (
             self.singular_steps or model._rows.redundant
@@ -99,7 +99,7 @@ class ConstrainedRun:
 
     @property
     def _singular(self) -> str:
-        """Message on violated or dependent constraints, or ""."""
+        """Return a message on violated or dependent constraint equations; "" if there are none."""
         if broken := self._broken:
             return broken
         if not self.singular_steps:
