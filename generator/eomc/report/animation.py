@@ -201,6 +201,7 @@ class _RunOnPage:
         return (len(self.rows) - 1) / lasting if lasting else 0.0
 
     def data(self) -> dict[str, Any]:
+        """Return the data of the run for the script of the page, to be written as JSON."""
         return {
             "t": [float(self.rows[0]), float(self.rows[-1])],
             "rows": base64.b64encode(self.rows.astype("<f8").tobytes()).decode("ascii"),

@@ -64,6 +64,7 @@ class _Sketch:
         self.centers: dict[str, Array] = {}  # centres of mass, in the world frame
 
     def drawing(self) -> Drawing | None:
+        """Return the drawing, or None if the scene declares nothing that can be drawn."""
         assembly, picture = self.scene.assembly, self.scene.picture
         if assembly:
             self._place(assembly)

@@ -34,7 +34,10 @@ Term = tuple[bool, Expr]  # (True if subtracted, the term without its sign)
 
 
 class Typesetter:
-    """Prints expressions over the names of a system."""
+    """Prints SymPy expressions over the names of a system as blocks of Unicode text or as LaTeX.
+
+    A `Term` is a pair (True if the term is subtracted, the term without its sign).
+    """
 
     def __init__(self, system: System) -> None:
         dotted = {c.q: (c.name, 0) for c in system.coordinates}
@@ -62,7 +65,10 @@ class Typesetter:
         self._latex = _Latex(_ambiguous_names(system.definitions) | in_latex, words)
 
     def terms(self, e: Expr) -> list[Term]:
-        """Return the terms of a sum in order, each with its sign."""
+        """Return the terms of the sum `e`, sorted for printing, each as a pair (subtracted, term).
+
+        Terms in accelerations come first, then terms in velocities, then all others.
+        """
         parts = [
             x
             for part in sympy.Add.make_args(sympy.sympify(e))
@@ -82,7 +88,10 @@ class Typesetter:
         return [y for x in products for y in sympy.Add.make_args(distribute_decimal(x))]
 
     def term(self, *factors: Expr) -> Term:
-        """Return a product with its factors in order, and its sign."""
+        """Return the product of `factors`, sorted for printing, as a pair (subtracted, term).
+
+        The first value is True if the coefficient is negative; the term itself has no sign.
+        """
         factors = tuple(x for f in factors for x in sympy.Mul.make_args(f) if x != 1)
         signed = sympy.Mul(*(f for f in factors if f.is_Number))
         number = abs(signed)
@@ -101,7 +110,7 @@ class Typesetter:
         return bool(signed < 0), product
 
     def ordered(self, e: Expr) -> Expr:
-        """Return an expression with its sums and products in order."""
+        """Return an expression whose sums and products are sorted for printing, not evaluated."""
         if e.is_Add:
             signed = [(-1 if minus else 1, term) for minus, term in self.terms(e)]
             return sympy.Add(*(_negative(x) if s < 0 else x for s, x in signed), evaluate=False)
@@ -134,7 +143,10 @@ class Typesetter:
         return (*rank, bool(part.as_coeff_Mul()[0] < 0), sympy.default_sort_key(part))
 
     def text(self, e: Expr) -> prettyForm:
-        """Return an expression as a block of text, wrapped to several lines if it is too wide."""
+        """Return an expression as a block of Unicode text, as SymPy's pretty printer makes it.
+
+        An expression that is too wide becomes several lines of plain text.
+        """
         if e not in self._blocks:
             block = self._block(e)
             if block.width() > WIDE - 12 and not isinstance(e, sympy.MatrixBase):
@@ -152,12 +164,12 @@ class Typesetter:
             pretty_use_unicode(unicode)
 
     def latex(self, e: Expr) -> str:
-        """Return an expression in LaTeX."""
+        """Return an expression as LaTeX, without delimiters."""
         printed: str = self._latex.doprint(e)
         return printed
 
     def rows(self, terms: Iterable[Term], width: int) -> list[list[Term]]:
-        """Split terms into rows at most `width` columns wide."""
+        """Split the terms of a sum into rows (lists of terms) at most `width` text columns wide."""
         lines: list[list[Term]] = [[]]
         used_width = 0
         for minus, term in terms:
@@ -170,7 +182,11 @@ class Typesetter:
         return lines
 
     def text_lines(self, terms: Sequence[Term], right: Sequence[Term] | None = None) -> list[str]:
-        """Return a sum, or an equation, as text lines of at most WIDE columns."""
+        """Return a sum, or an equation, as lines of Unicode text of at most WIDE columns.
+
+        terms: the sum, or the left-hand side. right: terms of the right-hand side, where an empty
+        sequence is 0; None for a sum.
+        """
         lines: list[str] = []
         rows = self.rows(terms, WIDE - 4)
         ends = [] if right is None else self.rows(right or [(False, sympy.S.Zero)], WIDE - 8)
@@ -206,7 +222,11 @@ class Typesetter:
         return printed
 
     def latex_lines(self, terms: Sequence[Term], right: Sequence[Term] | None = None) -> list[str]:
-        """Return a sum, or an equation, as LaTeX lines of about WIDE columns."""
+        """Return a sum, or an equation, as lines of LaTeX.
+
+        The arguments are those of `text_lines`. A line contains the terms that fill about WIDE
+        columns as Unicode text.
+        """
         lines = [self._latex_row(row, k > 0) for k, row in enumerate(self.rows(terms, WIDE))]
         if right is not None:
             ends = self.rows(right or [(False, sympy.S.Zero)], WIDE)
@@ -241,17 +261,21 @@ def _decimal(e: Expr) -> bool:
 
 
 def distribute_decimal(e: Expr) -> Expr:
-    """Multiply out a decimal times a sum; return anything else unchanged."""
+    """Expand a product of a decimal number and a sum; return any other expression unchanged.
+
+    A decimal number is a fraction that is printed as a decimal, such as 0.028 for 7/250.
+    """
     if e.is_Mul and len(e.args) == 2 and _decimal(e.args[0]) and e.args[1].is_Add:
         return sympy.Add(*(e.args[0] * x for x in e.args[1].args))
     return e
 
 
 def readable(value: Expr) -> Expr:
-    """Return an expression with decimals in place of fractions of many digits.
+    """Return an expression with decimals or short fractions in place of fractions of many digits.
 
-    Such fractions arise from slanted axes, given to 50 digits. Numbers that agree to 30 digits are
-    merged, and factors below ZERO_TOLERANCE, which are rounding errors of zero, are removed.
+    Such fractions arise from slanted axes, whose components have 50 digits. Numbers that agree to
+    30 digits are merged, and factors below ZERO_TOLERANCE, which are rounding errors of zero, are
+    removed.
     """
     if not _long(value):
         return value

@@ -62,6 +62,7 @@ class _Bodies:
         self.bodies: dict[str, Body] = {}
 
     def assembly(self) -> Assembly:
+        """Check all tables of bodies and what acts on them, and return the assembly."""
         gravity = self._gravity()
         self._check_names()
         for name, path in self.values.names.items():

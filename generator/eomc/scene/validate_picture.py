@@ -37,6 +37,7 @@ class _Picture:
         self.points: dict[str, Vector] = {}
 
     def checked(self) -> Picture:
+        """Check the table [picture] and return the picture; errors are reported to `check`."""
         for name, at in self.table.points.items():
             self._declare(name, at)
         shapes = [*self._simple(), *self._solids()]
