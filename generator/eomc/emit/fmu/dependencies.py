@@ -14,10 +14,11 @@ Names = frozenset[str]
 
 @dataclass(frozen=True)
 class Dependencies:
-    """Dependencies of a program's results, as names of coordinates, velocities, inputs, parameters,
-    time.
+    """What accelerations, outputs and event functions of a program depend on.
 
-    signals: whether the scene's signals may replace the inputs, which adds their dependencies.
+    Each dependency is a name of a coordinate, velocity, input or parameter, or of the time.
+    signals: whether the scene's signals may replace the inputs, so that results also depend on what
+    the signals depend on.
     """
 
     program: Program
@@ -25,23 +26,23 @@ class Dependencies:
 
     @cached_property
     def known(self) -> Names:
-        """The names of variables that an importer sets."""
+        """The names of all variables that an importer of the FMU sets, including the time."""
         s = self.program.system
         return frozenset(x.name for x in (*s.q, *s.qd, *s.u, *s.parameters)) | {TIME}
 
     @cached_property
     def accelerations(self) -> Sequence[Names]:
-        """Dependencies of each acceleration."""
+        """For each acceleration, the names of the variables that it depends on."""
         return self._results_of("acceleration")
 
     @cached_property
     def outputs(self) -> Sequence[Names]:
-        """Dependencies of each output."""
+        """For each output, the names of the variables that it depends on."""
         return self._results_of("outputs")
 
     @cached_property
     def events(self) -> Sequence[Names]:
-        """Dependencies of each event function."""
+        """For each event function, the names of the variables that it depends on."""
         return self._results_of("events")
 
     @cached_property
@@ -72,7 +73,7 @@ class Dependencies:
 
 
 def read(function: Function) -> list[Names]:
-    """Return the names from outside that each result of a function is computed from."""
+    """Return, for each result of a function, the names of its arguments that the result depends on."""
     dependencies: dict[str, Names] = {}
     for a in (*function.early, *function.body):
         dependencies[a.name] = frozenset().union(*(dependencies.get(n, {n}) for n in a.value.names))

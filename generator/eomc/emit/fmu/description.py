@@ -20,7 +20,11 @@ from eomc.scene.formulas import parse
 def view(
     target: Target, version: int, token: str, sources: Sequence[str]
 ) -> Description2 | Description3:
-    """Return the view for FMI 2 or 3. sources: the files to compile."""
+    """Return the template data of modelDescription.xml.
+
+    version: of FMI, 2 or 3. token: text that identifies the build. sources: names of the C files to
+    compile.
+    """
     s, known = target.system, variables(target)
     dependencies = Dependencies(target.program, has_signals(target))
     structure = _Structure(target, known, version)

@@ -28,9 +28,20 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit of FMI 2 or 3. sources: the files below sources/ that are compiled.
+    """The contents of an FMU (FMI unit) as texts, without a binary.
 
-    operations: how many the scene's functions have, which tells how long a compiler takes.
+    Attributes
+    ----------
+    name
+        Name of the scene in C.
+    version
+        Version of FMI, 2 or 3.
+    files
+        Texts by their path in the FMU.
+    sources
+        Paths, relative to sources/, of the C files that are compiled.
+    operations
+        Number of arithmetic operations of the scene's functions, which determines compile time.
     """
 
     name: str
@@ -43,9 +54,10 @@ class Unit:
 def unit(
     program: Program, version: int, show: Callable[[View], str], plain: Callable[[PlainView], str]
 ) -> Unit:
-    """The unit of a program. show, plain: a view by its template.
+    """Return the FMU of a program, without a binary; the same program gives the same texts.
 
-    Same program, same text.
+    version: of FMI, 2 or 3. show, plain: functions that render the template data of the FMU and of
+    portable C as text.
     """
     safe, written = rename_for_c(program)
     target = Target(safe, REALS[safe.system.run.real], written)

@@ -22,7 +22,10 @@ STEPS = 10_000  # of one call of adaptive steps
 
 
 def view(target: Target, token: str) -> SceneCalls:
-    """The view of a scene. token: what modelDescription.xml says too."""
+    """Return the data for the template of scene.h, the C between a scene and the code of all FMUs.
+
+    token: text that identifies the build, as in modelDescription.xml.
+    """
     s, public = target.system, Public(target)
     by_tolerance = s.run.tolerance is not None
     method, rows = s.run.methods[0], s.coordinates if s.constraints else ()

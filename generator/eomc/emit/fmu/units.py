@@ -51,19 +51,22 @@ _MOST = 20  # of an exponent
 
 @dataclass(frozen=True)
 class Meaning:
-    """factor times the product of BASE to the given powers."""
+    """A unit of measurement: `factor` times the product of the base units `BASE` to given powers.
+
+    powers: one integer exponent for each of BASE, in its order.
+    """
 
     factor: float
     powers: tuple[int, ...]
 
     def times(self, other: Meaning, power: int) -> Meaning:
-        """Return this unit times a power of another."""
+        """Return the product of this unit and another one to an integer power."""
         powers = (a + power * b for a, b in zip(self.powers, other.powers, strict=True))
         return Meaning(self.factor * other.factor**power, tuple(powers))
 
     @property
     def attributes(self) -> tuple[tuple[str, str], ...]:
-        """The attributes of the element BaseUnit."""
+        """Names and values of the attributes of FMI's XML element BaseUnit for this unit."""
         named = [(b, str(n)) for b, n in zip(BASE, self.powers, strict=True) if n]
         return (*named, *([("factor", repr(self.factor))] if self.factor != 1 else []))
 
@@ -72,7 +75,7 @@ ONE = Meaning(1.0, _NONE)
 
 
 def parsed(text: str) -> Meaning | None:
-    """Parse a unit such as "N m/rad" or "kg*m^2"; None where its meaning is not clear.
+    """Return the meaning of a unit such as "N m/rad" or "kg*m^2"; None if it is not clear.
 
     >>> parsed("N m/rad").attributes
     (('kg', '1'), ('m', '2'), ('s', '-2'), ('rad', '-1'))
@@ -150,7 +153,9 @@ def _word(word: str) -> Meaning:
 
 
 def rate(text: str, times: int) -> str:
-    """The unit of the first or second derivative by time; "" where there is none.
+    """Return the unit of the first or second time derivative of a quantity with the unit `text`.
+
+    times: 1 or 2. "" if the quantity has no unit.
 
     >>> rate("m", 2), rate("N m", 1)
     ('m/s^2', '(N m)/s')

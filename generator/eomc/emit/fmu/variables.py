@@ -20,8 +20,20 @@ TIME_NAME = "t"  # which no scene can give to anything else
 class Variable:
     """A variable of modelDescription.xml.
 
-    start, minimum, maximum: numbers as text, "" for none. derivative: the value reference of the
-    state of which it is the derivative.
+    Attributes
+    ----------
+    reference
+        Value reference, by which importers access the variable.
+    causality, variability, initial
+        As in the FMI standard; "" for no attribute.
+    unit, words
+        Unit and description; "" for none.
+    start, minimum, maximum
+        Numbers as text; "" for none.
+    derivative
+        For time derivatives, the value reference of the state; otherwise None.
+    boolean
+        Whether the variable is a truth value rather than a number.
     """
 
     name: str
@@ -40,7 +52,11 @@ class Variable:
 
 @dataclass(frozen=True)
 class Variables:
-    """All of them, by kind; there are as many indicators as events, and one switch at most."""
+    """All variables of an FMU, by kind, in the order of their value references.
+
+    der_q, der_qd: the time derivatives of q and q̇. indicators: one for each event function.
+    switches: the variable that makes the scene's signals replace the inputs, if there are signals.
+    """
 
     time: Variable
     q: tuple[Variable, ...]
@@ -63,14 +79,14 @@ class Variables:
 
 
 def has_signals(target: Target) -> bool:
-    """Whether inputs of the scene have values of their own."""
+    """Return True if the scene defines signals, which give its inputs values of their own."""
     return any(i.signal != 0 for i in target.system.inputs)
 
 
 def input_starts(target: Target) -> list[float]:
-    """Return the initial value of each input: its signal at the start, 0 if that has no value.
+    """Return the initial value of each input: its signal at the start, or 0 if that has no value.
 
-    A value outside of numeric limits is replaced by the limit, which is what acts in its place.
+    A value outside of the input's numeric limits is replaced by the limit, which acts instead of it.
     """
     inputs = target.system.inputs
     if not inputs:
@@ -86,13 +102,16 @@ def input_starts(target: Target) -> list[float]:
 
 
 def numeric_limits(one: Input) -> tuple[float | None, float | None]:
-    """Return the limits of an input that are numbers; None for formulas of parameters."""
+    """Return the lower and the upper limit of an input; None for one that is not a number.
+
+    Limits that are formulas of parameters are not numbers.
+    """
     low, high = (float(x) if x is not None and x.is_number else None for x in one.limits)
     return low, high
 
 
 def variables(target: Target) -> Variables:
-    """Return the variables of a scene."""
+    """Return all variables of the FMU of a scene, with their value references."""
     s, written, next_reference = target.system, target.as_written, count().__next__
     of_parameters = start_formulas(target)
 

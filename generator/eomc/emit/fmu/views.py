@@ -12,7 +12,11 @@ Attributes = tuple[tuple[str, FreeText], ...]
 
 @dataclass(frozen=True)
 class SceneEvent:
-    """An event: its name, -1, 0 or 1 for its direction, 0, 1 or 2 for record, stop and jump."""
+    """An event of the scene, for the C header of an FMU.
+
+    direction: -1 if the event triggers when its function falls through zero, 1 when it rises, 0 for
+    both. action: 0 for record (the motion goes on), 1 for stop, 2 for a jump of the state.
+    """
 
     name: str
     direction: int
@@ -21,9 +25,10 @@ class SceneEvent:
 
 @dataclass(frozen=True)
 class Start:
-    """A state that starts at a formula of parameters.
+    """An initial value that is a formula of parameters, for the C header of an FMU.
 
-    state: its index in [q; qd]. element, value: the array element and the value, in C.
+    state: index of the coordinate or velocity in [q; q̇]. element, value: C expressions of the
+    array element and of its value.
     """
 
     state: int
@@ -33,13 +38,40 @@ class Start:
 
 @dataclass(frozen=True)
 class SceneCalls:
-    """fmu/scene.h.jinja. inputs: their starts; from acceleration on calls, "" for none.
+    """Data for the template fmu/scene.h: what the hand-written C of an FMU needs from the scene.
 
-    project: onto constraints; fixed: whether each of q and qd stays there as it is. run, step: of
-    steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved,
-    slopes_solved: whether outputs, and their derivatives, read accelerations. feedback,
-    signals_of_parameters: whether signals depend on the state, on parameters. starts: of states
-    whose start is a formula of parameters, after the statements start_lines.
+    Strings from `acceleration` on are C calls; "" for functions that the scene does not have.
+
+    Attributes
+    ----------
+    token
+        Text that identifies the build, as in modelDescription.xml.
+    prefix, PREFIX, real
+        Beginnings of C names and of C macros, and the C type of numbers.
+    h, tolerance, memory
+        Step size in s, tolerance of adaptive steps (0 for fixed steps), and C type of the
+        workspace.
+    inputs, parameters
+        Initial values of the inputs as C literals, and C names of the parameters.
+    feedback, signals_of_parameters
+        Whether the scene's signals, which may replace the inputs, depend on the state and on
+        parameters.
+    solved, slopes_solved
+        Whether the outputs, and their derivatives, depend on accelerations.
+    acceleration, signal, outputs, energies, values, jumps
+        Calls of the accelerations, signals, outputs, energies, event functions, and jump map.
+    project, fixed
+        Call of the projection onto the constraints; for each entry of [q; q̇], 1 if the projection
+        of the initial state leaves it unchanged, else 0.
+    run, step, adaptive
+        Calls of many fixed steps and of one fixed step, or of adaptive steps; the others are "".
+    start_lines, starts
+        C statements that the initial values by formulas need, and these values.
+    sensitivity, output_sensitivity, linearization, output_slopes
+        Calls of derivatives: of accelerations and of outputs by parameters; of accelerations and of
+        outputs by state and inputs.
+    refuses, slopes_refuse
+        Whether the calls of outputs, and of their derivatives, return a status.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/scene.h"
@@ -83,7 +115,10 @@ class SceneCalls:
 
 @dataclass(frozen=True)
 class Described:
-    """A variable or unit: an element with attributes, and another inside with its own."""
+    """An XML element of the model description: a variable or a unit.
+
+    element: its name. attributes: its attributes. inner: the attributes of the element inside it.
+    """
 
     element: str
     attributes: Attributes
@@ -92,9 +127,11 @@ class Described:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A computed variable and its dependencies, as value references; in FMI 2 also their indices.
+    """A computed variable and the variables that it depends on, by their value references.
 
-    Indices count from 1, and so do references, since 0 is the time, which FMI 2 is not told of.
+    reference: that of the computed variable. known: those of the others. In FMI 2 these numbers
+    also are the positions in the list of variables, which count from 1, since number 0 is the time,
+    which FMI 2 does not list.
     """
 
     reference: int
@@ -103,9 +140,23 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Description:
-    """Fields of the model descriptions of both FMI versions, except for the events.
+    """Fields that the templates of modelDescription.xml for FMI 2 and FMI 3 share.
 
-    exchange: whether importers may integrate it.
+    Attributes
+    ----------
+    prefix, token, tool, about
+        Name of the model, text that identifies the build, name and version of eomc, and attributes
+        with title and version of the scene.
+    exchange
+        Whether an importer may integrate the model itself (model exchange).
+    derivatives
+        "true" if the FMU provides directional derivatives, else "false".
+    experiment
+        Attributes of the default experiment: times in s, and step size or tolerance.
+    units, variables
+        The units and the variables.
+    outputs, rates, initial
+        Dependencies of outputs, of derivatives of the state, and of computed initial values.
     """
 
     prefix: str
@@ -124,7 +175,10 @@ class Description:
 
 @dataclass(frozen=True)
 class Description2(Description):
-    """fmu/fmi2.xml.jinja. indicators: of events, how many. sources: files to be compiled."""
+    """Data for the template fmu/fmi2.xml: modelDescription.xml of FMI 2.
+
+    indicators: the number of event functions. sources: the C files to be compiled.
+    """
 
     TEMPLATE: ClassVar[str] = "fmu/fmi2.xml"
     indicators: int
@@ -133,7 +187,10 @@ class Description2(Description):
 
 @dataclass(frozen=True)
 class Description3(Description):
-    """fmu/fmi3.xml.jinja."""
+    """Data for the template fmu/fmi3.xml: modelDescription.xml of FMI 3.
+
+    crossings: dependencies of the event functions.
+    """
 
     TEMPLATE: ClassVar[str] = "fmu/fmi3.xml"
     crossings: tuple[Unknown, ...]
@@ -141,7 +198,10 @@ class Description3(Description):
 
 @dataclass(frozen=True)
 class BuildDescription:
-    """fmu/build_description.xml.jinja: what is to be compiled."""
+    """Data for the template fmu/build_description.xml: the C files of an FMU to be compiled.
+
+    prefix: name of the model. sources: the files, relative to the folder sources/.
+    """
 
     TEMPLATE: ClassVar[str] = "fmu/build_description.xml"
     prefix: str
