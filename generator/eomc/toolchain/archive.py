@@ -13,9 +13,10 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of all entries: the earliest date that zip allo
 
 
 def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None:
-    """Write a zip archive and replace `file` with it once it is complete.
+    """Write a zip archive to `file`, replacing an older file only when the new one is complete.
 
-    Missing folders are created. `programs` is the folder in the archive whose files are executable.
+    contents: bytes by path in the archive. programs: the folder in the archive whose files are
+    executable; "" for none. Missing folders on disk are created; equal contents give equal bytes.
     Raises EomcError if the archive can't be written.
     """
     with writing(file):

@@ -48,7 +48,20 @@ MAX_ARCHIVED_BUILDS = 32  # of other versions of a scene, about 0.5 MB each
 
 @dataclass(frozen=True)
 class Built:
-    """A module on disk. fresh: it was built by this call. key: "" if any build will do."""
+    """A built Python module on disk.
+
+    Attributes
+    ----------
+    name
+        Name of the scene.
+    folder
+        Folder with the files of the module.
+    fresh
+        Whether the module was built just now rather than found on disk.
+    key
+        Key of the build, see the function `key`; "" if `load` may import whatever build is in
+        `folder`.
+    """
 
     name: str
     folder: Path
@@ -62,7 +75,7 @@ class ReplacedError(EomcError):
 
 @lru_cache(maxsize=1)
 def generator_digest() -> str:
-    """Return the digest of the generator: of its version and the contents of all its files."""
+    """Return the SHA-256, in hexadecimal, of eomc's version and of all its files."""
     total = hashlib.sha256(__version__.encode())
     for name, file in resources.parts():
         total.update(name.encode() + file.read_bytes())
@@ -70,10 +83,11 @@ def generator_digest() -> str:
 
 
 def key(scene_digest: str, form: str = "fast") -> str:
-    """Return the key of a build.
+    """Return the key of a build: text that changes if anything changes that the build depends on.
 
-    Its first half is the digest of scene, generator, flags, processor and compiler; its second half
-    that of the same without the compiler. Raises EomcError if there is no compiler.
+    scene_digest: digest of the scene's text. form: "fast" for optimised C, "plain" for portable C.
+    The first half is a digest of scene, eomc, compiler flags, processor and compiler, the second
+    half the same without the compiler. Raises EomcError if there is no compiler.
     """
     small, large = compiler_for(0), compiler_for(MANY_OPERATIONS + 1)
     parts = _parts(scene_digest, form)
@@ -84,9 +98,10 @@ def key(scene_digest: str, form: str = "fast") -> str:
 
 
 def key_there(folder: Path, scene_digest: str, form: str = "fast") -> str:
-    """Return the key of the build in `folder` if it is complete and of this scene; else "".
+    """Return the key of the complete build in `folder` if it is of this scene; otherwise "".
 
-    It may be by another compiler: this serves machines that have none.
+    The compiler need not be the same, so that machines without a compiler can use the build.
+    Arguments as in `key`.
     """
     try:
         there = _key(folder)
@@ -112,9 +127,9 @@ def _digest_of_parts(*parts: str) -> str:
 
 
 def is_built(folder: Path, build_key: str) -> bool:
-    """Return whether `folder` contains the complete build with this key.
+    """Return True if `folder` contains the complete build with the key `build_key`.
 
-    The digests of all files are compared: loading a corrupt extension may crash the process.
+    The digests of all files are compared, since loading a corrupt extension may crash the process.
     """
     try:
         manifest = _manifest(folder)
@@ -161,12 +176,29 @@ def build(
     form: str = "fast",
     scene_digest: str = "",
 ) -> Built:
-    """Return the module of one scene under `root`; build it if it is not there yet.
+    """Return the module of a scene in a folder below `root`; build it if it is not there yet.
 
-    build_key: the key. sources: returns the files, given the name of the extension; called only if
-    the module must be built. form: of the C that it is compiled from. scene_digest: of the scene;
-    a build with another digest is archived, for values pickled by it.
-    Raises EomcError with the compiler's message if it fails, or if the folder can't be written.
+    Parameters
+    ----------
+    name
+        Name of the scene.
+    build_key
+        The result of `key`.
+    sources
+        Function that returns the generated files, given the name of the extension module; it is
+        called only if the module must be built.
+    root
+        Folder that contains the folders of all scenes.
+    form
+        "fast" to compile the optimised C, "plain" for the portable C.
+    scene_digest
+        Digest of the scene's text. A build with another digest is archived, so that values that it
+        has pickled can still be loaded.
+
+    Raises
+    ------
+    EomcError
+        With the compiler's message if it fails, or if the folder can't be written.
     """
     folder = place(name, root, form)
     root = folder.parent
@@ -190,7 +222,10 @@ def build(
 
 
 def place(name: str, root: Path, form: str = "fast") -> Path:
-    """Return the folder of a scene's module. That of the plain form lies inside it."""
+    """Return the folder below `root` for the module of the scene `name`.
+
+    form: "fast" for optimised C; "plain" for portable C, whose folder lies inside the other one.
+    """
     return root / name if form == "fast" else root / name / ".plain"
 
 
@@ -322,10 +357,11 @@ def _date_later(new: Path, old: Path) -> None:
 
 
 def load(built: Built, home: str = "") -> ModuleType:
-    """Import a built module under a name of its own; the same build gives the same module object.
+    """Import a built module, under a name that differs for each build; return the module.
 
-    home: the folder of builds of this scene, if the build lies elsewhere. Raises ReplacedError if
-    another build has replaced it.
+    The same build always gives the same module object. home: the folder of builds of this scene, if
+    the build lies elsewhere, such as in the archive. Raises ReplacedError if another build has
+    replaced it on disk.
     """
     folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
     key = _key(folder)
@@ -374,9 +410,17 @@ def unpickled(
 ) -> Any:
     """Return a value that was pickled by a module imported by `load`; pickle calls this function.
 
-    place: the scene's name, the folder of its builds, and the key of the build that pickled it.
-    Nothing is raised here, since a pool of processes waits forever if a task can't be unpickled:
-    the value is then an `Unreadable`, which raises EomcError when it is used.
+    Parameters
+    ----------
+    place
+        The scene's name, the folder of its builds, and the key of the build that pickled the value.
+    identity
+        Identity of that build, by which the module decides whether it can restore the value.
+    path, arguments
+        Name of the function or class in the module that restores the value, and its arguments.
+
+    This function never raises, since a pool of processes would wait forever. If the value can't be
+    restored, it is an `Unreadable`, which raises EomcError when it is used.
     """
     from eomc.runtime import status
     from eomc.runtime.package import Unreadable

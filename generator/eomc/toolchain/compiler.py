@@ -25,14 +25,17 @@ MANY_OPERATIONS = 60_000
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler: its command, and a text that identifies its version."""
+    """A C compiler: the words of its command, and a text that identifies its version."""
 
     command: tuple[str, ...]
     identity: str
 
 
 def find_compiler() -> Compiler:
-    """Return $CC, cc, gcc, clang or ziglang (from pip), the first that exists. Raises EomcError."""
+    """Return the first of $CC, cc, gcc, clang and ziglang (from pip) that exists.
+
+    Raises EomcError if there is none, or if $CC is set but does not exist.
+    """
     requested = os.environ.get("CC")
     for candidate in [requested] if requested else ["cc", "gcc", "clang"]:
         words = _split_words("CC", candidate)
@@ -51,7 +54,10 @@ def find_compiler() -> Compiler:
 
 
 def first_call_note() -> str:
-    """Return a note for ziglang's first call, which takes a minute; "" for other compilers."""
+    """Return a message that the first call of ziglang takes a minute; "" if this does not apply.
+
+    It does not apply to other compilers, and not if ziglang was called before.
+    """
     if not find_compiler().identity.startswith("ziglang"):
         return ""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -71,9 +77,10 @@ def _split_words(variable: str, text: str) -> list[str]:
 
 
 def compiler_for(operations: int) -> Compiler:
-    """Return the compiler for a scene: `find_compiler`'s, or clang for more than MANY_OPERATIONS.
+    """Return the compiler for a scene whose generated C has this number of arithmetic operations.
 
-    $CC takes precedence. Raises EomcError.
+    It is the one of `find_compiler`, but clang for more than MANY_OPERATIONS, if clang exists and
+    $CC is not set. Raises EomcError if there is no compiler.
     """
     default = find_compiler()
     if (
@@ -92,10 +99,11 @@ def _identity(path: str) -> str:
 
 
 def flags(form: str = "fast") -> tuple[str, ...]:
-    """Return the optimisation flags: $EOMC_CFLAGS if set, else those of the form of C.
+    """Return the optimisation flags for the generated C: $EOMC_CFLAGS, or those of the form.
 
-    With AVX-512, compilers vectorise in registers of half width, which is faster here: a chain of
-    five links takes 0.85 of the time. Explicit vectors in the generated C use the full width.
+    form: "fast" for optimised C, "plain" for portable C. With AVX-512, compilers vectorise in
+    registers of half width, which is faster here: a chain of five links takes 0.85 of the time.
+    Explicit vectors in the generated C use the full width.
     """
     chosen = user_flags()
     if chosen is not None:
@@ -106,24 +114,30 @@ def flags(form: str = "fast") -> tuple[str, ...]:
 
 
 def binding_flags() -> tuple[str, ...]:
-    """Return the flags of the binding: $EOMC_CFLAGS, or -O1, since its own speed hardly matters."""
+    """Return the optimisation flags for the C that connects the module with Python.
+
+    They are $EOMC_CFLAGS if set; otherwise -O1, since the speed of this code hardly matters.
+    """
     return user_flags() or ("-O1",)
 
 
 def user_flags() -> tuple[str, ...] | None:
-    """Return the words of $EOMC_CFLAGS; None if it is not set."""
+    """Return the words of the environment variable EOMC_CFLAGS; None if it is not set."""
     value = os.environ.get("EOMC_CFLAGS")
     return None if value is None else tuple(_split_words("EOMC_CFLAGS", value))
 
 
 def standard(form: str) -> str:
-    """Return the language standard flag of a form of C."""
+    """Return the compiler flag that selects the C standard.
+
+    form: "fast" for optimised C, "plain" for portable C.
+    """
     return PLAIN_STANDARD if form == "plain" else STANDARD
 
 
 @lru_cache(maxsize=1)
 def processor() -> str:
-    """Return the processor model and features, which -march=native depends on."""
+    """Return a text with the processor's model and features, on which -march=native depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         identifying = {

@@ -16,12 +16,12 @@ from eomc.toolchain.cache import generator_digest
 def cached_texts(
     root: Path, name: str, kind: str, scene_digest: str, make: Callable[[], dict[str, str]]
 ) -> dict[str, str]:
-    """Return the texts that `make` returns, from the cache in `root`/.shown/ if it is up to date.
+    """Return the texts that `make` returns, from a cache on disk if they are up to date.
 
     Parameters
     ----------
     root : Path
-        Build directory.
+        Build directory; the cache is its subfolder .shown.
     name : str
         Name of the scene; "" disables the cache.
     kind : str
@@ -29,7 +29,12 @@ def cached_texts(
     scene_digest : str
         Digest of the scene's text.
     make : callable
-        Returns the texts by name. They are not stored if the folder can't be written.
+        Returns the texts by name. It is called if they are not in the cache, or out of date.
+
+    Returns
+    -------
+    dict
+        The texts by name. They are not stored if the folder can't be written.
     """
     file = root / ".shown" / f"{name}.{kind}.json"
     parts = (scene_digest, kind, generator_digest(), version("sympy"))

@@ -23,10 +23,27 @@ def build(
     sources: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str,
     optimised: Sequence[str] | None = None,
 ) -> None:  # fmt: skip
-    """Compile the sources in `folder`, link `library` there, and test that it can be loaded.
+    """Compile sources to an extension module for Python, and test that it can be loaded.
 
-    `optimised` replaces the flags of the form of C. Raises EomcError with the compiler's message if
-    it fails.
+    Parameters
+    ----------
+    sources
+        The generated C, and the C that connects it with Python.
+    extension, library
+        Name of the module, and name of the file in `folder` to be written.
+    folder
+        Folder in which the generated C has been written.
+    compiler
+        The C compiler.
+    form
+        "fast" to compile the optimised C, "plain" for the portable C.
+    optimised
+        Optimisation flags instead of those of the form.
+
+    Raises
+    ------
+    EomcError
+        With the compiler's message if it fails, or if the module can't be loaded.
     """
     import cffi
 
@@ -64,7 +81,11 @@ def build(
 
 
 def python_library(library: str) -> str:
-    """Return the import library for Windows: of this Python, or of any Python 3 with abi3."""
+    """Return the path of the library of Python against which extensions are linked on Windows.
+
+    library: file name of the extension. The library is that of any Python 3, unless the name
+    contains the version of this Python.
+    """
     version = f"{sys.version_info[0]}{sys.version_info[1]}"
     name = f"python{version if version in library else 3}.lib"
     return str(Path(sys.base_prefix, "libs", name))

@@ -23,7 +23,11 @@ _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
 @dataclass(frozen=True)
 class Exported:
-    """An FMU on disk. `binary`: the folder of its binary, or "" without one; `why`: the reason."""
+    """An FMU (FMI unit) on disk.
+
+    file: its path. binary: the folder in it that contains the binary, or "" without one. why: the
+    reason why there is no binary, or "".
+    """
 
     file: Path
     binary: str
@@ -31,10 +35,11 @@ class Exported:
 
 
 def export(unit: Unit, file: Path, binary: bool = True) -> Exported:
-    """Write an FMU to `file`, replacing an older one, by default with a binary for this machine.
+    """Write an FMU to `file`, replacing an older one.
 
-    Without a compiler, the FMU contains its sources only. Raises EomcError with the compiler's
-    message if it fails, or if the file can't be written.
+    binary: whether it includes a binary for this machine, besides its sources. If there is no
+    compiler, the binary is left out. Raises EomcError with the compiler's message if it fails, or
+    if the file can't be written.
     """
     if file.is_dir():
         raise EomcError(f"{file}: is a folder: name a file, --out {unit.name}.fmu")
@@ -53,7 +58,10 @@ def export(unit: Unit, file: Path, binary: bool = True) -> Exported:
 
 
 def binary_folder(version: int) -> str:
-    """Return the folder of binaries for this platform, as named by the FMI standard."""
+    """Return the name that the FMI standard gives to the folder of binaries for this platform.
+
+    version: of FMI, 2 or 3.
+    """
     system = {"win32": "windows", "cygwin": "windows"}.get(sys.platform, sys.platform)
     machine = _MACHINES.get(platform.machine().lower(), platform.machine().lower())
     if version == 2 and machine == "x86_64":

@@ -18,9 +18,10 @@ _FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not needed, o
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on a file, which is created if needed; nothing is written to it.
+    """Hold an exclusive lock on the file `path` while the block of the with statement runs.
 
-    Raises EomcError if the path is not a regular file. Links are not followed and pipes not waited
+    Other processes that lock the same file wait. It is created if needed; nothing is written to it.
+    Raises EomcError if the path is not a regular file; links are not followed and pipes not waited
     for.
     """
     try:

@@ -34,10 +34,18 @@ _SYMBOLS, _WRITE, _ALLOCATED, _EXECUTED, _FUNCTION = 2, 1, 2, 4, 2  # constants 
 
 @dataclass(frozen=True)
 class FunctionSize:
-    """Size of a function in bytes: its code, its own stack, and the stack including its callees.
+    """Sizes of a C function in bytes.
 
-    stack, total_stack: None if the compiler does not report it or it has no bound. calls: names of
-    the callees, including library functions, whose stack is not known.
+    Attributes
+    ----------
+    code
+        Machine code.
+    stack, total_stack
+        Stack of the function alone, and together with the functions that it calls; None if the
+        compiler does not report it, or if it has no bound.
+    calls
+        Names of the functions that it calls, including library functions, whose stack is unknown
+        and counts as 0.
     """
 
     name: str
@@ -49,7 +57,19 @@ class FunctionSize:
 
 @dataclass(frozen=True)
 class ObjectSizes:
-    """Sizes of a compiled source: functions, and bytes of code, constants and writable data."""
+    """Sizes of a compiled C source.
+
+    Attributes
+    ----------
+    command
+        The compiler's command.
+    functions
+        Sizes of each function.
+    code, constants, writable
+        Bytes of machine code, of constant data and of writable data.
+    faults
+        Messages on functions that call themselves or whose stack has no bound.
+    """
 
     command: tuple[str, ...]
     functions: tuple[FunctionSize, ...]
@@ -70,7 +90,11 @@ class _Graph:
 
 
 def measure(files: Mapping[str, str], name: str, compiler: Compiler) -> ObjectSizes:
-    """Compile name.c alone and return its sizes. Raises EomcError if it can't be read as ELF."""
+    """Compile the portable C of a scene and return its sizes, without linking.
+
+    files: texts by file name, among them name.c and name.h. Raises EomcError if the compiler fails,
+    or if its output is not an ELF object.
+    """
     chosen = user_flags()
     flags = (
         PLAIN_STANDARD,

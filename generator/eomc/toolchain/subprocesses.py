@@ -17,8 +17,9 @@ from eomc.base.errors import EomcError
 def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
     """Run commands in parallel in `folder`, and wait until all have ended.
 
-    If one fails, or on Ctrl-C, the others are terminated. Raises EomcError with the output of the
-    first that fails, or if one can't be started; `name` is the scene's name, for the message.
+    name: the scene's name, for messages. If one command fails, or on Ctrl-C, the others are
+    terminated. Raises EomcError with the output of the first that fails, or if one can't be
+    started.
     """
     running: list[subprocess.Popen[str]] = []
     try:
@@ -33,7 +34,10 @@ def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
 
 
 def write_files(files: Mapping[str, str], folder: Path) -> None:
-    """Write texts by name into a folder; the scene's file name in them may not be valid Unicode."""
+    """Write texts into a folder; `files` has them by file name, and missing folders are created.
+
+    Characters that are not valid Unicode, as a scene's file name may contain, are escaped.
+    """
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace")
@@ -42,9 +46,23 @@ def write_files(files: Mapping[str, str], folder: Path) -> None:
 def try_load(
     name: str, command: Sequence[str], code: str, arguments: Sequence[str], remedy: str
 ) -> None:
-    """Run Python code that loads what `command` produced, in a separate process (some 10 ms).
+    """Test in a separate process that the output of a compiler can be loaded (some 10 ms).
 
-    Raises EomcError with the remedy if the code fails or crashes.
+    Parameters
+    ----------
+    name
+        The scene's name, for messages.
+    command
+        The compiler's command, for messages.
+    code, arguments
+        Python code that loads the output, and its command-line arguments.
+    remedy
+        End of the message that tells what to do.
+
+    Raises
+    ------
+    EomcError
+        If the code fails or crashes.
     """
     completed = subprocess.run(
         [sys.executable, "-I", "-S", "-c", code, *arguments],

@@ -55,7 +55,12 @@ _BASELINE = _Generation("baseline", (), ())  # every processor of the architectu
 
 
 def generations() -> tuple[_Generation, ...]:
-    """Return the generations of this architecture, the newest first; one only with $EOMC_CFLAGS."""
+    """Return the processor generations for which a wheel has an extension, the newest first.
+
+    A generation is a set of processor features, such as AVX2, with compiler flags for them. The
+    generations are those of this machine's architecture. If $EOMC_CFLAGS is set, there is one
+    only, with those flags.
+    """
     chosen = user_flags()
     if chosen is not None:
         return (_Generation("given", (), chosen),)
@@ -70,13 +75,15 @@ def build(sources: Sources, scene: bytes, digest: str, title: str, folder: Path)
     Parameters
     ----------
     sources : Sources
-        With COMPILED as the name of their extension.
+        The generated files, with COMPILED as the name of their extension module.
     scene : bytes
-        The scene file, which is included.
+        The scene's TOML file, which the wheel includes.
     digest : str
-        Digest of the scene file, for the version.
+        Digest of the scene file, which becomes part of the wheel's version.
     title : str
+        Title of the scene, for the wheel's summary.
     folder : Path
+        Where the wheel is written.
 
     Raises
     ------

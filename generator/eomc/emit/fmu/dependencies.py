@@ -73,7 +73,7 @@ class Dependencies:
 
 
 def read(function: Function) -> list[Names]:
-    """Return, for each result of a function, the names of its arguments that the result depends on."""
+    """Return, for each result of a function, the names of the arguments that determine it."""
     dependencies: dict[str, Names] = {}
     for a in (*function.early, *function.body):
         dependencies[a.name] = frozenset().union(*(dependencies.get(n, {n}) for n in a.value.names))

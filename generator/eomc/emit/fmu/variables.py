@@ -86,7 +86,7 @@ def has_signals(target: Target) -> bool:
 def input_starts(target: Target) -> list[float]:
     """Return the initial value of each input: its signal at the start, or 0 if that has no value.
 
-    A value outside of the input's numeric limits is replaced by the limit, which acts instead of it.
+    A value outside of the input's numeric limits is replaced by the limit.
     """
     inputs = target.system.inputs
     if not inputs:
