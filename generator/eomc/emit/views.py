@@ -405,8 +405,8 @@ class Face:
     holonomic, redundant
         Number of holonomic constraint equations, and indices of the redundant ones.
     modes
-        For each joint with stick-slip friction, the index of its discrete coordinate and of the
-        coordinate that slides or sticks.
+        For each coordinate with stick-slip friction, the index of the discrete coordinate that
+        stores whether it slides or sticks, and its own index.
     discrete
         Number of discrete coordinates that are parameters set by state jumps.
     functions
