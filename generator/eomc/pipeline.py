@@ -52,8 +52,8 @@ def _without_garbage_collection() -> Iterator[None]:
 def read(scene: ScenePath) -> System:
     """Read a scene file and return it as a System of SymPy expressions.
 
-    If the system has constraints, its initial values are adjusted to satisfy them. `scene`: path
-    of the TOML file. Raises SceneError, which lists all problems of the scene.
+    If the system has constraints, its free initial values are adjusted to satisfy them. scene:
+    path of the TOML file. Raises SceneError, which lists all problems of the scene.
     """
     from eomc.model.from_scene import from_scene
     from eomc.scene import read as scenes
@@ -110,7 +110,7 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
 
 @_without_garbage_collection()
 def unit(system: System, fmi: int = 2, *, warn: Callable[[Problem], None] | None = None) -> Unit:
-    """Generate the files of an FMU (Functional Mock-up Unit) of a system, return them as text.
+    """Generate the files of an FMU (Functional Mock-up Unit) of a system and return their text.
 
     fmi: version of the FMI standard, 2 or 3. warn: function that is called with each warning; by
     default warnings are discarded. Raises EomcError for another version.

@@ -60,7 +60,7 @@ class Method:
 
     @property
     def stages(self) -> int:
-        """Number of stages, at each of which one step evaluates the accelerations once."""
+        """Number of stages: points within a step at which the accelerations are evaluated."""
         return len(self.b)
 
     @cached_property

@@ -315,7 +315,7 @@ def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
 
 
 def symbol_of(value: Any, role: str) -> Any:
-    """Return `value` if it is a Symbol or a function of time (dynamicsymbols), or a name's symbol.
+    """Convert a name to a symbol; return a Symbol or function of time (dynamicsymbols) unchanged.
 
     role: description of the argument for the message. Raises EomcError for other types.
     """

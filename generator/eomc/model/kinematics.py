@@ -208,7 +208,10 @@ class Kinematics:
             yield body, R, v, omega
 
     def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
-        """Yield the same for bodies placed by formulas, by central differences."""
+        """Yield rotation and Jacobians (3, nq) of bodies placed by formulas, by central differences.
+
+        The tuples are those of `_tree_rates`.
+        """
         if not self.placed:
             return
         here = self._placed_at(q, t)
@@ -256,7 +259,7 @@ class Kinematics:
         return [axis / np.linalg.norm(axis) for axis in axes]
 
     def _roots(self, body: Body) -> tuple[float, Array]:
-        """Return the roots of mass and inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""
+        """Return square roots of mass and inertia tensor: 2 K = |root_m v|^2 + |root_I omega|^2."""
         inertia = [self._number(entry, self.values) for entry in body.inertia]
         moments, axes = np.linalg.eigh(spatial.tensor(inertia))
         root = np.sqrt(np.maximum(moments, 0))[:, None] * axes.T

@@ -48,9 +48,9 @@ class End:
 
 @dataclass(frozen=True)
 class _Pull:
-    """A row, and what a multiplier of one does to the second body: a force, a moment.
+    """A constraint equation, and force and moment on the second body for a multiplier of one.
 
-    rotation_error: as of a constraint.
+    rotation_error: see `Constraint`.
     """
 
     row: Expr

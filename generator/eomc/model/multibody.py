@@ -102,7 +102,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a body's frame is: fixed in a link's frame, and as expressions in the world."""
+    """The pose of a body's frame, relative to its link and, as expressions, in the world."""
 
     link: int
     offset: Vector  # in the link's frame
@@ -393,7 +393,10 @@ class Builder:
     def _kinetic(
         self, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
     ) -> list[Expr]:
-        """m/2 |dc/dt|^2 + 1/2 sum_ab J_ab sum_k dR_ka/dt dR_kb/dt with J = tr(I)/2 - I; terms."""
+        """Return the kinetic energy of a body as terms of a sum.
+
+        m/2 |dc/dt|^2 + 1/2 sum_ab J_ab sum_k dR_ka/dt dR_kb/dt with J = tr(I)/2 - I
+        """
         energy = [mass * _rate(x) ** 2 / 2 for x in position]
         if self.assembly.plane:
             return [*energy, inertia[2] * _rate(place.angle) ** 2 / 2]

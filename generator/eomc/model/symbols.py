@@ -48,7 +48,10 @@ class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as th
         return 1 / pivot if pivot > limit else sympy.S.Zero
 
     def fdiff(self, argindex: int = 1) -> Expr:
-        """Return the derivative: -1/pivot^2 (or 0) by the pivot (argument 1), 0 by the limit."""
+        """Return the derivative with respect to the pivot (argument 1) or the limit (argument 2).
+
+        They are -1/pivot^2 (0 if pivot <= limit) and 0.
+        """
         return -(self**2) if argindex == 1 else sympy.S.Zero
 
 
