@@ -208,9 +208,9 @@ class Kinematics:
             yield body, R, v, omega
 
     def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
-        """Yield rotation and Jacobians (3, nq) of bodies placed by formulas, by central differences.
+        """Yield rotation and Jacobians (3, nq) of bodies placed by formulas.
 
-        The tuples are those of `_tree_rates`.
+        The Jacobians are computed by central differences. The tuples are those of `_tree_rates`.
         """
         if not self.placed:
             return
