@@ -36,7 +36,10 @@ OK, SINGULAR, NOT_FINITE, _, _, LOCKED = range(6)
 
 
 def report(of: Comparison, module: Any, form: str) -> None:
-    """Append the checks of one form's module."""
+    """Append the rows on `project` for the module of one form of C.
+
+    of: the checks and their states. form: prefix of the rows' names.
+    """
     rows = ProjectionChecks(of, module)
     of.row(f"{form}project", LIMIT, "units of rounding", partial(rows.projected, False))
     of.row(f"{form}project, held", LIMIT, "units of rounding", partial(rows.projected, True))
@@ -44,7 +47,10 @@ def report(of: Comparison, module: Any, form: str) -> None:
 
 
 def of_inertia(of: Comparison, refusals: Refusals) -> None:
-    """Append the checks for parameters with which D has no positive eigenvalue."""
+    """Append the row on parameters with which D has no positive eigenvalue.
+
+    of: the checks and their states. refusals: the checks of refusals.
+    """
     checks = MasslessParameters(of, refusals)
     row = of.row
     row("no inertia: refusals", 0, "calls that do not refuse", checks.refuse)
@@ -55,15 +61,19 @@ def of_inertia(of: Comparison, refusals: Refusals) -> None:
 
 @dataclass(frozen=True)
 class ProjectionChecks:
-    """Checks of `project` of one form's module."""
+    """Checks of the function `project`, which puts a state onto the constraints.
+
+    of: the checks and their states. module: that of one form of C, optimised or portable.
+    """
 
     of: Comparison
     module: Any
 
     def projected(self, with_fixed: bool) -> float | Measurement:
-        """Return the largest distance of a projected state from the reference's projection.
+        """Return the largest error of projected states, in units of rounding.
 
-        with_fixed: one coordinate and its velocity are fixed.
+        Displaced states are compared with the reference's projection. with_fixed: one coordinate
+        and its velocity are fixed. Nothing is judged if there is no state to compare.
         """
         of = self.of
         scale = of.sampler.scale
@@ -123,7 +133,11 @@ class ProjectionChecks:
         return [name for i in fixed for name in (names[i], f"{names[i]}_dot")]
 
     def refusals(self) -> float:
-        """Return how many states that can't be projected are not refused, or are changed."""
+        """Return the number of wrong results of `project` for states that are hard to project.
+
+        States that can't be projected must be refused and left unchanged. States far away must be
+        refused or satisfy the constraints afterwards.
+        """
         random = np.random.default_rng(13)
         scale = self.of.sampler.scale
         wrong = 0
@@ -197,7 +211,10 @@ class ProjectionChecks:
 
 
 class MasslessParameters:
-    """Checks of states and parameters with which D is negative semidefinite."""
+    """Checks of refusals at states and parameters with which D has no positive eigenvalue.
+
+    of: the checks and their states. refusals: the checks of refusals.
+    """
 
     def __init__(self, of: Comparison, refusals: Refusals) -> None:
         self.of, self.refusals = of, refusals
@@ -216,7 +233,10 @@ class MasslessParameters:
                     yield s
 
     def refuse(self) -> float:
-        """Return the number of calls that do not refuse, or that write to their outputs."""
+        """Return the number of calls that do not refuse such a state, or that write to outputs.
+
+        The functions are acceleration, a run by each method, and `project`.
+        """
         wrong = 0
         for s in self.states[:12]:
             status, clean = self.refusals.accelerate(s)

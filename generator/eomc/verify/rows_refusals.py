@@ -1,7 +1,7 @@
 """Rows of `check` about refusals: a singular D, states that are not finite, no convergence.
 
-For these, parameters and states are sought where the reference's D is not positive definite.
-Whatever is asked of the module there must say so and leave alone what it was to write.
+Parameters and states are sought at which the reference's D is not positive definite. There each
+function of the module must return an error and leave its outputs unchanged.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ MARK = -7.0  # what is to be left alone
 
 
 def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
-    """Yield the state with nan or inf in place of one coordinate or velocity, and its index."""
+    """Yield copies of the state with nan or inf in place of one coordinate or velocity.
+
+    Each is a tuple of the field ("q" or "qd"), the index in it, nan or inf, and the state.
+    """
     for field in ("q", "qd"):
         for i in range(len(s.q)):
             for what in (math.nan, math.inf):
@@ -53,7 +56,10 @@ def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
 
 
 class Refusals:
-    """Checks of refusals."""
+    """Checks of refusals: states and steps for which functions must return an error.
+
+    singular, regular: states with a singular and with a regular D, collected by the checks.
+    """
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.module, self.model = check, check.module, check.module._model
@@ -63,7 +69,7 @@ class Refusals:
         self.regular: list[State] = []
 
     def report(self) -> None:
-        """Append the rows on refusals."""
+        """Append the rows on refusals to the report."""
         row = self.check.row
         if self.check.system.constraints:
             self.report_constrained()
@@ -75,7 +81,7 @@ class Refusals:
             row(f"{method} too long", 0, "runs that end otherwise", find)
 
     def report_singular(self) -> None:
-        """Add those about D that is singular."""
+        """Append the rows on a singular D, for a system without constraints."""
         row, unit = self.check.row, "states judged wrongly"
         row("singular D", 0, unit, self.definite)
         if not self.singular:
@@ -85,7 +91,7 @@ class Refusals:
         row("singular D in a run", 0, "runs that go on", self.run_into)
 
     def report_constrained(self) -> None:
-        """Add those about D that is negative along changes that rows allow."""
+        """Append the rows on a D that is negative along motions which the constraints allow."""
         row, unit = self.check.row, "calls that do not refuse"
         row("negative D along the rows", 0, unit, self.negative_inertia_errors)
         row("negative D along the rows: refusals", 0, unit, self.refuse)
@@ -93,9 +99,10 @@ class Refusals:
     # where D is singular
 
     def negative_inertia_errors(self) -> float:
-        """Count accelerations that are not refused though D is indefinite on the constraints.
+        """Return the number of states whose D is negative on the constraints but not refused.
 
-        Rows hold what has no inertia of its own, so that D alone says nothing.
+        D alone may be singular, since constraints determine coordinates without inertia. States
+        that are refused are collected in `singular`.
         """
         wrong = 0
         for s in self.suspects():
@@ -112,7 +119,10 @@ class Refusals:
         return float(wrong)
 
     def definite(self) -> float:
-        """Count states at which the module wrongly accepts or refuses D."""
+        """Return the number of states at which the module wrongly accepts or refuses D.
+
+        States that are judged correctly are collected in `singular` and `regular`.
+        """
         suspects = self.suspects()
         stacked: dict[str, Any] = {
             "q": np.array([s.q for s in suspects]),
@@ -138,9 +148,10 @@ class Refusals:
         return float(wrong)
 
     def exact(self, s: State) -> bool:
-        """Return whether D is singular, or regular, independently of rounding errors.
+        """Return whether it does not depend on rounding if D is singular at a state.
 
-        Where one inertia is 2^60 times another, D may have lost the other, or a pivot may.
+        That is so unless a parameter is tiny or huge: if one inertia is 2^60 times another, D or a
+        pivot may have lost the other.
         """
         sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
         return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)
@@ -148,19 +159,26 @@ class Refusals:
     def natural(self, s: State) -> bool:
         """Return whether all parameters have the signs of their defaults.
 
-        Link multipliers divide by masses: they refuse one that is not positive, whatever D is.
+        The method of link multipliers divides by masses: it refuses one that is not positive,
+        whatever D is.
         """
         pairs = [(x, self.defaults[name]) for name, x in (s.params or {}).items()]
         return all(x * default > 0 or default == 0 for x, default in pairs)
 
     def lacks_precision(self, s: State, D: Vector) -> bool:
-        """Whether the module's own D has lost the digits that decide, as where lengths are huge."""
+        """Return whether the module's D differs so much from the exact D that rounding decides.
+
+        That happens, for instance, where lengths are huge.
+        """
         size = np.sqrt(np.abs(np.diag(D)))
         off = np.abs(self.check.ask("D", s) - D)
         return bool(np.any(off > PRECISION_LOSS * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
-        """Return the start and some other states with parameters changed in several ways."""
+        """Return states whose parameters are changed so that D may be singular.
+
+        Single parameters are zero, negative, tiny or huge, and all are random with random signs.
+        """
         states = self.places()
         suspects_ = []
         changes: list[dict[str, float]] = [{}]
@@ -185,7 +203,10 @@ class Refusals:
         return [suspects_[k] for k in sorted(order)]
 
     def places(self) -> list[State]:
-        """Return states at which D may be singular: start, upright, level, and random ones."""
+        """Return states at which D may be singular: the start, three random states, and others.
+
+        The others have all coordinates equal to 0, π/2 or π.
+        """
         own = self.check.sampler.start
         drawn = [e.state for e in self.check.few(4)[1:]]
         states = [own, *drawn]
@@ -194,7 +215,10 @@ class Refusals:
         return [replace(s, t=0.0, u=None) for s in states]
 
     def accelerate(self, s: State) -> tuple[int, bool]:
-        """Return the C function's status, and whether outputs are unchanged after an error."""
+        """Return the status of the C function `acceleration`, and whether its outputs are right.
+
+        After an error they must be unchanged, otherwise finite.
+        """
         model = self.model
         a = np.full(model.nq, MARK, model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -208,7 +232,10 @@ class Refusals:
         return status, clean
 
     def refuse(self) -> float:
-        """Return the number of calls that return OK at a singular state, or write to outputs."""
+        """Return the number of calls that do not refuse a singular state, or write to outputs.
+
+        The functions are acceleration, multipliers, steps and runs by all methods, and derivatives.
+        """
         wrong, run = 0, self.check.system.run
         solved = ("acceleration", "multipliers")[: 1 + bool(self.check.system.constraints)]
         for s in self.singular[:: max(1, len(self.singular) // 24)]:
@@ -223,11 +250,14 @@ class Refusals:
         return float(wrong)
 
     def call(self, name: str, s: State) -> Any:
-        """Call a function of the module at a state."""
+        """Return the result of the module's function `name` at the state `s`."""
         return getattr(self.module, name)(s.q, s.qd, t=s.t, u=s.u, params=s.params)
 
     def raises(self, call: Callable[[], Any], status: str) -> bool:
-        """Return whether a call raises with this status and names the state."""
+        """Return whether a call raises ArithmeticError with this status.
+
+        The message must contain the state.
+        """
         try:
             call()
         except ArithmeticError as fault:
@@ -235,7 +265,10 @@ class Refusals:
         return False
 
     def stays(self, method: str, s: State, status: str) -> bool:
-        """Return whether a step and a run stop at the initial state with the right message."""
+        """Return whether a step and a run from `s` stop at once, with this status.
+
+        The step must leave its outputs unchanged, and the run must store the initial state only.
+        """
         out = tuple(np.full(len(s.q), MARK, self.model.dtype) for _ in range(2))
         options = {"params": s.params, "u": s.u, "method": method}
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **options)
@@ -251,9 +284,10 @@ class Refusals:
         )
 
     def run_into(self) -> float:
-        """Count runs from a regular start that continue past a singular D, or store such a state.
+        """Return the number of runs that go on past a singular D, or store nan or inf.
 
-        Not where rounding decides which D is singular along them.
+        The runs start where D is regular, and lead to states where it is singular. States at which
+        rounding decides whether D is singular are left out.
         """
         wrong = tried = 0
         h = self.check.system.run.h
@@ -275,9 +309,10 @@ class Refusals:
         return float(wrong)
 
     def regular_neighbour(self, s: State, turn: int) -> list[State]:
-        """Return a regular state that differs from a singular one in one coordinate, or None.
+        """Return a regular state that differs from the singular `s` in one coordinate, in a list.
 
-        From there a run may come gently to where D is singular: nothing else moves.
+        Its velocities are zero; the list is empty if none is found. turn: selects the coordinate. A
+        run from there moves that coordinate alone, slowly, to the singular state.
         """
         i = turn % len(s.q)
         for by in DISPLACEMENTS:
@@ -289,7 +324,10 @@ class Refusals:
         return []
 
     def goes_on(self, method: str, s: State, steps: int) -> bool:
-        """Return whether a run has stored a state whose D is not positive definite."""
+        """Return whether a run from `s` makes a step from a D that is not positive definite.
+
+        Storing a state that is not finite counts, too.
+        """
         run = run_in_c(self.model, method, s, self.check.system.run.h, steps + 3)
         rows = run.rows[:, : run.steps + 1].astype(float)
         if not np.all(np.isfinite(rows)):
@@ -308,7 +346,10 @@ class Refusals:
         return bool(np.any(least < -EIGENVALUE_TOLERANCE))
 
     def positions_along_step(self, starts: Vector, ends: Vector) -> list[Vector]:
-        """Return positions within steps by cubic interpolation: (n, nq) for each of ALONG."""
+        """Return positions within n steps by cubic interpolation, (n, nq) for each of STEP_POINTS.
+
+        starts, ends: q and q̇ before and after the steps, (2, n, nq).
+        """
         (q, qd), (r, v), h = starts, ends, self.check.system.run.h
         return [
             q + (r - q) * x**2 * (3 - 2 * x) + h * x * (1 - x) * (qd * (1 - x) - v * x)
@@ -316,7 +357,10 @@ class Refusals:
         ]
 
     def least_eigenvalues(self, q: Vector, s: State) -> Vector:
-        """The least scaled eigenvalues of the reference's D at positions (n, nq)."""
+        """Return the least eigenvalue of the reference's D at n positions, (n,).
+
+        q: (n, nq). s: its parameters are used. D is scaled to a unit diagonal.
+        """
         if not len(q):
             return np.zeros(0)
         with np.errstate(all="ignore"):
@@ -326,7 +370,7 @@ class Refusals:
     # what is not finite
 
     def nonfinite_errors(self) -> float:
-        """Count functions that do not refuse nan or infinity."""
+        """Return the number of calls that do not refuse a state with nan or infinity."""
         s, wrong = self.check.few(2)[-1].state, 0
         for field, i, what, at in with_nonfinite_entries(s):
             status, clean = self.accelerate(at)
@@ -343,7 +387,7 @@ class Refusals:
         return float(wrong)
 
     def multiplied(self, s: State) -> bool:
-        """Return whether multipliers are finite, or refused by the C function as nan."""
+        """Return whether `multipliers` in C gives finite values or, with an error, nan."""
         model = self.model
         multipliers = np.zeros(len(model.constraint_names), model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -356,14 +400,20 @@ class Refusals:
         return bool(np.all(np.isnan(multipliers) if refused else np.isfinite(multipliers)))
 
     def matters(self, s: State, field: str, i: int) -> bool:
-        """Return whether accelerations depend on a coordinate or velocity."""
+        """Return whether the module's accelerations at `s` depend on one coordinate or velocity.
+
+        field: "q" or "qd". i: index of the coordinate.
+        """
         x = getattr(s, field).copy()
         x[i] += 0.1 * (1 + abs(x[i]))
         one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
         return not np.array_equal(one, other)
 
     def bounded(self, s: State) -> bool:
-        """Whether the reference is finite there, as tanh and atan are at infinity."""
+        """Return whether the reference's D, bias and tau are finite at a state with nan or inf.
+
+        tanh and atan, for instance, are finite at infinity.
+        """
         with np.errstate(all="ignore"):
             values = [
                 self.check.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
@@ -372,7 +422,10 @@ class Refusals:
         return all(bool(np.all(np.isfinite(value))) for value in values)
 
     def linearized(self, s: State) -> bool:
-        """Return whether the derivatives are finite, or were not written."""
+        """Return whether `linearization` in C gives finite values or, after an error, none.
+
+        After an error its outputs must be unchanged.
+        """
         model, n = self.model, self.model.nq
         A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -386,7 +439,11 @@ class Refusals:
         return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
-        """Check steps so long that the state overflows, or that the stages do not converge."""
+        """Return the number of runs that end wrongly because steps are too long.
+
+        States overflow, or stages of implicit methods do not converge. A run must then return an
+        error and store finite states only.
+        """
         s, wrong = self.check.few(2)[-1].state, 0
         ended = []
         for power in (4, 8, 16, 40, 100, 160, 300):

@@ -1,8 +1,8 @@
-"""Checks of runs: long steps, runs in pieces, stored rows, inputs of each step, large angles.
+"""Checks of runs: long steps, runs in several calls, stored states, inputs by step, large angles.
 
-A run may take another way through the C than one step from the start does: sines and cosines are
-predicted while steps are short, Kahan remainders are kept, and a run that was cut goes on from its
-memory. All ways give the same motion, most of them the same bits.
+A run may take another way through the C code than one step from the start does: sines and cosines
+are predicted while steps are short, Kahan remainders are kept, and a run in several calls goes on
+from its workspace. All ways give the same motion, most of them the same bits.
 """
 
 from __future__ import annotations
@@ -56,14 +56,18 @@ ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
 
 @dataclass(frozen=True)
 class RunResult:
-    """Result of a run of the C function: rows (2, n, nq), number of steps, status."""
+    """Result of a run by the C function.
+
+    rows: stored q and q̇, (2, n, nq); nan where the run ended before. steps: number of steps.
+    status: 0, or the code of the error.
+    """
 
     rows: Vector
     steps: int
     status: int
 
     def is_identical(self, other: RunResult) -> bool:
-        """True if all bits agree; nan equals nan."""
+        """Return whether all bits of two results agree; nan equals nan."""
         return (
             self.steps == other.steps
             and self.status == other.status
@@ -72,7 +76,7 @@ class RunResult:
 
 
 def parameters(model: Any, s: State) -> Vector:
-    """Return the parameters of a state, (np,)."""
+    """Return the values of all parameters at a state, (np,), in the order of the module."""
     values = [(s.params or model.defaults)[name] for name in model.parameters]
     return np.array(values, model.dtype)
 
@@ -81,10 +85,20 @@ def run_in_c(
     model: Any, method: str, s: State, h: float, steps: int, *, cuts: Sequence[int] = (),
     every: int = 1, moved: float = 0.0, fresh_memory: bool = False,
 ) -> RunResult:  # fmt: skip
-    """A run of the C function from s, in calls that end at `cuts`; s.u (nu,) or (steps, nu).
+    """Return a run of `steps` steps of h seconds from `s`, by the C function for `method`.
 
-    moved: the part by which a state's first number is changed at a cut, as if from elsewhere.
-    fresh_memory: every call has a memory of its own.
+    Parameters
+    ----------
+    s : State
+        Its u may have a value for each step, (steps, nu), in place of (nu,).
+    cuts : sequence of int
+        Numbers of steps after which a call ends and the next one continues the run.
+    every : int
+        Only each `every`-th state is stored.
+    moved : float
+        Change of the first coordinate between two calls, relative to 1 + its size.
+    fresh_memory : bool
+        Whether each call has a workspace of its own.
     """
     _, run, _, _, work_type, _ = model._loops[method]
     q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -123,7 +137,11 @@ def _reads_time(system: System) -> bool:
 
 
 class Runs:
-    """Checks of runs."""
+    """Checks of runs by fixed steps, in C.
+
+    starts: the initial state and a random one with reference values. states: the same without
+    these. turning: such states with velocities of several sizes.
+    """
 
     def __init__(self, check: Comparison) -> None:
         self.check, self.model = check, check.module._model
@@ -144,7 +162,7 @@ class Runs:
             return self.sampler.expected(s)
 
     def report(self) -> None:
-        """Append the rows on runs."""
+        """Append the rows on runs to the report."""
         row, rounding = self.check.row, "units of rounding"
         if self.check.methods[0] == "rk4":
             unit = rounding + ", times steps and growth"
@@ -165,7 +183,7 @@ class Runs:
     limit = 1e3
 
     def written(self) -> float:
-        """Count functions that do not write all of their outputs."""
+        """Return the number of functions that do not write all entries of their output."""
         s, n, left = self.states[-1], self.model.nq, 0
         for name in ("D", "C", "g", "bias", "tau"):
             out = np.full((n, n) if name in "DC" else n, np.nan, self.model.dtype)
@@ -175,7 +193,10 @@ class Runs:
         return float(left)
 
     def large_step(self, s: State, part: float) -> float:
-        """An h in which some coordinate moves by about this part of how far it goes."""
+        """Return a step size, s, with which the fastest coordinate moves by a part of its range.
+
+        s: the state at which the step begins. part: the fraction of the range of the motion.
+        """
         spread = part * self.sampler.spread
         a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
         with np.errstate(divide="ignore"):
@@ -183,7 +204,11 @@ class Runs:
         return float(min(np.min(h), 100 * self.h)) or self.h
 
     def turning_step(self, s: State, turned: float = TURNED, moved: float = math.inf) -> float:
-        """An h at half of which accelerations turn some angle by `turned`, or rates by `moved`."""
+        """Return a step size, s, with which angles turn by a given amount.
+
+        In half of the step, accelerations turn some angle by `turned`, or velocities by `moved`,
+        rad; the shorter step counts.
+        """
         a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
         fastest, rate = (
             float(np.max(np.abs(x[self.sampler.angles]), initial=0)) for x in (a, s.qd)
@@ -193,7 +218,11 @@ class Runs:
         return min([*steps, 100 * self.h]) if steps else self.h
 
     def long(self) -> float | Measurement:
-        """Compare long steps with the reference's."""
+        """Return the largest error of runs by long steps, in units of rounding.
+
+        Angles move too far for their sines to be predicted. The runs are compared with the
+        reference.
+        """
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         pairs = [
             (e, h)
@@ -210,13 +239,20 @@ class Runs:
         return largest(errors, "a difference grows too much in one long step")
 
     def short(self) -> float | Measurement:
-        """Compare steps in which angles hardly change with the reference's."""
+        """Return the largest error of runs by short steps, in units of rounding.
+
+        Angles hardly change, so that their sines are predicted. The runs are compared with the
+        reference.
+        """
         starts = self.check.few(2 if self.check.large else 8)
         errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
         return largest(errors, "a difference grows too much in one short step")
 
     def sines(self) -> float:
-        """D, g and bias all around the circle, where sines need all of their terms."""
+        """Return the largest error of D, g and bias at angles around the circle, in roundings.
+
+        There sines need all of their terms.
+        """
         e = self.check.few(2)[-1]
         s, n = e.state, len(e.state.q)
         around = np.linspace(-np.pi, np.pi, ANGLES, endpoint=False)[:, None] + 0.01
@@ -238,7 +274,7 @@ class Runs:
         return float(np.max(errors, initial=0))
 
     def expected(self, states: Sequence[State]) -> list[dict[str, Vector]]:
-        """The reference's D, g and bias at states that differ in q alone."""
+        """Return the reference's D, g and bias, by name, at states that differ in q alone."""
         s, ask = states[0], self.sampler.reference.evaluate
         q, qd = (np.array([getattr(at, x) for at in states]) for x in ("q", "qd"))
         values_by_name = {
@@ -249,12 +285,12 @@ class Runs:
         ]
 
     def far(self) -> float:
-        """Values, accelerations and steps at angles and times that sines are too small for.
+        """Return the largest error of values and steps at angles of many turns and late times.
 
-        An angle is as exact as its last digit, so that a unit is that of the angle. Times are
-        earlier where formulas contain larger angles, such as t**3, or where single precision does
-        not resolve a step; states where angles are still
-        larger than the numbers that a double counts are left out.
+        There the inlined sines can't be used. An angle is as exact as its last digit, so that a
+        unit is a rounding of the angle. Times are earlier where formulas contain larger angles,
+        such as t**3, or where single precision does not resolve a step. States are left out if
+        angles are still larger than the integers that a double represents.
         """
         errors, angle = [], largest_angle(self.check.system)
         for e in self.check.few(2):
@@ -295,16 +331,20 @@ class Runs:
         return float(np.max(errors, initial=0))
 
     def holds(self, s: State) -> bool:
-        """Whether constraints hold with angles turned so far: gears need turns of their own."""
+        """Return whether constraints hold at a state whose angles are many turns away.
+
+        They may not: angles of gears need different numbers of turns.
+        """
         off, size = self.sampler.value_and_size(
             partial(self.sampler.reference.evaluate, "constraints"), s
         )
         return bool(np.all(np.abs(off) <= 1e3 * self.check.eps * size))
 
     def solved(self, e: Expected) -> Expected:
-        """With what a rounding of q makes of velocities, to which stages are solved for.
+        """Return `e` with larger sizes of accelerations, for the stages of implicit methods.
 
-        The accelerations of all coordinates follow such velocities.
+        Stages are solved for with velocities that a rounding of q changes; accelerations follow
+        these velocities.
         """
         s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
         scale = self.sampler.scale
@@ -315,11 +355,15 @@ class Runs:
         return replace(e, size={**e.size, "acceleration": gain})
 
     def resolves_steps(self, t: float) -> bool:
-        """Return whether the module's numbers resolve a step's 64th part at the time t."""
+        """Return whether the module's numbers resolve 1/64 of a step at the time t, s."""
         return bool(64 * np.spacing(np.asarray(t, self.check.dtype)) <= self.h)
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
-        """Some steps from there; acceleration: the size of what is rounded in one."""
+        """Return the error of a few RK4 steps from `s`, in units of rounding.
+
+        The steps are compared with the reference. acceleration: size of the accelerations for their
+        rounding errors, (nq,). The result is 0 if the steps lead too far to be compared.
+        """
         h, x, scale = self.h, self.sampler.rounded(s), self.sampler.scale
         u = None if s.u is None else np.array([s.u] * x.shape[1])
         off = np.zeros_like(scale)
@@ -335,7 +379,10 @@ class Runs:
         return self.check.units(end, x[:, 0], size)
 
     def inputs(self) -> float | Measurement:
-        """Compare a run with inputs for each step with the reference and with runs in pieces."""
+        """Return the largest error of runs with other inputs in each step, in units of rounding.
+
+        They are compared with the reference and, bit by bit, with runs by `simulate`.
+        """
         errors, spread = [], self.sampler.scale
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
@@ -357,9 +404,10 @@ class Runs:
         return largest(errors, "the first step leads too far")
 
     def driven(self, s: State, u: Vector, spread: Vector) -> tuple[int, Vector, float]:
-        """The reference with a row of inputs each step, as far as it isn't thrown out.
+        """Return the reference's run with the inputs `u`, (steps, nu), while it stays near `s`.
 
-        The steps, the state after them, (2, nq), and how much a difference has grown until then.
+        The results are the number of steps, the state after them (2, nq), and the growth of a small
+        difference of the initial state. spread: typical sizes of q and q̇, (2, nq).
         """
         x = np.array([s.q, s.qd])[:, None] + [[0.0], [NUDGE]] * spread[:, None]  # (2, 2, nq)
         start = x[:, 0]
@@ -376,7 +424,11 @@ class Runs:
         return sure
 
     def cut(self, method: str) -> float:
-        """How many runs in several calls, or with fewer rows kept, are not the whole to the bit."""
+        """Return the number of runs whose bits depend on how a run is divided or stored.
+
+        A run by `method` in several calls, or with fewer stored states, must equal that in one
+        call.
+        """
         wrong = 0
         for s in self.states:
             steps = [self.h, *(self.large_step(s, part) for part in LONG)]
@@ -387,13 +439,17 @@ class Runs:
         return float(wrong)
 
     def table(self, s: State) -> State:
-        """Return the state with a row of inputs for each step."""
+        """Return the state with random inputs for each step, (STEPS, nu)."""
         u = self.random.normal(size=(STEPS, self.model.nu))
         u[::2] = u[1::2]  # inputs that jump at some steps and not at others
         return replace(s, u=u)
 
     def differ(self, method: str, s: State, h: float) -> int:
-        """Count the runs of one state and step that differ."""
+        """Return the number of runs from `s` with steps of h seconds that have other bits.
+
+        They are a run in several calls, one with fewer stored states, and one whose state is
+        changed between calls, which must not use its workspace.
+        """
         whole = run_in_c(self.model, method, s, h, STEPS)
         pieces = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS)
         sparse = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)
@@ -413,12 +469,12 @@ class Runs:
         return wrong + (not moved.is_identical(fresh))
 
     def fine(self, method: str) -> float | Measurement:
-        """How far rounding moves the end of a run of thousands of steps, in units of the state.
+        """Return how far rounding moves the end of a run of thousands of steps, in roundings.
 
         Two runs over the same time in so short steps that the method is exact differ by rounding
-        alone. The median of some states: where a difference grows fast, rounding does too. No step
-        is short enough where forces jump or bend within it; where they are steep, what is left gets
-        less with shorter steps, as rounding does not.
+        alone. The median over some states counts: where a difference grows fast, rounding does too.
+        Nothing is judged if forces jump or have kinks, or if they are so steep that shorter steps
+        still differ less.
         """
         states, errors = self.check.few(4), list[float]()
         for parts in FINE:
@@ -432,7 +488,11 @@ class Runs:
         return min(errors)
 
     def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
-        """Return the median difference of runs with h divided by two numbers of parts, in units."""
+        """Return the median difference of two runs over the same time, in units of rounding.
+
+        parts: for each run, the number of its steps in one step of the scene. states: initial
+        states.
+        """
         errors, T = [], 2 * self.h
         for e in states:
             s, gain = replace(e.state, u=None), T * e.size["acceleration"]

@@ -1,4 +1,4 @@
-"""Check of closed loops: A with feedback signals, in eighty digits."""
+"""Rows of `check` about closed loops: A with feedback signals, by derivatives in eighty digits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eomc.verify.sampling import Expected
 
 
 def report(check: Comparison) -> None:
-    """Append the checks of a scene with smooth feedback."""
+    """Append the rows on closed loops, if signals are a smooth feedback of the state."""
     if not check.system.run.needs_derivatives or not _is_feedback(check.system):
         return
     signals = tuple(Output(i.name, i.signal) for i in check.system.inputs)

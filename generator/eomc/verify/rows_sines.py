@@ -1,9 +1,9 @@
-"""Check of sines and cosines near their zeros, as far as they are inlined.
+"""Row of `check` about sines and cosines near their zeros, as far as they are inlined.
 
-Beside a multiple of a quarter turn an error of the reduction by 1e-17 is lost in most sums, but not
-in an entry of D or g that is one sine times something else. The reference says which are: at
-neighbouring doubles they are in proportion to the sine, and larger than what is left of constants
-that cancel.
+Near a multiple of a quarter turn, an error of 1e-17 in the reduction of an angle is lost in most
+sums, but not in an entry of D or g that is one sine times something else. The reference shows which
+entries are: at neighbouring doubles they are proportional to the sine, and larger than what is
+left of constants that cancel.
 """
 
 from __future__ import annotations
@@ -32,15 +32,19 @@ MOVES = (1e-6, -0.43, 0.31, 0.77, -0.68)
 
 
 def report(check: Comparison) -> None:
-    """Add it, where there are angles; single precision takes its sines from double."""
+    """Append the row on sines that vanish, if there are angles.
+
+    There is none in single precision, which takes its sines from double precision.
+    """
     if np.any(check.sampler.angles) and check.dtype == np.float64:
         check.row("sines that vanish", LIMIT, "units of rounding", lambda: vanishing(check))
 
 
 def vanishing(check: Comparison) -> float | Measurement:
-    """Return the largest relative error of entries proportional to one sine, in roundings.
+    """Return the largest relative error of entries of D and g that are proportional to one sine.
 
-    It is so at all quarter turns where that sine vanishes: what is so at some may be a sum that
+    It is in roundings, at angles near zeros of the sine. An entry counts if it is proportional at
+    all quarter turns at which that sine vanishes: if it is so at some only, it may be a sum that
     cancels there, as 1 - tanh(x)**2 does far out.
     """
     e, errors = check.few(2)[-1], list[float]()

@@ -1,6 +1,6 @@
-"""Checks of events in fixed steps: each row is one step of the method from the previous row.
+"""Rows of `check` about events in fixed steps: each stored state is one step from the previous one.
 
-So is the state at each event; and where what an event watches changes its sign, there it is.
+So is the state at each event; and where an event function changes its sign, an event is recorded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SIDES = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
 
 
 def report(check: Comparison) -> None:
-    """Add the row of a scene with events."""
+    """Append the rows on events in fixed steps, one for each method."""
     for module, form in check.forms:
         for method in check.methods:
             check.row(

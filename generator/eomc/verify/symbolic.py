@@ -32,10 +32,11 @@ MAX_SIZE = 10_000  # some seconds of SymPy at five links
 
 @lru_cache(maxsize=16)
 def derive(system: System) -> SymbolicReference:
-    """D qdd + C qd + g = tau from d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - U - P, plainly.
+    """Derive the reference's equations of motion D q̈ + C q̇ + g = τ of a system, with SymPy.
 
-    U is the linear part of a generalized potential. T = K - U is split by its degree in qd,
-    T = T2 + a.qd + T0, and p = dT/dqd:
+    They follow from d/dt ∂L/∂q̇ - ∂L/∂q + ∂R/∂q̇ = Q with L = K - U - P, without any simplification
+    of the system. U is the linear part of a generalized potential. T = K - U is split by its degree
+    in q̇, T = T2 + a·q̇ + T0, and p = ∂T/∂q̇:
 
     - D = d2T/dqd2, symmetric, others call it M;
     - bias = (dp/dq) qd + dp/dt - dT/dq + dP/dq, and g = bias at qd = 0;
@@ -44,12 +45,12 @@ def derive(system: System) -> SymbolicReference:
       so that bias = C qd + g, and Ddot - 2C + dD/dt is skew-symmetric;
     - tau = Q - dR/dqd;
     - jacobi = p.qd - L, which is K + P where K is purely quadratic, and changes at the rate
-      power = tau.qd - dL/dt at fixed q and qd; tau is without what constraints do;
+      power = tau.qd - dL/dt at fixed q and qd; tau does not contain constraint forces;
     - of constraints phi(q, t), then psi(q, qd, t): A = dphi/dq, then dpsi/dqd; rates
       A qd + dphi/dt, then psi; gamma = d(rates)/dt at qdd = 0, so that A qdd + gamma = 0.
 
-    The last few are kept, with their functions: a report asks for the same in three places.
-    Raises EomcError where K is not quadratic in the velocities, or where a definition can't be
+    The last few results are cached, with their functions: a report needs the same in three places.
+    Raises EomcError if K is not quadratic in the velocities, or if a definition can't be
     differentiated.
     """
     expand = _expander(system)
@@ -121,7 +122,10 @@ def _constraint_expressions(
 
 
 def without_definitions(system: System) -> System:
-    """Return the system with definitions substituted and energies simplified."""
+    """Return the system with its definitions substituted and its energies simplified.
+
+    It has no definitions, outputs and reactions.
+    """
     expand = _expander(system)
     names = ("kinetic", "potential", "linear_potential", "dissipation")
     energies = {name: simplify_by_rates(expand(getattr(system, name)), system.qd) for name in names}
@@ -135,9 +139,10 @@ def without_definitions(system: System) -> System:
 
 
 def reference_for(system: System) -> Reference:
-    """Return the reference: symbolic if that is small, else by Taylor arithmetic.
+    """Return the reference for a system: symbolic for small ones, else by Taylor arithmetic.
 
-    Raises EomcError as `derive` and `TaylorReference` do.
+    Systems with parameters that jumps set have a `DiscreteReference` around one of these. Raises
+    EomcError as `derive` and `TaylorReference` do.
     """
     if system.discrete:
         return DiscreteReference(system, reference_for(with_constant_parameters(system)))
@@ -145,7 +150,10 @@ def reference_for(system: System) -> Reference:
 
 
 def is_small(system: System, most: float | None = None) -> bool:
-    """Return whether the expanded equations have few enough operations for `derive`."""
+    """Return whether the expanded equations have few enough operations for `derive`.
+
+    most: the largest number of operations; MAX_SIZE by default.
+    """
     return _expanded_size(system) <= (MAX_SIZE if most is None else most)
 
 
@@ -210,11 +218,11 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 @dataclass(frozen=True)
 class SymbolicReference(Reference):
-    """Equations of motion as expressions in q, qd, t, u and the parameters.
+    """Reference whose equations of motion are expressions in q, qd, t, u and the parameters.
 
-    constraints, constraint_rates, gamma: (m, 1); constraint_jacobian: (m, nq); D, C: (nq, nq);
-    g, bias, tau, friction: (nq, 1), tau = Q - friction; signals: (nu, 1), the
-    inputs by default.
+    The expressions are explained in `derive`. Shapes: constraints, constraint_rates, gamma (m, 1);
+    constraint_jacobian (m, nq); D, C (nq, nq); g, bias, tau, friction (nq, 1), where friction is
+    ∂R/∂q̇ and contained in tau; signals (nu, 1), the inputs by default; the others are scalars.
     """
 
     system: System
@@ -241,21 +249,21 @@ class SymbolicReference(Reference):
 
     @cached_property
     def motion(self) -> ImmutableMatrix:
-        """Entries of D by rows, bias and tau in one column, for accelerations: (nq^2 + 2 nq, 1)."""
+        """Entries of D by rows, bias and tau in one column, (nq^2 + 2 nq, 1), for accelerations."""
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
     @cached_property
     def energy_terms(self) -> Expr:
-        """Sum of |terms| of K and P."""
+        """Expression of the sum of the sizes of all terms of K and P."""
         return _magnitude(self.kinetic) + _magnitude(self.potential)
 
     @cached_property
     def power_terms(self) -> Expr:
-        """Sum of |terms| of the power."""
+        """Expression of the sum of the sizes of all terms of the power."""
         return _magnitude(self.power)
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Implement `Reference.terms`."""
+        """Return the sum of the sizes of all terms of "energy" or "power", as `Reference.terms`."""
         return float(self.evaluate(f"{name}_terms", **s))
 
     def _value(

@@ -63,15 +63,16 @@ _REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
 
 
 class TaylorReference(Reference):
-    """Equations of motion evaluated numerically at each state; quantities as in `symbolic.derive`.
+    """Reference that evaluates equations of motion numerically; quantities as in `symbolic.derive`.
 
     D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) + c(0))/2 with c = T_vvs + N: that is
-    Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part
-    da_i/dq_j - da_j/dq_i and the explicit dD/dt, as in `symbolic.derive`. No differences are
-    taken: every value is good to a few roundings of its largest terms.
+    Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part da_i/dq_j
+    - da_j/dq_i and the explicit dD/dt, as in `symbolic.derive`. The module's docstring explains the
+    derivatives. No differences are taken: every value is good to a few roundings of its largest
+    terms.
 
-    Raises EomcError where K is not seen to be a polynomial of degree 2 in the velocities, or
-    where a derivative is needed that can't be had.
+    Raises EomcError if K is not seen to be a polynomial of degree 2 in the velocities, or if a
+    derivative is needed that is not known.
     """
 
     def __init__(self, system: System) -> None:
@@ -230,7 +231,11 @@ def _column(z: Any) -> Any:
 
 @dataclass
 class _List:
-    """List of the distinct operations in all expressions of a system, in order of evaluation."""
+    """List of the distinct operations in all expressions of a system, in order of evaluation.
+
+    ops: the operations. known: index of the operation that evaluates an expression. roots: indices
+    of the results, such as "K" or "Q", by name.
+    """
 
     system: System
     ops: list[Op] = field(default_factory=list)
@@ -259,11 +264,16 @@ class _List:
         self.roots = {name: [self.node(e) for e in exprs] for name, exprs in roots.items()}
 
     def add(self, op: Op) -> int:
+        """Append an operation and return its index."""
         self.ops.append(op)
         return len(self.ops) - 1
 
     def make(self, kind: str, args: Iterable[int], data: Any = None, degree: float = 0) -> int:
-        """Append an operation, or return the index of an equal one."""
+        """Append an operation on earlier ones and return its index.
+
+        kind, data, degree: as in `Op`. args: indices of its arguments, whose dependencies it
+        inherits.
+        """
         args = tuple(args)
         of = [self.ops[i] for i in args]
         moves, rate, given = (
@@ -279,6 +289,10 @@ class _List:
         return self.known[e]
 
     def build(self, e: Expr) -> int:
+        """Append the operations that evaluate `e`, and return the index of the last one.
+
+        Raises EomcError if the derivatives of `e` are not known.
+        """
         if e.is_number:
             return self.add(Op("number", data=np.float64(e)))
         if isinstance(e, dot):
@@ -308,7 +322,10 @@ class _List:
         raise EomcError(f"{self.system.name}: the derivatives of {e} are not known")
 
     def product(self, e: Expr) -> int:
-        """Return a product with factors in order of dependency, so that few products are large."""
+        """Append the operations for a product or square, and return the index of the last one.
+
+        Factors are sorted by what they depend on, so that few products have large derivatives.
+        """
         factors: list[int] = []
         for factor in e.args if e.is_Mul else (e,):
             square = factor.is_Pow and factor.exp == 2
@@ -321,6 +338,10 @@ class _List:
         return index
 
     def rate(self, e: Expr) -> int:
+        """Append the operation for a dot(...), a derivative by time, and return its index.
+
+        Raises EomcError if the expression in it depends on velocities, inputs or another dot(...).
+        """
         inside = self.node(e.args[0])
         op = self.ops[inside]
         if op.degree or op.has_inputs or op.rate:
@@ -329,7 +350,11 @@ class _List:
         return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
 
     def plan(self, fields_by_root: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
-        """Return the operations that the wanted derivatives need, in order, with their fields."""
+        """Return the operations needed for some derivatives, in order of evaluation.
+
+        fields_by_root: names of the needed derivatives, separated by spaces, for each result. Each
+        entry is the index of an operation, the operation, and the derivatives needed from it.
+        """
         need: dict[int, set[str]] = {}
         for root, fields in fields_by_root.items():
             for index in self.roots[root]:

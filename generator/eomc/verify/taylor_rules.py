@@ -1,6 +1,6 @@
-"""Rules of Taylor arithmetic: value and derivatives of each operation from its arguments'.
+"""Rules of Taylor arithmetic: value and derivatives of an operation from those of its arguments.
 
-What a derivative is called, see `taylor`, whose lists of operations these rules carry out.
+The names of derivatives are explained in `taylor`, whose lists of operations these rules evaluate.
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ FEEDS: Mapping[str, Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Op:
-    """One operation on earlier ones: its kind, arguments, and a number, index or function.
+    """One operation on the results of earlier ones.
 
-    degree: in the velocities, inf where it is no polynomial in them; moves: 2 where it hangs on
-    q, 1 where on t alone; rate: hangs on a dot(...); has_inputs: hangs on an input.
+    kind: its rule, a key of RULES. args: indices of its arguments. data: a number, index or
+    function that the rule needs. degree: degree in the velocities; inf if it is no polynomial in
+    them. moves: 2 if it depends on q, 1 if on t only, else 0. rate, has_inputs: whether it depends
+    on a dot(...), on an input.
     """
 
     kind: str
@@ -58,7 +60,11 @@ class Op:
 
 @dataclass(frozen=True)
 class Point:
-    """Point of evaluation: q, qd (b, nq); t, u, values: numbers or columns."""
+    """The b states at which operations are evaluated.
+
+    q, qd: (b, nq). t: time, s. u, values: inputs and parameters. Each of these is one number or a
+    column (b, 1).
+    """
 
     q: Vector
     qd: Vector
@@ -68,11 +74,11 @@ class Point:
 
     @cached_property
     def d(self) -> Vector:
-        """The direction (qd, 1) of x = (q, t)."""
+        """Direction (q̇, 1) in which x = (q, t) moves, (b, nq + 1)."""
         return np.concatenate([self.qd, np.ones((len(self.qd), 1))], axis=1)
 
     def unit(self, i: int, more: int) -> Vector:
-        """The unit row i of nq + more entries."""
+        """Return the unit vector along entry i as a matrix with one row, (1, nq + more)."""
         row = np.zeros((1, self.q.shape[1] + more))
         row[0, i] = 1
         return row
@@ -293,7 +299,10 @@ def _asin(x: Any) -> Three:
 
 
 def step_at(at_zero: float) -> Callable[[Any], Three]:
-    """Return the step function with this value at 0."""
+    """Return a function that computes value and two derivatives of the step function.
+
+    at_zero: value of the step function at 0, where its derivatives are nan.
+    """
     return lambda x: (np.heaviside(x, at_zero), _corner(x), _corner(x))
 
 

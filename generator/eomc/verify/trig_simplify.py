@@ -22,16 +22,20 @@ _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the gene
 
 
 def simplify_trig(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
-    """Return an equal form of `e` with few operations, by coefficients of the velocities.
+    """Return an expression equal to `e` with as few operations as found, or `e` itself.
 
-    Exact. Parts that are not polynomial stay unchanged.
+    rates: velocities; the coefficient of each product of them is shortened separately. Parts that
+    are not polynomial stay unchanged.
     """
     e = sympy.sympify(e)
     return min((e, simplify_by_rates(e, rates)), key=lambda form: form.count_ops())
 
 
 def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
-    """Return a sum of products of rates, each with the shortest coefficient found."""
+    """Return `e` as a sum of products of rates, each with the shortest coefficient found.
+
+    rates: velocities. If `e` is not polynomial in them, it is shortened as a whole.
+    """
     terms = coefficients(e, rates)
     if terms is None:
         return _coefficient(e)
@@ -39,7 +43,10 @@ def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
 
 
 def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
-    """Return pairs (product of rates, coefficient) whose sum is `e`; None if not polynomial."""
+    """Return pairs (product of rates, coefficient) whose sum of products is `e`.
+
+    rates: velocities. Coefficients are shortened. None if `e` is not polynomial in the rates.
+    """
     if not rates or not e.has(*rates):
         coefficient = _coefficient(e)
         return [(sympy.S.One, coefficient)] if coefficient != 0 else []
