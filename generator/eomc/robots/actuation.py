@@ -14,17 +14,20 @@ _MAX_TERMS = 50  # of one sum: each term nests the formula deeper, and the limit
 
 
 def law_names(drive: Drive) -> tuple[str, ...]:
-    """Return the suffixes of the names that a drive's law adds to its own name."""
+    """Return the suffixes of the names in the scene that belong to a drive with a control law.
+
+    Appended to the drive's name, they give its force and its gains kp and kv. Empty without a law.
+    """
     return ("_force", "_kp", "_kv") if drive.law else ()
 
 
 def inputs(robot: Robot) -> dict[str, str]:
-    """Return the entries of [inputs]."""
+    """Return the entries of the scene's table [inputs]: the TOML text of each drive, by name."""
     return {d.name: _input(d, robot) for d in robot.drives}
 
 
 def gains(robot: Robot) -> dict[str, str]:
-    """Return the gains of servos, as entries of [parameters]."""
+    """Return the gains kp and kv of servos as entries of the scene's table [parameters]."""
     units, entries = _units(robot), {}
     for d in robot.drives:
         if d.law:
@@ -38,7 +41,10 @@ def gains(robot: Robot) -> dict[str, str]:
 
 
 def definitions(robot: Robot) -> dict[str, str]:
-    """Return the lengths of tendons and the forces of servos, as entries of [definitions]."""
+    """Return entries of the scene's table [definitions]: the TOML text of each formula, by name.
+
+    The formulas are the lengths of tendons and the forces of servos.
+    """
     driven = {d.coordinate for d in robot.drives}
     acting = [t for t in robot.tendons if t.acts or t.name in driven]
     entries = {t.name: toml(less(total(t.terms), -t.offset)) for t in acting}
@@ -49,7 +55,10 @@ def definitions(robot: Robot) -> dict[str, str]:
 
 
 def energies(robot: Robot) -> dict[str, str]:
-    """Return the entries of [energy]: tendons, and the weight that is compensated (gravcomp)."""
+    """Return entries of the scene's table [energy]: the TOML text of each formula, by its key.
+
+    The energies are those of tendons, and of the weight that is compensated (gravcomp in MJCF).
+    """
     rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
     lifted = [b for b in robot.bodies if b.lifted and b.mass]
     weights = [
@@ -73,7 +82,10 @@ def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
 
 
 def force(coordinate: str, robot: Robot) -> str:
-    """Return the formula of the force along a coordinate, its `actuator`."""
+    """Return the formula of the force that drives exert along a coordinate (`actuator` in a scene).
+
+    It is "0" if no drive acts on the coordinate.
+    """
     terms = [
         (by * d.gear, f"{d.name}_force" if d.law else d.name)
         for d in robot.drives

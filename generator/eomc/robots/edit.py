@@ -30,9 +30,10 @@ _LIMITS = re.compile(r"limits of (\d+ )?joints?\b")  # in what readers leave out
 
 
 def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """Return the robot with joints fixed at `values`: coordinate -> value (rad or m).
+    """Return the robot with joints fixed at given positions.
 
-    Raises EomcError for unknown coordinates, and for those of a joint that has several.
+    `values` maps the name of a coordinate to its value (rad or m). Raises EomcError for unknown
+    coordinates, and for those of a joint that has several.
     """
     owners = {m.name: body for body in robot.bodies for m in body.motions}
     for name in values:
@@ -86,7 +87,10 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def with_joint_stops(robot: Robot) -> Robot:
-    """Return the robot with stops at its joint limits. Raises EomcError if no joint has limits."""
+    """Return the robot with stops (stiff springs) at its joint limits.
+
+    Raises EomcError if no joint has limits.
+    """
     stops = joint_stops(robot)
     if not stops:
         raise EomcError("--stops: no joint of this robot has limits")
@@ -103,11 +107,13 @@ def with_joint_stops(robot: Robot) -> Robot:
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
-    """Return the subtree of bodies from `root`, or the chain of bodies from `root` to `tip`.
+    """Return a part of the robot: the bodies carried by `root`, or the chain from `root` to `tip`.
 
-    The root is fixed to the world in its pose at the start values, so that the direction of gravity
-    relative to it is unchanged. Bodies fixed to a body of the chain are retained, except those
-    carried by the tip. Raises EomcError for unknown bodies, and if `tip` is not in the subtree.
+    Without `root`, the chain begins at the world. The root is fixed to the world in its pose at the
+    start, so that the direction of gravity relative to it is unchanged. Bodies fixed to a body of
+    the chain are retained, except those carried by the tip.
+
+    Raises EomcError for unknown bodies, and if `tip` is not carried by `root`.
     """
     by_name = {body.name: body for body in robot.bodies}
     for option, name in (("--root", root), ("--tip", tip)):
@@ -147,9 +153,9 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
 
 
 def with_nearest_inertias(robot: Robot) -> Robot:
-    """Return the robot with each inertia that no body can have replaced by the nearest valid one.
+    """Return the robot with each invalid inertia tensor replaced by the nearest valid one.
 
-    The replacements are reported.
+    A tensor is invalid if no body can have it. The replacements are noted in `left_out`.
     """
     bodies, words = [], []
     for body in robot.bodies:
@@ -166,10 +172,10 @@ def with_nearest_inertias(robot: Robot) -> Robot:
 
 
 def with_base(robot: Robot, free: bool) -> Robot:
-    """Return the robot with its root body free, or fixed to the world in its pose at the start.
+    """Return the robot with its root body free to move (`free`), or fixed to the world.
 
-    A free root starts in the pose in which it was fixed. Raises EomcError if several bodies are
-    attached to the world.
+    A root that becomes fixed keeps its pose at the start; one that becomes free starts in the pose
+    in which it was fixed. Raises EomcError if several bodies are attached to the world.
     """
     roots = [body for body in robot.bodies if body.parent == WORLD]
     if len(roots) != 1:

@@ -9,13 +9,16 @@ from eomc.robots.rotations import SNAP, Vector
 
 
 def number(x: float) -> str:
-    """The shortest text that reads back as x."""
+    """Return the shortest text that reads back as the number x."""
     short = repr(float(x)).removesuffix(".0")
     return "0" if short == "-0" else short
 
 
 def angle(x: float) -> str:
-    """An angle as a scene has it: 0.3, or "pi/2" in quotes within 1e-10 of multiples of pi/12."""
+    """Return an angle x (rad) as a scene writes it: 0.3, or "pi/2" in quotes.
+
+    Multiples of pi/12, to within 1e-10, are written with pi.
+    """
     twelfths = round(x * 12 / math.pi)
     if abs(x - twelfths * math.pi / 12) > SNAP or abs(twelfths) > 48:
         return _shortest(x)
@@ -37,21 +40,21 @@ def _shortest(x: float) -> str:
 
 
 def length(x: float, of: str) -> str:
-    """An angle, or a length, by its unit."""
+    """Return an angle (rad) or a length (m) as a scene writes it; `of` is "rad" or "m"."""
     return angle(x) if of == "rad" else number(x)
 
 
 def vector(v: Vector) -> str:
-    """A vector as TOML has it."""
+    """Return a vector as a TOML array."""
     return f"[{', '.join(map(number, v))}]"
 
 
 def total(terms: Sequence[tuple[float, str]]) -> str:
-    """The sum of terms, each with its factor."""
+    """Return the formula of a sum of terms (factor, name), such as "2*q1 - q2"."""
     shown = [{1.0: q, -1.0: f"-{q}"}.get(by, f"{number(by)}*{q}") for by, q in terms]
     return " + ".join(shown).replace("+ -", "- ") or "0"
 
 
 def less(text: str, x: float) -> str:
-    """The formula less a number."""
+    """Return the formula `text` minus the number x."""
     return f"{text} - {number(x)}".replace("- -", "+ ") if x else text

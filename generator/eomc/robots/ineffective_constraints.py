@@ -16,9 +16,9 @@ GAP_TOLERANCE = 1e-6  # m: a larger gap is reported
 
 
 def without_ineffective_constraints(robot: Robot) -> Robot:
-    """Return the robot without loops and couplings whose Jacobian is zero; they are reported.
+    """Return the robot without loops and couplings whose Jacobian is zero in all positions.
 
-    MuJoCo gives such an equality no rows.
+    They are noted in `left_out`. MuJoCo gives such a constraint no equations.
     """
     if not robot.loops and not robot.couplings:
         return robot

@@ -14,13 +14,16 @@ TRIANGLE = 1e-6  # relative excess of a principal moment over the other two that
 
 
 def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
-    """Return A I A^T, with entries that are only rounding error set to zero."""
+    """Return the inertia tensor A I A^T, in the frame to whose axes A transforms vectors.
+
+    Entries that are only rounding errors become zero.
+    """
     size = 1e-15 * max(map(abs, inertia))
     return six(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
 
 
 def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
-    """Return the principal moments in ascending order, and their axes."""
+    """Return the principal moments of inertia in ascending order (kg m^2), and their axes."""
     import numpy as np
 
     moments, axes = np.linalg.eigh(spatial.tensor(inertia))
@@ -28,7 +31,10 @@ def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
 
 
 def indefinite(inertia: Inertia) -> str:
-    """Return a message if a principal moment is negative, with the nearest valid tensor; or ""."""
+    """Return a message if a principal moment of inertia is negative, else "".
+
+    The message proposes the nearest valid tensor, if there is one.
+    """
     moments, _ = principal(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
         return ""
@@ -45,7 +51,7 @@ def indefinite(inertia: Inertia) -> str:
 
 
 def has_nearest(inertia: Inertia) -> bool:
-    """Return whether the nearest valid tensor differs from zero.
+    """Return True if the nearest valid tensor differs from zero.
 
     It is zero if one principal moment is negative and fewer than two are positive; the tensor in
     the file then has wrong signs.
@@ -56,7 +62,7 @@ def has_nearest(inertia: Inertia) -> bool:
 
 
 def unbalanced(inertia: Inertia) -> str:
-    """Return a message if a principal moment exceeds the sum of the other two; or ""."""
+    """Return a message if a principal moment of inertia exceeds the sum of the others, else ""."""
     (small, middle, large), _ = principal(inertia)
     if large <= (small + middle) * (1 + TRIANGLE):
         return ""
@@ -68,7 +74,7 @@ def unbalanced(inertia: Inertia) -> str:
 
 
 def nearest(inertia: Inertia) -> Inertia:
-    """Return the tensor of a physical body that is nearest in the Frobenius norm.
+    """Return the valid inertia tensor that is nearest to `inertia` in the Frobenius norm.
 
     It has the same principal axes. Its principal moments are I = (b + c, a + c, a + b), where
     a, b, c >= 0 are the second moments of mass along the axes: nonnegative least squares, solved
@@ -93,5 +99,5 @@ def nearest(inertia: Inertia) -> Inertia:
 
 
 def shown(inertia: Inertia) -> str:
-    """Return the six entries as text, for a message."""
+    """Return the six entries of an inertia tensor as text, for a message."""
     return f"[{', '.join(f'{x:.8g}' for x in inertia)}]"

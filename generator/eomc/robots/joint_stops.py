@@ -20,9 +20,19 @@ DAMPING = {"rad": 1.0, "m": 10.0}  # s/rad, s/m
 
 @dataclass(frozen=True)
 class Stop:
-    """The stop of a coordinate: its limits, and the force `effort` that penetrates by `depth`.
+    """The stop of a coordinate at its limits: a spring that acts beyond them, see the module.
 
-    known: whether the file gives that force, or it is estimated from weights.
+    Attributes
+    ----------
+    coordinate, unit : str
+        Name of the coordinate, and its unit "rad" or "m".
+    limits : (float, float)
+        Lowest and highest position.
+    effort : float
+        The force (N or N m) at which the penetration of the limit is the depth in `DEPTHS`.
+    known : bool
+        Whether the file gives the effort. Otherwise it is estimated from the weight that the joint
+        carries.
     """
 
     coordinate: str
@@ -33,7 +43,7 @@ class Stop:
 
 
 def joint_stops(robot: Robot) -> list[Stop]:
-    """Return the stops of all coordinates that have finite limits."""
+    """Return a stop for each coordinate that has finite limits."""
     loads: dict[str, tuple[float, float]] = {}  # by body: mass, and largest mass times distance
     holding_effort: dict[str, float] = {}  # by coordinate: against gravity, N or N m
     g = math.hypot(*robot.gravity)

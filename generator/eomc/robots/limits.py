@@ -16,7 +16,7 @@ _STOPS = "those of speed and effort are notes"  # a note of edit.with_joint_stop
 
 
 def input_range(force: Range, factor: float) -> Range:
-    """Return the limits of an input whose force is `factor` times its value."""
+    """Return the limits of an input for which the force `factor` times input stays in `force`."""
     if not factor:
         return UNLIMITED
     low, high = sorted(f / factor for f in force)
@@ -24,17 +24,17 @@ def input_range(force: Range, factor: float) -> Range:
 
 
 def intersection(one: Range, other: Range) -> Range | None:
-    """Return the intersection of two ranges; None if it is empty or a point."""
+    """Return the range common to two ranges; None if it is empty or a single point."""
     low, high = max(one[0], other[0]), min(one[1], other[1])
     return (low, high) if low < high else None
 
 
 def with_input_limits(robot: Robot) -> Robot:
-    """Return the robot with inputs limited by their drive and by the force limits of its joint.
+    """Return the robot with each input limited by the limits of its drive and of its joint's force.
 
     Servos limit their force instead of their input. The force limits of a joint that several
-    drives or tendons act on apply to the sum of their forces; they are reported and left out.
-    Raises EomcError if no input has limits.
+    drives or tendons act on apply to the sum of their forces; they are left out and noted in
+    `left_out`. Raises EomcError if no input has limits.
     """
     on = [q for d in robot.drives for _, q in robot.coordinate_terms(d.coordinate)]
     driven = {m.name: m.driven for m in robot.motions if m.driven != UNLIMITED}

@@ -13,8 +13,8 @@ from eomc.scene.assembly import WORLD
 def with_masses(robot: Robot, tip: str = "") -> Robot:
     """Return the robot with its moving masses as parameters, and a payload of 0 kg at its tips.
 
-    tip: the body that a payload is fixed to, where there is only one. Otherwise that is the last
-    body in each rigid group that moves and carries no further joint that moves.
+    With the name of a body as `tip`, only that body gets a payload. Otherwise each moving group of
+    rigidly connected bodies that carries no further joint gets one, on its outermost body.
     """
     group, _ = _groups(robot)
     bodies = [
@@ -58,7 +58,7 @@ def _tips(robot: Robot) -> list[str]:
 
 
 def parameters(robot: Robot) -> dict[str, str]:
-    """Return the entries of [parameters]."""
+    """Return the masses and payloads as entries of the scene's table [parameters], by name."""
     entries = {}
     for b in robot.bodies:
         if b.parameter:
@@ -68,7 +68,10 @@ def parameters(robot: Robot) -> dict[str, str]:
 
 
 def inertia_text(body: RobotBody) -> str:
-    """Return the tensor about the centre of mass; it scales with a mass that is a parameter."""
+    """Return the inertia tensor about the centre of mass as a TOML array.
+
+    If the mass is a parameter of the scene, the entries are formulas proportional to it.
+    """
     tensor_entries = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
     if not body.parameter:
         return f"[{', '.join(map(number, tensor_entries))}]"

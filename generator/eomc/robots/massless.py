@@ -9,7 +9,10 @@ from eomc.scene.joints import JOINTS
 
 
 def without_inertia(robot: Robot) -> list[str]:
-    """Return a message for each joint that moves no mass or inertia, and then a remedy."""
+    """Return a message for each joint that moves no mass or inertia, followed by a remedy.
+
+    Empty if there is none.
+    """
     faults: dict[str, str] = {}  # by coordinate
     locks: dict[str, str] = {}
     resisted: set[str] = set()

@@ -28,25 +28,44 @@ UNLIMITED: Range = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint moves by gear times a coordinate, plus shift (rad or m)."""
+    """The position of a joint that follows a coordinate: gear times it, plus shift (rad or m)."""
 
     coordinate: str
     gear: float = 1.0
     shift: float = 0.0
 
     def joint_position(self, value: float) -> float:
-        """Return the position of the joint at this value of the coordinate."""
+        """Return the position of the joint (rad or m) when the coordinate has the given value."""
         return self.gear * value + self.shift
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One degree of freedom of a joint, in `unit` "rad" or "m".
+    """One degree of freedom of a joint.
 
-    It is a coordinate of the scene unless it `mimics` another one. damping: N m s/rad or N s/m;
-    friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or N/m) and rest: of the joint's
-    own spring. friction_width: rad/s or m/s, 0 for the default. note: its limits, in words.
-    limits: range of positions. driven: range of driving forces, N m or N, infinite if not given.
+    It is a coordinate of the scene (TOML file) unless it mimics another one.
+
+    Attributes
+    ----------
+    name, unit : str
+        Name of the coordinate, and its unit "rad" or "m".
+    start : float
+        Initial value.
+    note : str
+        Its limits, in words.
+    damping : float
+        N m s/rad or N s/m.
+    friction, friction_width : float
+        Dry friction (N m or N), and the velocity (rad/s or m/s) within which it is smoothed; 0 for
+        the default.
+    armature : float
+        Inertia of the drive's rotor (kg m^2 or kg).
+    stiffness, rest : float
+        Of the joint's own spring: stiffness (N m/rad or N/m) and the position without force.
+    mimics : Mimic or None
+        The coordinate that it follows.
+    limits, driven : (float, float)
+        Range of positions, and range of driving forces (N m or N); infinite if not given.
     """
 
     name: str
@@ -66,15 +85,30 @@ class Motion:
 
 @dataclass(frozen=True)
 class RobotBody:
-    """A body and the joint that connects it to its parent; `assembly.Body` in numbers.
+    """A body, and the joint that connects it to its parent.
 
-    parent: a body above, or "world". joint: a key of joints.JOINTS, with a motion for each of
-    its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
-    frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
-    body's frame. inertia: kg m^2, of the centre of mass, along the body's axes. point: whether it
-    only marks a point of its parent. lifted: the share of its weight that is compensated
-    (gravcomp). rotor: the armature that is included in the diagonal of the inertia, kg m^2.
-    parameter: the name of its mass in the scene, or "" if that is a number.
+    Attributes
+    ----------
+    parent : str
+        Name of an earlier body, or "world".
+    joint : str
+        Kind of the joint, a key of joints.JOINTS.
+    motions, axes : tuple
+        For each coordinate of the joint, its motion; the unit axes in the joint's frame.
+    offset, rotation
+        The joint's frame in the parent's frame: v_parent = offset + rotation v_joint, with the
+        offset in m.
+    mass, center, inertia
+        Mass (kg), centre of mass in the body's frame (m), and inertia about the centre of mass,
+        along the body's axes (kg m^2).
+    point : bool
+        Whether the body only marks a point of its parent.
+    lifted : float
+        The share of its weight that is compensated (gravcomp in MJCF).
+    rotor : float
+        The armature that is included in the diagonal of the inertia (kg m^2).
+    parameter : str
+        The name of its mass in the scene, or "" if the mass is a number.
     """
 
     name: str
@@ -96,10 +130,14 @@ class RobotBody:
 
 @dataclass(frozen=True)
 class Law:
-    """The affine law of an actuator: force = gain(l, v) * input + bias(l, v).
+    """The affine control law of an actuator: force = gain(l, v) * input + bias(l, v).
 
-    gain, bias: coefficients of 1, of the length l and of the velocity v. force: range to which the
-    force is clamped.
+    Attributes
+    ----------
+    gain, bias : Vector
+        Coefficients of 1, of the length l and of the velocity v.
+    force : (float, float)
+        The range to which the force is clamped.
     """
 
     gain: Vector
@@ -108,17 +146,20 @@ class Law:
 
     @property
     def kp(self) -> float:
-        """Stiffness: position gain."""
+        """Stiffness (position gain): minus the coefficient of the length in the bias."""
         return -self.bias[1]
 
     @property
     def kv(self) -> float:
-        """Damping: velocity gain."""
+        """Damping (velocity gain): minus the coefficient of the velocity in the bias."""
         return -self.bias[2]
 
     @property
     def set_point(self) -> str:
-        """Gain whose set point is the input: "kp" for a position, "kv" for a velocity, or ""."""
+        """The quantity that the input is the set point of: "kp" for position, "kv" for velocity.
+
+        It is "" if the input is no set point.
+        """
         gain, *more = self.gain
         if not gain or any(more):
             return ""
@@ -132,11 +173,21 @@ class Law:
 
 @dataclass(frozen=True)
 class Drive:
-    """An input that exerts the force gear * input along a coordinate or a tendon.
+    """An input of the scene that exerts the force gear * input along a coordinate or a tendon.
 
-    law: the actuator's law, if it has one. Its length is then gear times the coordinate, and the
-    force along the coordinate is gear times that of the law. limits: of the input, in its own
-    unit, before the gear. start: initial value of the input.
+    Attributes
+    ----------
+    coordinate : str
+        Name of the coordinate or the tendon.
+    gear : float
+        Factor from the input to the force.
+    limits : (float, float)
+        Limits of the input in its own unit, before the gear.
+    law : Law or None
+        The actuator's control law. Its length is then gear times the coordinate, and the force
+        along the coordinate is gear times that of the law.
+    start : float
+        Initial value of the input.
     """
 
     name: str
@@ -149,21 +200,29 @@ class Drive:
 
     @property
     def ends(self) -> Range:
-        """Range of its force, before the gear."""
+        """The range of the drive's force, before the gear."""
         return self.law.force if self.law else self.limits
 
     @property
     def max_force(self) -> float:
-        """Largest magnitude of the force along the coordinate, infinite if it is not limited."""
+        """The largest magnitude of the force along the coordinate (N or N m); inf if unlimited."""
         return abs(self.gear) * max(map(abs, self.ends)) if self.gear else 0.0
 
 
 @dataclass(frozen=True)
 class Tendon:
-    """A fixed tendon, whose length is a linear combination of coordinates plus `offset`.
+    """A fixed tendon, whose length is a linear combination of coordinates plus an offset.
 
-    stiffness, damping, armature: along it. rest: the range of lengths in which its spring is slack.
-    offset: contribution of locked joints to the length.
+    Attributes
+    ----------
+    terms : tuple of (float, str)
+        The factor of each coordinate.
+    offset : float
+        The contribution of locked joints to the length (m).
+    stiffness, damping, armature : float
+        Along the tendon.
+    rest : (float, float)
+        The range of lengths in which its spring is slack.
     """
 
     name: str
@@ -176,15 +235,24 @@ class Tendon:
 
     @property
     def acts(self) -> bool:
-        """Whether it has stiffness, damping or armature, with or without a drive."""
+        """Whether the tendon has stiffness, damping or armature, with or without a drive."""
         return bool(self.stiffness or self.damping or self.armature)
 
 
 @dataclass(frozen=True)
 class RobotLoop:
-    """A joint, "spherical" or "weld", that closes a loop between two bodies or with the world.
+    """A joint that closes a kinematic loop between two bodies, or between a body and the world.
 
-    points: its position in each body's frame, m. rotation: of the second frame in the first.
+    Attributes
+    ----------
+    joint : str
+        "spherical" or "weld".
+    bodies : (str, str)
+        The two bodies, or "world".
+    points : (Vector, Vector)
+        The joint's position in each body's frame (m).
+    rotation : Matrix
+        Of the second frame in the first one when the loop is closed.
     """
 
     name: str
@@ -198,7 +266,16 @@ class RobotLoop:
 class Coupling:
     """A holonomic constraint between coordinates: first - zero = sum a_k (second - at)^k.
 
-    first, second: linear combinations of coordinates. polynomial: a_0 to a_4. unit: of both sides.
+    Attributes
+    ----------
+    first, second : tuple of (float, str)
+        Linear combinations of coordinates, as the factor of each.
+    zero, at : float
+        Offsets of the two.
+    polynomial : (float, ...)
+        Coefficients a_0 to a_4.
+    unit : str
+        Unit of both sides.
     """
 
     name: str
@@ -211,17 +288,20 @@ class Coupling:
 
     @property
     def coordinates(self) -> set[str]:
-        """Names of the coordinates that occur in it."""
+        """The names of the coordinates that occur in the constraint."""
         return {q for _, q in (*self.first, *self.second)}
 
     def excess(self, values: Mapping[str, float]) -> float:
-        """Return the residual: the left side less the right side."""
+        """Return the residual: the left side minus the right side, at the given coordinates."""
         first, second = (sum(by * values[q] for by, q in s) for s in (self.first, self.second))
         right = sum(a * (second - self.at) ** k for k, a in enumerate(self.polynomial))
         return first - self.zero - right
 
     def root(self, near: float) -> float | None:
-        """Return the value of its only coordinate that is closest to `near`; None for none."""
+        """Return the value of the only coordinate that satisfies the constraint, closest to `near`.
+
+        None if there is none.
+        """
         from numpy.polynomial import Polynomial
 
         one, other = (sum(by for by, _ in side) for side in (self.first, self.second))
@@ -233,11 +313,20 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of bodies, parents first, with drives, tendons and constraints; gravity in m/s^2.
+    """A robot as its file describes it, before it becomes a scene: a tree of bodies.
 
-    stopped: whether joint limits become stops. limited: whether limits of drives become limits of
-    inputs. method: of integration, "" for the default. left_out: notes on parts of the file that
-    are not modelled.
+    Attributes
+    ----------
+    bodies : tuple of RobotBody
+        Parents before children.
+    gravity : Vector
+        m/s^2.
+    stopped, limited : bool
+        Whether joint limits become stops, and limits of drives become limits of inputs.
+    method : str
+        Method of integration; "" for the default.
+    left_out : tuple of str
+        Notes on parts of the file that are not modelled.
     """
 
     name: str
@@ -255,11 +344,11 @@ class Robot:
 
     @property
     def motions(self) -> tuple[Motion, ...]:
-        """The coordinates, in the order of the bodies."""
+        """The coordinates of the robot, in the order of the bodies."""
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
     def coordinate_terms(self, name: str) -> Terms:
-        """Return a coordinate or a tendon as a linear combination of coordinates."""
+        """Return the pairs (factor, coordinate) whose sum is a coordinate or a tendon's length."""
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
@@ -272,7 +361,10 @@ def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
 
 
 def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
-    """Return the pose of a body in its parent, offset (m) and rotation, at joint `values`."""
+    """Return the pose of a body in its parent's frame, offset (m) and rotation, at joint positions.
+
+    `values` contains the position of each coordinate of its joint (rad or m).
+    """
     offset, rotation = body.offset, body.rotation
     joint = JOINTS[body.joint]
     for kind, axis, value in zip(joint.motions, joint.motion_axes(body.axes), values, strict=True):
@@ -284,7 +376,7 @@ def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]
 
 
 def fix_body(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
-    """Return the body with a fixed joint in this pose."""
+    """Return the body with a fixed joint in the given pose, offset (m) and rotation."""
     return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
 
 
@@ -293,7 +385,8 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
 
     Joints that mimic a fixed coordinate are fixed as well, and so is a coordinate that a coupling
     determines from fixed ones. In tendons and couplings fixed coordinates become constants. Drives,
-    tendons and constraints that refer to a removed coordinate or body are left out and reported.
+    tendons and constraints that refer to a removed coordinate or body are left out and noted in
+    `left_out`.
     """
     values, coupled = _propagate_couplings(robot, frozen or {})
     free = {m.name for m in robot.motions} - values.keys()
@@ -392,7 +485,10 @@ def _reduced(c: Coupling, values: Mapping[str, float]) -> Coupling:
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:
-    """Return the six coordinates of a free body; a non-empty `of` is appended to their names."""
+    """Return the six coordinates of a free body: x, y, z (m), yaw, pitch, roll (rad).
+
+    A non-empty `of` is appended to their names.
+    """
     end = f"_{of}" if of else ""
     slides = (Motion(f"{name}{end}", "m") for name in "xyz")
     turns = (
@@ -404,11 +500,14 @@ def free_motions(of: str = "") -> tuple[Motion, ...]:
 
 
 def without_dust(body: RobotBody) -> Inertia:
-    """Return the inertia, or zero if it is rounding error: radii of gyration below 0.1 um."""
+    """Return a body's inertia, or zero if it is a rounding error.
+
+    It is one if the radii of gyration are below 0.1 um.
+    """
     dust = max(map(abs, body.inertia)) <= 1e-14 * body.mass
     return NO_INERTIA if dust else body.inertia
 
 
 def joined(*notes: str) -> str:
-    """Join non-empty notes by semicolons."""
+    """Return the non-empty notes joined by semicolons."""
     return "; ".join(note for note in notes if note)

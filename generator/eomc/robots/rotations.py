@@ -18,7 +18,10 @@ SNAP = 1e-10  # rad: files write pi/2 with eleven digits and mean it
 
 
 def cleaned(a: Matrix) -> Matrix:
-    """A rotation with entries within 1e-12 of 0, 1 and -1 put there: cos(pi/2) is 6e-17."""
+    """Return a rotation matrix with entries within 1e-12 of 0, 1 and -1 rounded to these.
+
+    For example, cos(pi/2) is 6e-17 in floating point.
+    """
 
     def clean(x: float) -> float:
         near = float(round(x))
@@ -28,12 +31,12 @@ def cleaned(a: Matrix) -> Matrix:
 
 
 def times(a: Matrix, b: Matrix) -> Matrix:
-    """A B, of rotations; cleaned."""
+    """Return the product A B of two rotation matrices, cleaned."""
     return cleaned(product(a, b))
 
 
 def unit(v: Vector) -> Vector:
-    """v/|v|; ValueError where |v| is zero or not finite."""
+    """Return v/|v|. Raises ValueError if |v| is zero or not finite."""
     size = math.hypot(*v)
     if not size or not math.isfinite(size):
         raise ValueError("a vector of length zero" if not size else "a vector that is not finite")
@@ -44,17 +47,23 @@ def unit(v: Vector) -> Vector:
 
 
 def from_axis_angle(axis: Vector, angle: float) -> Matrix:
-    """The rotation by `angle` (rad) about `axis`, of any length but zero (Rodrigues)."""
+    """Return the matrix of the rotation by `angle` (rad) about `axis`.
+
+    The axis may have any nonzero length.
+    """
     return cleaned(about(unit(axis), math.cos(angle), math.sin(angle)))
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
-    """Rz(yaw) Ry(pitch) Rx(roll), as URDF writes it."""
+    """Return the rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of angles in rad, as in URDF."""
     return from_euler("zyx", (yaw, pitch, roll))
 
 
 def from_quaternion(w: float, x: float, y: float, z: float) -> Matrix:
-    """The rotation of a quaternion, of any length but zero."""
+    """Return the rotation matrix of a quaternion of any nonzero length.
+
+    Raises ValueError if its length is zero or not finite.
+    """
     size = math.hypot(w, x, y, z)
     if not size or not math.isfinite(size):
         raise ValueError("a quaternion of length zero")
@@ -69,7 +78,11 @@ def from_quaternion(w: float, x: float, y: float, z: float) -> Matrix:
 
 
 def from_euler(sequence: str, angles: Sequence[float]) -> Matrix:
-    """Turns about the axes of `sequence`: small letters turn with the frame, capitals do not."""
+    """Return the rotation matrix of successive rotations about coordinate axes.
+
+    `sequence` names the axes, and `angles` are in rad. Lowercase letters are axes of the rotating
+    frame, uppercase ones are fixed axes.
+    """
     out = IDENTITY
     for axis, angle in zip(sequence, angles, strict=True):
         turn = from_axis_angle(IDENTITY["xyz".index(axis.lower())], angle)
@@ -78,17 +91,21 @@ def from_euler(sequence: str, angles: Sequence[float]) -> Matrix:
 
 
 def toward(z: Vector) -> Matrix:
-    """The smallest rotation that takes the z axis to the unit vector `z`; half a turn about x."""
+    """Return the smallest rotation that takes the z axis to the unit vector `z`.
+
+    For the opposite direction it is half a turn about x.
+    """
     sine = math.hypot(z[0], z[1])
     axis = (-z[1], z[0], 0.0) if sine > 1e-10 else (1.0, 0.0, 0.0)
     return from_axis_angle(axis, math.atan2(sine, z[2]))
 
 
 def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
-    """The turns about z, y and x that make the rotation `a`, those by zero left out.
+    """Return the rotations about z, y and x that make up the rotation matrix `a`, as (axis, angle).
 
-    Near a pitch of pi/2 only the sum of the other two is well known: what rounding does to the
-    first is undone by taking the last from what the first leaves.
+    Zero rotations are left out. Near a pitch of pi/2 only the sum of the other two angles is well
+    determined: the last one is computed from the rotation that remains after the first, which
+    compensates the first one's rounding error.
     """
     yaw = math.atan2(a[1][0], a[0][0]) if math.hypot(a[0][0], a[1][0]) > 1e-12 else 0.0
     rest = times(transposed(from_axis_angle((0.0, 0.0, 1.0), yaw)), a)
@@ -102,7 +119,7 @@ def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
 
 
 def yaw_pitch_roll(a: Matrix) -> Vector:
-    """The angles (rad) with a = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return the angles (rad) with a = Rz(yaw) Ry(pitch) Rx(roll).
 
     Where they are singular, at a pitch of a quarter turn, the roll is 0.
     """

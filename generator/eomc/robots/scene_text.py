@@ -40,8 +40,10 @@ _NAME = 32  # characters of a name, to leave room for suffixes such as "_torque"
 def prepared_for_scene(robot: Robot) -> Robot:
     """Return the robot with names that are valid in a scene and with massless frames as points.
 
-    Raises EomcError if no joint moves, if a joint moves no mass or inertia, or if a tensor is not
-    positive semi-definite. Tensors that violate the triangle inequality are reported.
+    Constraints without effect are removed, and adaptive steps are selected if forces are stiff.
+    Raises EomcError if no joint moves, if a joint moves no mass or inertia, or if an inertia tensor
+    is not positive semi-definite. Tensors that violate the triangle inequality are noted in
+    `left_out`.
     """
     robot = without_ineffective_constraints(robot)
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
@@ -187,7 +189,7 @@ def _renamed(old: str, new: str, note: str) -> str:
 
 
 def scene_text(robot: Robot) -> str:
-    """Return the scene of a robot as TOML, without keys that have their default values.
+    """Return the scene of a robot as TOML text, without keys that have their default values.
 
     Numbers are written exactly, except angles within 1e-10 of a multiple of pi/12: these are
     written as multiples of pi, so that their sines are exact.

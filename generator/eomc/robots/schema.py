@@ -24,9 +24,16 @@ MAX_ENTRIES = 40  # in one line of a report, so that a hostile file prints no bo
 
 @dataclass(frozen=True)
 class Element:
-    """The attributes and child elements that an element may have. skipped: not looked into.
+    """The attributes and child elements that an element of a robot file may have.
 
-    is_open: any child elements may stand in it; they are not looked into.
+    Attributes
+    ----------
+    attributes, children
+        Names of the attributes; child elements by name.
+    skipped : bool
+        Whether the contents of the element are not checked.
+    is_open : bool
+        Whether any child elements may occur in it, which are not checked.
     """
 
     attributes: frozenset[str] = frozenset()
@@ -36,7 +43,10 @@ class Element:
 
 
 def parse(outline: str, groups: Mapping[str, str]) -> Element:
-    """Return the root element of an outline."""
+    """Return the root element described by an outline, see the module.
+
+    `groups` maps a group's name to the attributes that several elements share.
+    """
     top = Element()
     stack = [top]
     for line in outline.strip().splitlines():
@@ -53,9 +63,10 @@ def parse(outline: str, groups: Mapping[str, str]) -> Element:
 
 
 def unknown_parts(root: Tag, element: Element, of: str) -> tuple[str, ...]:
-    """Return in words the elements, attributes and texts of a file that its format does not have.
+    """Return, in words, the elements, attributes and texts of a file that its format does not have.
 
-    of: what the format is called. Elements that it does not have are not looked into.
+    `of` is the name of the format, such as "URDF". The contents of unknown elements are not
+    checked.
     """
     unknown: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
 

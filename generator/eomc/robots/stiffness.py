@@ -34,7 +34,19 @@ FRICTION_DECAY_LIMIT = 1e6
 
 @dataclass(frozen=True)
 class Element:
-    """A damper (N s/m or N m s/rad) and a spring (N/m or N m/rad) that act along J q."""
+    """A damper and a spring that act along the linear combination J q of the coordinates.
+
+    Attributes
+    ----------
+    name : str
+        Description of the damper or spring.
+    J : (n,)
+        The coefficients of the coordinates.
+    damping : float
+        N s/m or N m s/rad.
+    stiffness : float
+        N/m or N m/rad.
+    """
 
     name: str
     J: Array
@@ -42,17 +54,20 @@ class Element:
     stiffness: float = 0.0
 
     def is_stiff(self, inverse: Array) -> bool:
-        """Return whether it alone makes the default steps unstable; `inverse` is that of M."""
+        """Return True if the element alone makes a scene's default steps unstable.
+
+        `inverse` is the inverse of the mass matrix.
+        """
         mobility = float(self.J @ inverse @ self.J)
         oscillation = math.sqrt(self.stiffness * mobility)
         return self.damping * mobility > DECAY_LIMIT or oscillation > OSCILLATION_LIMIT
 
 
 def with_stable_steps(robot: Robot) -> Robot:
-    """Return the robot with adaptive steps where the default steps are unstable at the start.
+    """Return the robot with adaptive steps if the default steps are unstable at the start.
 
-    Friction that is too stiff for adaptive steps too has a wider range of velocities in which it is
-    smoothed. Both are reported.
+    Friction that is too stiff for adaptive steps too is smoothed over a wider range of velocities.
+    Both are noted in `left_out`.
     """
     if robot.method or not robot.motions:
         return robot
@@ -169,10 +184,16 @@ def _of_sum(terms: Terms | Sequence[tuple[float, str]], rows: Sequence[str]) -> 
 
 @dataclass(frozen=True)
 class Rigid:
-    """A body's frame in the world at the start, and how the motions above it move it.
+    """A body's frame in the world at the start, and how the coordinates above it move it.
 
-    columns: of each motion the row of its coordinate, its angular velocity, and the velocity of a
-    point of the world that it carries along.
+    Attributes
+    ----------
+    place, turn
+        Origin of the frame in the world (m), and rotation matrix from the body to the world.
+    columns : tuple
+        For each joint motion on the path from the world to the body: the row of its coordinate, the
+        angular velocity for a unit rate of the coordinate, and a function that returns the velocity
+        of a point of the body at a given place in the world.
     """
 
     place: Vector
@@ -180,11 +201,15 @@ class Rigid:
     columns: tuple[tuple[int, Vector, Callable[[Vector], Vector]], ...] = ()
 
     def point(self, at: Vector) -> Vector:
-        """Return a point of the body in the world."""
+        """Return the position in the world of a point `at` given in the body's frame (m)."""
         return plus(self.place, apply(self.turn, at))
 
     def jacobians(self, at: Vector, n: int) -> tuple[Array, Array]:
-        """Return the Jacobians (3, n) of the velocity at a point of the world, and of turning."""
+        """Return the Jacobians (3, n) of a point's velocity and of the body's angular velocity.
+
+        The point belongs to the body and is at the place `at` in the world. `n` is the number of
+        coordinates.
+        """
         moves, turns = np.zeros((2, 3, n))
         for row, turn, velocity in self.columns:
             moves[:, row] += velocity(at)
@@ -193,7 +218,10 @@ class Rigid:
 
 
 def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, Rigid]:
-    """Return each body at the start by its name, and the world."""
+    """Return the position and the motions of each body at the start, by name, and of the world.
+
+    `rows` are the names of the coordinates, in the order of the columns of Jacobians.
+    """
     rigid = {WORLD: Rigid(ORIGIN, IDENTITY)}
     for body in bodies:
         parent = rigid[body.parent]
@@ -223,7 +251,10 @@ def _sliding(velocity: Vector) -> Callable[[Vector], Vector]:
 
 
 def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
-    """Return M at the start, armatures included; `rows` are its coordinates."""
+    """Return the mass matrix (n, n) at the start, including armatures.
+
+    `rows` are the names of the n coordinates.
+    """
     M = np.zeros((len(rows), len(rows)))
     rigid = rigid_bodies(robot.bodies, rows)
     for body in robot.bodies:
@@ -241,7 +272,10 @@ def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
 
 
 def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
-    """Return an orthonormal basis of the velocities that loops and couplings allow, (n, k)."""
+    """Return an orthonormal basis (n, k) of the velocities that loops and couplings allow.
+
+    `rows` are the names of the n coordinates.
+    """
     starts = {m.name: m.start for m in robot.motions}
     if not robot.loops and not robot.couplings:
         return np.eye(len(rows))
@@ -253,14 +287,21 @@ def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
 
 
 def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
-    """Return the gradient of a coupling at the start."""
+    """Return the gradient (n,) of a coupling's residual at the positions `starts`.
+
+    `rows` are the names of the n coordinates.
+    """
     x = sum(by * starts[q] for by, q in c.second) - c.at
     slope = sum(k * a * x ** (k - 1) for k, a in enumerate(c.polynomial) if k)
     return _of_sum(c.first, rows) - slope * _of_sum(c.second, rows)
 
 
 def loop_jacobian(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
-    """Return the Jacobian of a loop's rows: of the difference of two velocities, of turning too."""
+    """Return the Jacobian of a loop's constraint equations, (3, n), or (6, n) for a weld.
+
+    The rows are the relative velocity of the two points of the loop, for a weld followed by the
+    relative angular velocity of its bodies. `rows` are the names of the n coordinates.
+    """
     ends = zip((rigid[name] for name in loop.bodies), loop.points, strict=True)
     pairs = [body.jacobians(body.point(at), len(rows)) for body, at in ends]
     moves, turns = (one - other for one, other in zip(*pairs, strict=True))

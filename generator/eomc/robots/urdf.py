@@ -75,7 +75,7 @@ _SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")
 
 
 def read(file: str | os.PathLike[str]) -> Robot:
-    """Read the robot of a URDF file, with its root link fixed to the world.
+    """Return the robot described by a URDF file, with its root link fixed to the world.
 
     Raises SceneError with all faults of the robot, EomcError if the file is not a URDF.
     """

@@ -22,9 +22,20 @@ LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they 
 
 @dataclass(frozen=True, eq=False)
 class Tag:
-    """An element of the file, with its line, attributes and children.
+    """An element of an XML file.
 
-    text: the non-blank text between its tags.
+    Attributes
+    ----------
+    kind : str
+        Name of the element.
+    attributes : dict
+        Attributes by name.
+    line, file
+        Where the element begins.
+    children : list of Tag
+        Child elements.
+    text : list of str
+        The non-blank pieces of text between the element's tags.
     """
 
     kind: str
@@ -35,19 +46,19 @@ class Tag:
     text: list[str] = field(default_factory=list)
 
     def get(self, key: str, default: str = "") -> str:
-        """Return the text of an attribute."""
+        """Return the text of an attribute, or `default` if it is missing."""
         return self.attributes.get(key, default)
 
     def each(self, kind: str) -> Iterator[Tag]:
-        """Return the children of a kind."""
+        """Return an iterator over the child elements with the name `kind`."""
         return (child for child in self.children if child.kind == kind)
 
     def first(self, kind: str) -> Tag | None:
-        """Return the first child of a kind, or None."""
+        """Return the first child element with the name `kind`, or None."""
         return next(self.each(kind), None)
 
     def all(self) -> Iterator[Tag]:
-        """Yield this tag and all of its descendants, in the file's order."""
+        """Yield this element and all of its descendants, in the order of the file."""
         waiting = [self]
         while waiting:
             yield (tag := waiting.pop())
@@ -94,7 +105,11 @@ class _Builder:
 
 
 def root(file: str | os.PathLike[str]) -> Tag:
-    """Return the root element of an XML file. Raises EomcError with the fault and a remedy."""
+    """Return the root element of an XML file.
+
+    Entities are not expanded. Raises EomcError with the fault and a remedy if the file is not valid
+    XML or cannot be read.
+    """
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import DefusedXMLParser
 
@@ -126,7 +141,11 @@ def root(file: str | os.PathLike[str]) -> Tag:
 
 
 def number(word: str) -> float:
-    """Convert a word to a number. Raises ValueError, also for Python's own syntax such as 1_0."""
+    """Return the number that a word of a file stands for.
+
+    Raises ValueError if it is not a finite number, also for Python's own syntax such as 1_0, and if
+    it is too large. Numbers that are too small become zero.
+    """
     try:
         value = float("x" if "_" in word or not word.isascii() else word)
     except ValueError:

@@ -29,9 +29,16 @@ Loaded = TypeVar("Loaded", Motion, Tendon)
 
 
 class Actuator(NamedTuple):
-    """An actuator of the file. drive: None if it is left out. dynamics: its dyntype.
+    """An actuator of an MJCF file.
 
-    lawful: whether its control, or activation, is the drive's input, and not its force.
+    Attributes
+    ----------
+    drive : Drive or None
+        The input of the scene; None if the actuator is left out.
+    dynamics : str
+        The dynamics between control and activation (dyntype in MJCF).
+    lawful : bool
+        Whether the input of the scene is the actuator's control or activation, and not its force.
     """
 
     drive: Drive | None
@@ -43,9 +50,9 @@ def read_actuators(
     root: Tag, bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Tendons,
     reader: Reader,
 ) -> tuple[list[MjcfJoint], list[Actuator]]:  # fmt: skip
-    """Return the joints with their actuators' armature and damping, and the actuators.
+    """Return the joints with the armature and damping of their actuators, and the actuators.
 
-    Tendons are changed in place. bodies: with masses, in the pose of the file.
+    Tendons are changed in place. `bodies` are in the pose of the file, and have masses.
     """
     by_name = {joint.name: joint for joint in joints}
     tags = [tag for section in root.each("actuator") for tag in section.children]
@@ -222,7 +229,11 @@ def _range_note(report: Report, name: str, own: Range, control: Range, force: Ra
 def with_key_frame_start(
     root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: Report
 ) -> tuple[list[MjcfJoint], tuple[Drive, ...]]:
-    """Return joints and drives that start at the key frame "home"; report singular angles."""
+    """Return the joints and drives with the initial values of the key frame "home".
+
+    Joints whose yaw, pitch and roll are singular at the start, at a pitch of a quarter turn, are
+    reported.
+    """
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
         a = AttributeReader(tag.attributes, tag, report)

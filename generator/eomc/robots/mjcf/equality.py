@@ -67,7 +67,11 @@ def read_equalities(
     anchors: Mapping[str, Vector],
     reader: Reader,
 ) -> tuple[tuple[RobotLoop, ...], tuple[Coupling, ...]]:
-    """Return the loops and couplings of a file; bodies and joints are in the pose of the file."""
+    """Return the loops and couplings that the equality constraints of a file define.
+
+    Bodies and joints are in the pose of the file. `anchors` maps each body to the origin of its
+    frame in the scene, in the body's frame in the file (m).
+    """
     poses = {WORLD: IDENTITY_POSE}
     for body in bodies:
         offset, turn = body_pose(body, [m.start for m in body.motions])

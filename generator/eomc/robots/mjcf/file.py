@@ -54,9 +54,16 @@ Classes = dict[str, dict[str, Attributes]]
 
 @dataclass
 class Report:
-    """Results of reading: faults, and names of the parts that are left out, by kind.
+    """What reading a file yields besides the robot.
 
-    strangers: notes on elements and attributes that MJCF does not define.
+    Attributes
+    ----------
+    faults : list of Problem
+        Errors, all of which are reported together.
+    strangers : tuple of str
+        Notes on elements and attributes that MJCF does not define.
+    left : dict
+        Names of the parts that are not modelled, by kind.
     """
 
     faults: list[Problem] = field(default_factory=list)
@@ -64,11 +71,11 @@ class Report:
     left: dict[str, list[str]] = field(default_factory=dict)
 
     def leave(self, kind: str, name: str = "") -> None:
-        """Record that the part `name` of this kind is left out."""
+        """Record that the part `name` of a kind is left out of the model."""
         self.left.setdefault(kind, []).append(name)
 
     def read(self, kind: str, name: str) -> None:
-        """Remove the record that a part is left out."""
+        """Remove the record that the part `name` of a kind is left out."""
         those = self.left.get(kind, [])
         if name in those:
             those.remove(name)
@@ -76,7 +83,7 @@ class Report:
                 del self.left[kind]
 
     def lines(self) -> tuple[str, ...]:
-        """Return one note for each kind that is left out; a name counts once."""
+        """Return one note for each kind of part that is left out; a name counts once."""
         lines = [*self.strangers]
         for kind, those in self.left.items():
             names = [*dict.fromkeys(name for name in those if name)]
@@ -91,7 +98,7 @@ class Report:
 
 @dataclass(frozen=True)
 class AttributeReader:
-    """Typed access to the attributes of a tag, its own or inherited; faults are reported."""
+    """Typed access to the attributes of an element, its own or inherited; faults are reported."""
 
     attributes: Attributes
     tag: Tag
@@ -101,18 +108,18 @@ class AttributeReader:
         return key in self.attributes
 
     def get(self, key: str, default: str = "") -> str:
-        """Return the text of an attribute."""
+        """Return the text of an attribute, or `default` if it is missing."""
         return self.attributes.get(key, default)
 
     def fault(self, message: str) -> None:
-        """Report a fault with its line; reading continues, to report all faults."""
+        """Report a fault at the line of the element. Reading continues, to report all faults."""
         tag = self.tag
         self.report.faults.append(Problem(message, element_label(tag), str(tag.file), tag.line))
 
     def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
-        """Return the numbers of an attribute, between `least` (default: `most`) and `most` of them.
+        """Return the numbers in an attribute; None if it is missing or faulty.
 
-        Returns None if the attribute is missing or faulty.
+        There must be at most `most` and at least `least` numbers (default: `most`).
         """
         text = self.attributes.get(key)
         if text is None:
@@ -130,17 +137,20 @@ class AttributeReader:
         return values
 
     def vector(self, key: str) -> Vector | None:
-        """Return three numbers, or None as in `numbers`."""
+        """Return the three numbers of an attribute; None if it is missing or faulty."""
         values = self.numbers(key, 3)
         return (values[0], values[1], values[2]) if values else None
 
     def number(self, key: str, default: float = 0.0) -> float:
-        """Return one number, or the default."""
+        """Return the number in an attribute, or `default` if it is missing or faulty."""
         values = self.numbers(key, 1)
         return values[0] if values else default
 
     def choice(self, key: str, choices: Sequence[str], default: str = "") -> str:
-        """Return a word out of `choices`; the default is the first of them."""
+        """Return the word in an attribute, which must be one of `choices`.
+
+        It is `default` if the attribute is missing or faulty; the first choice by default.
+        """
         default = default or choices[0]
         word = self.get(key, default)
         if word in choices:
@@ -149,7 +159,7 @@ class AttributeReader:
         return default
 
     def is_true(self, key: str, default: bool = False) -> bool:
-        """Return whether the attribute is "true"."""
+        """Return True if the attribute is "true"; `default` if it is missing or faulty."""
         return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
 
 
@@ -170,7 +180,7 @@ EFFECTS = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of <compiler> and <option> that affect masses and motion."""
+    """Settings of <compiler> and <option> in an MJCF file that affect masses and motion."""
 
     degrees: bool = True
     eulerseq: str = "xyz"
@@ -187,7 +197,7 @@ class Settings:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def angle(self, value: float) -> float:
-        """Return an angle of the file in rad."""
+        """Return an angle given in the file's unit (degrees or radians) in rad."""
         return math.radians(value) if self.degrees else value
 
 
@@ -195,10 +205,10 @@ class Settings:
 
 
 def load(path: Path, include: bool, report: Report) -> Tag:
-    """Read the file as a tree of tags, with each <include> replaced by the included elements.
+    """Return the root element of a file, with each <include> replaced by the included elements.
 
-    Raises SceneError at once if a file can't be included, since elements that refer to its contents
-    would be reported as faults too.
+    `include` says whether included files may be opened. Raises SceneError at once if a file cannot
+    be included, since elements that refer to its contents would be reported as faults too.
     """
     root = xml.root(path)
     folder = path.resolve().parent
@@ -249,18 +259,21 @@ def _included(
 
 
 def element_label(tag: Tag) -> str:
-    """Return the label of a tag in error messages."""
+    """Return the label of an element in error messages: its kind and its name."""
     name = tag.get("name")
     return f'{tag.kind} "{name}"' if name else tag.kind
 
 
 def missing(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return a message that nothing of this kind has the name, with a similar known name."""
+    """Return the message that nothing of this kind has the name, with a similar name of `known`."""
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
 def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
-    """Report attributes in `UNREAD` that change the motion in MuJoCo and are not read."""
+    """Report the attributes of an element that change the motion in MuJoCo but are not read.
+
+    They are listed in `UNREAD` for its `kind`.
+    """
     for key, what in UNREAD[kind].items():
         if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):
             a.report.leave(what, name)
@@ -328,10 +341,10 @@ def _compiler(s: Settings, a: AttributeReader) -> Settings:
 
 
 def classes_of(root: Tag, report: Report) -> Classes:
-    """Return the default classes: the attributes of each kind of element, with inherited ones.
+    """Return the default classes: for each class, the attributes of each kind of element.
 
-    All actuators of a class share one entry, "actuator". Elements of a class apply to its nested
-    classes, wherever they occur in it.
+    Inherited attributes are included. All actuators of a class share one entry, "actuator".
+    Elements of a class apply to its nested classes, wherever they occur in it.
     """
     classes: Classes = {"main": {}}
     for top in root.each("default"):
@@ -360,7 +373,7 @@ def classes_of(root: Tag, report: Report) -> Classes:
 
 
 def merged(base: Attributes, tag: Tag) -> Attributes:
-    """Return the attributes of a tag, completed by those of its class.
+    """Return the attributes of an element, completed by those of its default class, `base`.
 
     An orientation replaces an inherited one of any kind, and `fromto` an inherited pose. A shortcut
     such as <position> is converted to the attributes of <general>; the key " law" has its name.

@@ -14,12 +14,23 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, uni
 
 
 class MjcfJoint(NamedTuple):
-    """A joint of the file. kind: as in joints.JOINTS. type: as in MJCF.
+    """A joint of an MJCF file.
 
-    anchor: its position in the body's frame. zero: pose of the frame in which the joint's
-    coordinates are zero, relative to the body's frame moved to the anchor. armature: of the
-    rotations of a free or ball joint. spring: its springdamper, a time constant (s) and a damping
-    ratio; zeros if it has none.
+    Attributes
+    ----------
+    type, kind : str
+        Type of the joint in MJCF, and as a key of joints.JOINTS.
+    motions, axes : tuple
+        Degrees of freedom, and their unit axes.
+    anchor : Vector
+        Its position in the body's frame (m).
+    zero : Pose
+        Pose of the frame in which the joint's coordinates are zero, relative to the body's frame
+        moved to the anchor.
+    armature : float
+        Rotor inertia of the rotations of a free or ball joint (kg m^2).
+    spring : (float, float)
+        Time constant (s) and damping ratio of its springdamper; zeros if it has none.
     """
 
     name: str
@@ -40,9 +51,10 @@ TYPES = ("hinge", "slide", "ball", "free")
 
 
 def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint | None:
-    """Read a joint; `pose` is that of its body in the parent. Returns None after a fault.
+    """Return the joint that an element describes; None after a fault.
 
-    The motions of free and ball joints are named by `with_coordinate_names`.
+    `pose` is that of the joint's body in its parent's frame. The motions of free and ball joints
+    are named by `with_coordinate_names`.
     """
     report, settings, tag = reader.report, reader.settings, placed.tag
     free = tag.kind == "freejoint"
@@ -183,12 +195,15 @@ def _limits(
 
 
 def without_limits(joint: MjcfJoint) -> MjcfJoint:
-    """Return the joint without limits of its positions."""
+    """Return the joint with unlimited positions."""
     return joint._replace(motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
 
 
 def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
-    """Return whether a range in the file is active."""
+    """Return True if the range that the attribute `key` of an element switches is active.
+
+    "auto" means that it is active if the file says so (autolimits).
+    """
     word = a.get(key, "auto")
     return word == "true" or (word == "auto" and settings.autolimits)
 
@@ -204,8 +219,9 @@ def unique_name(name: str, taken: Collection[str]) -> str:
 def with_coordinate_names(joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     """Return the joints with unique names of coordinates.
 
-    The name is the joint's; of a free or ball joint it has a suffix, and the coordinates of the
-    only free joint are x, y, z, yaw, pitch and roll.
+    A hinge or slide has the name of its joint. The coordinates of a free joint are x, y, z, yaw,
+    pitch and roll, those of a ball joint yaw, pitch and roll, with the joint's name appended. If
+    the file has exactly one free joint, nothing is appended to the names of its coordinates.
     """
     taken = {joint.name for joint in joints if joint.type in {"hinge", "slide"}}
     several = sum(joint.type == "free" for joint in joints) > 1

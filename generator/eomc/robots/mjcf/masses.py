@@ -35,13 +35,19 @@ ROUNDING = 1e-15  # relative to neighbouring entries: smaller ones become zero
 
 
 class Pose(NamedTuple):
-    """Pose of a frame in another: its origin, m, and its axes, the columns of `turn`."""
+    """The pose of a frame in another frame.
+
+    `place` is its origin (m), and the columns of `turn` are its axes.
+    """
 
     place: Vector
     turn: Matrix
 
     def compose(self, other: Pose) -> Pose:
-        """Return the pose of `other`, relative to this frame, in the frame of this pose."""
+        """Return the pose of `other` in the outer frame of this pose.
+
+        `other` is a pose relative to the frame of this pose.
+        """
         return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
 
 
@@ -49,14 +55,14 @@ IDENTITY_POSE = Pose(ORIGIN, IDENTITY)
 
 
 class Mass(NamedTuple):
-    """A mass (kg), its centre, m, and its inertia about the centre, kg m^2."""
+    """A mass (kg), its centre of mass (m), and its inertia tensor about the centre (kg m^2)."""
 
     mass: float = 0.0
     center: Vector = ORIGIN
     inertia: Inertia = NO_INERTIA
 
     def in_frame(self, pose: Pose) -> Mass:
-        """Return the mass in the parent frame; `pose` is that of its own frame there."""
+        """Return the mass in the outer frame; `pose` is the pose of its own frame in that frame."""
         return Mass(
             self.mass,
             plus(pose.place, apply(pose.turn, self.center)),
@@ -65,7 +71,17 @@ class Mass(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A tag in a body, with the pose of the enclosing frames in the body, and its childclass."""
+    """An element of a body, with its place in the tree.
+
+    Attributes
+    ----------
+    tag, body
+        The element, and the name of the body.
+    pose : Pose
+        Pose of the enclosing frames in the body's frame.
+    childclass : str
+        Default class that applies to the element.
+    """
 
     tag: Tag
     body: str
@@ -75,9 +91,16 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Reader:
-    """Context of reading: settings, default classes, and the report of faults.
+    """The context in which elements are read.
 
-    sites: named sites read so far.
+    Attributes
+    ----------
+    settings, classes
+        Settings of the file, and default classes of attributes.
+    report : Report
+        Receives faults and notes on parts that are left out.
+    sites : dict
+        Named sites read so far.
     """
 
     settings: Settings
@@ -86,20 +109,27 @@ class Reader:
     sites: dict[str, Placed] = field(default_factory=dict)
 
     def attributes_with_defaults(self, placed: Placed, kind: str) -> AttributeReader:
-        """Return the attributes of a tag, completed by its class or the enclosing childclass."""
+        """Return the attributes of an element, completed by those of its default class.
+
+        The class is that of the element, else the enclosing childclass; `kind` is the element's
+        name in the class.
+        """
         tag = placed.tag
         default = self.class_of(tag.get("class", placed.childclass), tag)
         return AttributeReader(merged(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
-        """Return the default class with this name; the outermost one for "" or after a fault."""
+        """Return the default class `name`: attributes of each kind of element.
+
+        It is the outermost class if the name is "", or after a fault, which is reported for `tag`.
+        """
         if name and name not in self.classes:
             self.own_attributes(tag).fault(missing("default class", name, self.classes))
             name = ""
         return self.classes[name or "main"]
 
     def own_attributes(self, tag: Tag) -> AttributeReader:
-        """Return the attributes of a tag without those of its class."""
+        """Return the attributes of an element without those of its default class."""
         return AttributeReader(tag.attributes, tag, self.report)
 
 
@@ -107,7 +137,10 @@ class Reader:
 
 
 def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
-    """Return the unit vector along `vector`; None, after a fault, if its length is zero."""
+    """Return the unit vector along `vector`; None if its length is zero, which is reported.
+
+    `what` names the vector in the message.
+    """
     x, y, z = vector
     if math.hypot(x, y, z) < 1e-14:
         a.fault(f"{what} has the length zero; give it a direction")
@@ -147,7 +180,7 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
 
 
 def pose_of(a: AttributeReader, settings: Settings) -> Pose:
-    """Return the pose of an element's frame in the enclosing frame."""
+    """Return the pose of an element's frame in the enclosing frame, from its attributes."""
     return Pose(a.vector("pos") or ORIGIN, _orientation(a, settings))
 
 
@@ -317,7 +350,7 @@ def _sum(masses: Sequence[Mass]) -> Mass:
 
 
 def rounded(x: float, size: float) -> float:
-    """Return x, or 0 if it is rounding error relative to numbers of magnitude `size`."""
+    """Return x, or 0 if it is a rounding error relative to numbers of magnitude `size`."""
     return x if abs(x) > ROUNDING * size else 0.0
 
 
@@ -343,7 +376,7 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
 def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, is_static: bool) -> Mass:
     """Return the mass of a body in its frame, from <inertial> or from its geoms.
 
-    is_static: the body doesn't move.
+    `inner` are the elements in the body; `is_static` says that the body does not move.
     """
     how = reader.settings.inertia
     inertials = [p for p in inner if p.tag.kind == "inertial"]
@@ -381,7 +414,7 @@ def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
 
 
 def scaled_to(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
-    """Return the bodies with masses and inertias scaled to settotalmass."""
+    """Return the bodies with masses and inertias scaled so that the total mass is `total` (kg)."""
     now = sum(body.mass for body in bodies)
     k = total / now if now else 1.0
     return [

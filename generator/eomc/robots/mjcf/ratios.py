@@ -25,16 +25,28 @@ if TYPE_CHECKING:
 
 
 def has_ratio(law: Law | None) -> bool:
-    """Whether the damping is a ratio: a servo of positions whose velocity counts positive."""
+    """Return True if the damping of a control law is a damping ratio.
+
+    MJCF has one for a servo of positions whose velocity coefficient is positive.
+    """
     return bool(law and law.bias[2] > 0 and law.set_point == "kp" and law.kp > 0)
 
 
 def damping(
     law: Law, along: Iterable[tuple[float, str]], masses: NDArray[np.float64], rows: Sequence[str]
 ) -> float:
-    """kv: ratio times 2 sqrt(kp m), as MuJoCo 4 has it, m = 1/(J M^-1 J^T).
+    """Return the damping kv of a servo from its damping ratio: ratio times 2 sqrt(kp m).
 
-    along: J by coordinates, the gear in it. masses: M, its `rows`.
+    m = 1/(J M^-1 J^T) is the mass that the servo moves, as in MuJoCo 4.
+
+    Parameters
+    ----------
+    law : Law
+        The servo, with the damping ratio as its velocity coefficient.
+    along
+        The gradient J of the servo's length (including its gear), as pairs (entry, coordinate).
+    masses, rows
+        The mass matrix M, and the coordinate of each of its rows.
     """
     import numpy as np
 
@@ -53,10 +65,11 @@ def sprung(
     tendons: Iterable[Tendon],
     disabled: Collection[str],
 ) -> list[MjcfJoint]:
-    """Return the joints, springdamper as stiffness m/(t r)^2 and damping 2 m/t in its place.
+    """Return the joints with stiffness and damping in place of a springdamper.
 
-    t is the time constant, r the damping ratio, m the inverse of the mean of M^-1 along the
-    joint's coordinates. Damping by actuators adds to it. disabled: the effects that flags disable.
+    With the time constant t and the damping ratio r, the stiffness is m/(t r)^2 and the damping
+    2 m/t, where 1/m is the mean of M^-1 along the joint's coordinates. The damping of actuators is
+    added. `disabled` contains the effects that flags of the file disable.
     """
     import numpy as np
 
@@ -84,9 +97,10 @@ def sprung(
 def masses_at_start(
     bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Iterable[Tendon]
 ) -> tuple[NDArray[np.float64], list[str]]:
-    """M in the pose of the file, and the coordinate of each row.
+    """Return the mass matrix in the pose of the file, and the name of each row's coordinate.
 
-    Whole turns have rows about x, y and z, called by angles that nothing else asks for.
+    The rotations of free and ball joints have rows about x, y and z, which are named by the joint's
+    angles.
     """
     import numpy as np
 

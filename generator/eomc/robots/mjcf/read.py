@@ -58,15 +58,21 @@ KINDS = {
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
-    """Read the robot of an MJCF file.
+    """Return the robot of an MJCF file.
 
     Coordinates are MuJoCo's qpos: a hinge or slide has its `ref` in the pose in which the file
     is written. Free and ball joints have yaw, pitch and roll in place of the quaternion; those of
     a free joint begin at the body's own orientation, those of a ball joint at zero. The start is
     the key frame called "home", or else the pose in which the file is written.
 
-    include: open the files that <include> names, if they lie in the folder of `path`.
-    Raises SceneError with every fault found; EomcError where the file can't be read.
+    With `include`, files that <include> names are opened if they lie in the folder of `path`.
+
+    Raises
+    ------
+    SceneError
+        With every fault found.
+    EomcError
+        If the file cannot be read.
     """
     path = Path(path)
     report = Report()

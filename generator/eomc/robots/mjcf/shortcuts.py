@@ -18,10 +18,21 @@ MEASURES = (
 
 
 def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Return the attributes of <general> that a shortcut sets; missing numbers are inherited.
+    """Return the attributes of <general> that an actuator shortcut such as <position> sets.
 
-    Nothing is inherited from a class with another shortcut or without a constant gain. A kind whose
-    force is not affine in its input has the kind itself as gaintype and biastype.
+    Parameters
+    ----------
+    kind : str
+        Name of the shortcut.
+    inherited, own
+        Attributes of its default class, and of the element. Missing numbers are inherited, except
+        from a class with another shortcut or without a constant gain.
+
+    Returns
+    -------
+    dict
+        The attributes. A shortcut whose force is not affine in its input has `kind` as gaintype and
+        biastype.
     """
     same = inherited.get(" law") == kind
     if not same and (" law" in inherited or inherited.get("gaintype", "fixed") != "fixed"):

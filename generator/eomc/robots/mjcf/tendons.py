@@ -15,7 +15,10 @@ LEFT = "tendons"  # kind in the report of tendons that have no effect
 
 
 class Tendons:
-    """The tendons of a file, by name. fixed: those that are linear combinations of joints."""
+    """The tendons of an MJCF file.
+
+    `fixed` contains those that are linear combinations of joint positions, by name.
+    """
 
     def __init__(self, root: Tag, joints: Sequence[MjcfJoint], reader: Reader) -> None:
         self.fixed: dict[str, Tendon] = {}
@@ -38,22 +41,22 @@ class Tendons:
 
     @property
     def acting(self) -> tuple[Tendon, ...]:
-        """Fixed tendons with stiffness, damping, armature or an actuator."""
+        """The fixed tendons that have stiffness, damping, armature or an actuator."""
         return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
 
     def known(self, name: str, a: AttributeReader) -> bool:
-        """Return whether there is a tendon with this name; report a fault if not."""
+        """Return True if the file has a tendon called `name`; otherwise report a fault."""
         names = {tag.get("name") for tag in self._tags}
         if name not in names:
             a.fault(missing("tendon", name, names))
         return name in names
 
     def reads(self, name: str) -> None:
-        """Record that a fixed tendon is not left out."""
+        """Record that a fixed tendon is modelled, so that it is not listed as left out."""
         self._reader.report.read(LEFT, f"fixed {name}".rstrip())
 
     def driven(self, name: str) -> str:
-        """Mark a fixed tendon as driven; return its name as the coordinate of the drive."""
+        """Record that an actuator drives a fixed tendon, and return the tendon's unique name."""
         self._driven.add(name)
         self.reads(name)
         return self.fixed[name].name
