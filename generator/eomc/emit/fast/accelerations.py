@@ -46,9 +46,10 @@ class Accelerations:
 
     @cached_property
     def staged(self) -> tuple[Function, Function]:
-        """Two functions: one for the expressions of the parameters alone, and one for the rest.
+        """The accelerations as two functions of the program.
 
-        The first is evaluated once for a run, the second at every stage.
+        The first computes all expressions that depend on the parameters only, once for a run; the
+        second computes the accelerations from these, at every stage.
         """
         precomputed, remaining = outline.split_precomputed(self.function, self.parameter_names)
         projections = [self._split_projection[0]] if self._split_projection else []
@@ -77,10 +78,10 @@ class Accelerations:
 
     @cached_property
     def correction(self) -> tuple[Function, bool]:
-        """The projection onto the constraints, and whether sines are arguments of it.
+        """The function for corrections onto the constraints, and whether sines are arguments of it.
 
-        Its precomputed expressions are removed. If sines are arguments, they are those of the
-        accelerations; otherwise it computes its own.
+        It takes expressions of the parameters alone as arguments. If the flag is True, it takes the
+        sines and cosines of the accelerations too; otherwise it computes its own.
         """
         assert self._split_projection is not None
         remaining = self._split_projection[1]
@@ -139,8 +140,8 @@ class Accelerations:
 
     @property
     def long(self) -> bool:
-        """Whether the accelerations are so long that they are called, not inlined.
+        """Whether the C accelerations are too long to be inlined.
 
-        This bounds the time of compilation.
+        If they were inlined in every stage, compilation would take long.
         """
         return outline.weight(self.rotated[1]) > MAX_INLINED_OPERATIONS

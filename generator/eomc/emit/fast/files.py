@@ -41,7 +41,10 @@ def steppers(target: Target) -> Steppers:
 
 
 def rooms(steppers: Steppers) -> list[int]:
-    """Return workspace sizes, in numbers: of each method's run, and last of adaptive steps."""
+    """Return the workspace sizes of runs in optimised C, as counts of numbers.
+
+    One size for each integration method with fixed steps, and last that of adaptive steps.
+    """
     system = steppers.one.target.system
     room = adaptive.workspace_size(system, steppers.one.width)
     return [*(runs.state_size(steppers, m) for m in steppers.methods), room]

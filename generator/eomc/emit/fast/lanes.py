@@ -42,11 +42,11 @@ def interleaved(k: int) -> int:
 
 @dataclass(frozen=True)
 class Lane:
-    """C text of the accelerations for one *lane* type, the C type that the code computes with.
+    """Generator of the C text of the accelerations for one C type, called a *lane*.
 
-    name: "" for one number; "wide" for a vector register with one value of each of several
-    instances; "two" for a register with the values of two configurations. C names of the lane end
-    in it.
+    name: "" for plain numbers; "wide" for a vector register with one value of each of several
+    instances; "two" for a register with the values of two configurations. The C names of the
+    functions end in it.
     """
 
     accelerations: Accelerations
@@ -59,12 +59,12 @@ class Lane:
 
     @property
     def end(self) -> str:
-        """The suffix of C names of the lane, such as "_wide"; "" for one number."""
+        """The suffix of the C names of this type, such as "_wide"; "" for plain numbers."""
         return f"_{self.name}" if self.name else ""
 
     @cached_property
     def real(self) -> Real:
-        """The C type of a value of the lane: one number or a vector register."""
+        """The C type of a value: a number or a vector register."""
         scalar = self.accelerations.target.real
         if not self.name:
             return scalar
@@ -83,7 +83,7 @@ class Lane:
 
     @cached_property
     def target(self) -> Target:
-        """The program and its C names, with this lane's type of numbers."""
+        """The program and its C names, with this C type instead of that of numbers."""
         return replace(self.accelerations.target, real=self.real)
 
     @property
@@ -103,7 +103,7 @@ class Lane:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Template fields that all code for a lane shares, by name; see `views.Laned`."""
+        """Template fields, by name, that all C text for this type shares; see `views.Laned`."""
         inline = self.qualifiers[INLINE]
         return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
@@ -118,13 +118,19 @@ class Lane:
 
     @property
     def computes_own_sines(self) -> bool:
-        """Whether some caller of the accelerations does not supply the sines of the angles."""
+        """Whether the C accelerations must be able to compute the sines of their angles.
+
+        Otherwise all callers pass sines and cosines as an argument.
+        """
         run = self.target.system.run
         return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
 
     @property
     def padded(self) -> bool:
-        """Whether C vectors of coordinates are padded with zeros to a multiple of four."""
+        """Whether C vectors of coordinates are padded with zeros to a multiple of four.
+
+        This is the case for plain numbers if the accelerations are split into two parts.
+        """
         return not self.name and self.accelerations.parts is not None
 
     @property
@@ -192,7 +198,7 @@ class Lane:
 
     @cached_property
     def names_of(self) -> dict[str, frozenset[str]]:
-        """For each C argument, the names of the program's values that it supplies."""
+        """For each C argument, by name: the names of the program's values that it supplies."""
         groups = self.target.groups()
         sines = {n for a in self.accelerations.angles for n in (a.sine, a.cosine)}
         groups = {k: v for k, v in groups.items() if k in ("q", "qd", "t", "u")}
@@ -389,7 +395,7 @@ class Lane:
 
     @cached_property
     def signal(self) -> Computed | None:
-        """The C function for the scene's signals (formulas for inputs); None without signals."""
+        """The C function for the scene's signals, its formulas for inputs; None without signals."""
         if "signal" not in self.target.program:
             return None
         arguments = [*(["t"] if self.target.signal_t else [])]
@@ -447,7 +453,10 @@ class Lane:
 
     @cached_property
     def calls(self) -> tuple[str, ...]:
-        """Sorted names of the mathematical functions of the scene, without sine and cosine."""
+        """Sorted names of the mathematical functions that the scene calls.
+
+        Sine and cosine are not included.
+        """
         functions = [self.accelerations.function]
         others = ("signal", "projection")
         functions += [f for n in others if (f := self.target.program.functions.get(n))]

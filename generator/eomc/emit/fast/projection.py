@@ -14,9 +14,10 @@ from eomc.program.program import TIME
 
 
 def view(functions: Functions, lane: Lane) -> Projection:
-    """Return the template data of the projection onto the constraints for a lane.
+    """Return the template data of the projection onto the constraints.
 
-    lane: the type of numbers, one number or a vector register with values of several instances.
+    lane: the C type to compute with, plain numbers or a vector register with one value of each of
+    several instances.
     """
     correction, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = correction.function.call(**state)
@@ -35,7 +36,8 @@ def view(functions: Functions, lane: Lane) -> Projection:
 def projected(lane: Lane) -> CFunction:
     """Return the prototype of the C function that makes the end of a step satisfy the constraints.
 
-    It changes the increments r and v of q and q̇ in place. lane: one number or a vector register.
+    It changes the increments r and v of q and q̇ in place. lane: plain numbers or a vector
+    register.
     """
     out = tuple(c.output_array(lane.real.name, n) for n in "rv")
     singular_flag = () if lane.name else (CArgument("int *", "singular"),)
@@ -50,7 +52,7 @@ def projected(lane: Lane) -> CFunction:
 def ending(functions: Functions, lane: Lane, **passed: str) -> str:
     """Return the C call that projects the end of a step onto the constraints; "" without these.
 
-    passed: C expressions for some arguments, by name.
+    lane: plain numbers or a vector register. passed: C expressions for some arguments, by name.
     """
     return projected(lane).call(**passed) if functions.projection else ""
 

@@ -11,7 +11,10 @@ from eomc.integrators.tableaux import RK4, Method
 
 
 def predicts(steppers: Steppers, m: Method) -> bool:
-    """Return True if steps of the method `m` predict angles, to compute their sines in advance."""
+    """Return True if steps of the integration method `m` predict angles of the next step.
+
+    Sines and cosines of the predicted angles are computed in advance.
+    """
     return m is RK4 and steppers.predicted
 
 
@@ -48,7 +51,7 @@ def state_size(steppers: Steppers, m: Method) -> int:
 
 
 def constants_call(steppers: Steppers) -> str:
-    """Return the C call that precomputes expressions of the parameters; "" if there are none."""
+    """Return the C call that evaluates expressions of the parameters before a run; "" for none."""
     function = steppers.one.compute_constants.function
     is_empty = (
         not steppers.accelerations.constants and sum(len(b.lines) for b in function.body) == 2

@@ -27,8 +27,11 @@ from eomc.program import two_point
 class Steppers:
     """The integration methods of a scene in optimised C: their functions and template data.
 
-    slopes: template data of the derivatives of the accelerations; None if the scene does not need
-    them.
+    A *lane* is the C type that a function computes with: one number, or a vector register with one
+    value of each of several instances.
+
+    accelerations, functions: the scene's accelerations and other C functions. slopes: template data
+    of the derivatives of the accelerations; None if the scene does not need them.
     """
 
     accelerations: Accelerations
@@ -37,32 +40,42 @@ class Steppers:
 
     @cached_property
     def one(self) -> Lane:
-        """The lane of one number, for single trajectories."""
+        """The C text of the accelerations for plain numbers, for single trajectories."""
         return Lane(self.accelerations)
 
     @cached_property
     def wide(self) -> Lane:
-        """The lane of a vector register, which has one value of each of several instances."""
+        """The C text of the accelerations for vector registers.
+
+        A register has one value of each of several instances of a batch, or of several stages.
+        """
         return Lane(self.accelerations, "wide")
 
     @property
     def two_point(self) -> bool:
-        """Whether the accelerations of one trajectory are split into two parts.
+        """Whether single trajectories use accelerations that are split into two C functions.
 
-        The position-dependent part is then computed for two configurations at once.
+        The position-dependent part is computed for two configurations at once in one register; the
+        velocity-dependent part completes the accelerations for each of them.
         """
         return self.accelerations.parts is not None
 
     @property
     def predicted(self) -> bool:
-        """Whether RK4 extrapolates the angles of one trajectory to compute sines in advance."""
+        """Whether RK4 extrapolates the angles of a single trajectory from one step to the next.
+
+        Their sines and cosines are then computed in advance.
+        """
         s = self.accelerations
         few = 0 < len(s.angles) < two_point.MIN_ANGLES
         free = not (self.two_point or s.target.system.constraints)
         return few and s.target.real is DOUBLE and free
 
     def corrected(self, method: Method) -> bool:
-        """Return True if steps of `method` pass the sines at their end to the projection."""
+        """Return True if steps of `method` pass sines to the projection onto the constraints.
+
+        These are the sines and cosines of the angles at the end of the step.
+        """
         s = self.accelerations
         return method is RK4 and self.functions.projection is not None and s.correction[1]
 
@@ -73,13 +86,16 @@ class Steppers:
 
     @property
     def shared_signals(self) -> bool:
-        """Whether signals depend on time only, so that stages share their values."""
+        """Whether the signals depend on time only, so that stages at one time share them.
+
+        Signals are the scene's formulas for its inputs.
+        """
         target = self.accelerations.target
         return "signal" in target.program and not target.signal_state
 
     @property
     def signals_supplied(self) -> bool:
-        """Whether all callers of the C accelerations supply the inputs from the signals."""
+        """Whether all callers of the C accelerations compute the inputs from the signals first."""
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
         return self.shared_signals and alone and not self.predicted
@@ -258,7 +274,7 @@ class Steppers:
 
     @property
     def newton_p(self) -> bool:
-        """Whether the derivatives for Newton's method depend on parameters."""
+        """Whether the derivatives for Newton's method depend on the parameters p."""
         slopes = self.slopes
         if slopes is None or not self.accelerations.target.needs_p:
             return False
@@ -267,7 +283,7 @@ class Steppers:
 
     @property
     def follows(self) -> bool:
-        """Whether the scene's signals depend on the state."""
+        """Whether the scene's signals (formulas for its inputs) depend on the state."""
         return self.accelerations.target.signal_state
 
     def gauss(self, m: Method) -> views.Gauss:

@@ -557,7 +557,7 @@ class Loop(Named, Driven):
     newton, implicit, predicted
         Whether the method uses Newton's method, is implicit, and predicts angles.
     padded
-        Whether increments are initialised, because vectors are padded to whole registers.
+        Whether vectors of coordinates are padded with zeros to a multiple of four.
     start_call, predicted_call
         C calls of the accelerations at the start, and of the steps with predicted angles.
     advance, otherwise

@@ -84,7 +84,11 @@ class _Structure:
     def unknowns(
         self, pairs: Iterable[tuple[Variable, Names]], initial: bool = False
     ) -> tuple[Unknown, ...]:
-        """Return the dependencies of variables. initial: before the start, including parameters."""
+        """Return each computed variable with the value references that it depends on.
+
+        pairs: the variables, and the names of values that each depends on. initial: whether
+        parameters are included, as for initial values.
+        """
         references = self._all if initial else self._moving
         return tuple(
             Unknown(v.reference, tuple(sorted({r for n in names for r in references.get(n, ())})))

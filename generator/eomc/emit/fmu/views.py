@@ -117,7 +117,8 @@ class SceneCalls:
 class Described:
     """An XML element of the model description: a variable or a unit.
 
-    element: its name. attributes: its attributes. inner: the attributes of the element inside it.
+    element: the element's name. attributes: its attributes, as (name, value). inner: the attributes
+    of the one element inside it.
     """
 
     element: str
@@ -127,11 +128,11 @@ class Described:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A computed variable and the variables that it depends on, by their value references.
+    """A computed variable of an FMU, and the variables that it depends on.
 
-    reference: that of the computed variable. known: those of the others. In FMI 2 these numbers
-    also are the positions in the list of variables, which count from 1, since number 0 is the time,
-    which FMI 2 does not list.
+    reference, known: their value references, the numbers by which FMI identifies variables. In FMI
+    2 they also are positions in the list of variables, counted from 1: reference 0 is the time,
+    which that list does not contain.
     """
 
     reference: int

@@ -167,7 +167,7 @@ class AnySource(Named):
     evaluations, acceleration
         The functions of mechanics, and the function for the accelerations.
     solved
-        Lines of a comment that says how the accelerations are solved for.
+        Lines of a comment on how D qÌ = Ï - bias is solved for the accelerations qÌ.
     slopes, steppers
         C text for the derivatives of the accelerations ("" for none), and for the steps and runs of
         each method: the rendered text of other templates.
