@@ -1,1 +1,1 @@
-"""Text to a compiled module: compiler, extension, cache."""
+"""From generated text to a compiled module: compiler, extension module, cache."""

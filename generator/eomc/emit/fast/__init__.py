@@ -1,1 +1,1 @@
-"""The fast form of C: GNU C, vector registers, whatever was measured to pay."""
+"""Optimised C: for gcc and clang, with vector registers and measured optimisations."""

@@ -1,6 +1,6 @@
-"""Optimised C: the views of a program and its files.
+"""Optimised C: the header and the source of a program.
 
-For gcc and clang. Functions of a step are printed over a lane type: one number for a trajectory, a
+For gcc and clang. Functions of a step are printed for several C types: numbers for a trajectory, a
 vector register for batches and for iterated stages, two configurations for long accelerations.
 """
 
@@ -26,7 +26,7 @@ from eomc.emit.plain import views as plain_views
 from eomc.emit.projection import project
 from eomc.integrators.tableaux import RK4
 
-Show = Callable[[views.View | plain_views.View], str]  # a view by its template
+Show = Callable[[views.View | plain_views.View], str]  # renders template data as text
 
 # Placeholders in csrc for names, types and sizes of a lane
 PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")

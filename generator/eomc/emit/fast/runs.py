@@ -1,4 +1,4 @@
-"""Runs and batches of a method in optimised C: their views and calls."""
+"""Runs and batches of a method in optimised C: their template data and C calls."""
 
 from __future__ import annotations
 

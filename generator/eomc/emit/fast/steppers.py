@@ -1,4 +1,4 @@
-"""Integration methods in optimised C: their views and calls."""
+"""Integration methods in optimised C: their template data and C calls."""
 
 from __future__ import annotations
 

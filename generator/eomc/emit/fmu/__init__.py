@@ -1,1 +1,1 @@
-"""A scene as a unit of FMI: variables, description, C below the hand-written layer."""
+"""A scene as an FMU (FMI unit): variables, model description, and C for the hand-written code."""

@@ -54,7 +54,7 @@ def view(
         "derivatives": "true" if s.run.needs_derivatives else "false",
         "experiment": _free(experiment),
         "units": _units(known),
-        # that of FMI 2 needs no time, and some importers take it for a fault
+        # FMI 2 needs no variable for the time, and some importers take it for an error
         "variables": tuple(_described(v, version) for v in known if v.reference or version == 3),
         "outputs": structure.unknowns([*outputs, *computed]),
         "rates": structure.unknowns(rates),
@@ -111,7 +111,7 @@ def _units(known: Variables) -> tuple[Described, ...]:
 
 def _described(v: Variable, version: int) -> Described:
     unit = v.unit if units.parsed(v.unit) is not None else ""
-    # an input's start is always exact, and FMI 2 forbids to say so
+    # the start of an input is always exact, and FMI 2 forbids the attribute
     initial = "" if v.causality == "input" else v.initial
     outer = _free(
         [

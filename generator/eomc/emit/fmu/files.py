@@ -1,4 +1,4 @@
-"""All that a unit of FMI is made of but its binary, as text by the name that it has inside."""
+"""The contents of an FMU (FMI unit) without a binary: texts by their path in the FMU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from eomc.program.outline import weight
 from eomc.program.program import Program
 
 VERSIONS = (2, 3)
-# of the standard, and what is written by hand over it
+# headers of the FMI standard, by version
 _HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),

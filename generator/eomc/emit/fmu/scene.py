@@ -1,4 +1,4 @@
-"""C between a scene and the hand-written layer: its functions with one signature in every scene."""
+"""scene.h of an FMU: the functions of a scene, with the same arguments in every scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eomc.scene.formulas import parse
 from eomc.scene.schema import ACTIONS
 
 ENERGIES = ("kinetic_energy", "potential_energy", "energy")
-STEPS = 10_000  # of one call of adaptive steps
+STEPS = 10_000  # largest number of adaptive steps in one call
 
 
 def view(target: Target, token: str) -> SceneCalls:
@@ -109,5 +109,5 @@ def _signals_read_parameters(target: Target) -> bool:
 
 
 def _called(target: Target, name: str) -> str:
-    """The call of an evaluation function, "" where the scene has none."""
+    """Return the C call of an evaluation function; "" if the scene does not have it."""
     return Public(target).evaluation(name).call() if source(target, name) is not None else ""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-# exponents of these
+# exponents of the units in BASE
 _SI: Mapping[str, tuple[int, ...]] = {
     **{name: tuple(int(name == b) for b in BASE) for name in BASE},
     "g": (1, 0, 0, 0, 0, 0, 0, 0),
@@ -46,7 +46,7 @@ _OTHERS: Mapping[str, tuple[float, tuple[int, ...]]] = {
 }
 _TOKEN = re.compile(r"\s*(\*\*|[*/()^·.]|-?\d+|[A-Za-zµΩ°%]+|[⁻⁰¹²³⁴-⁹]+)")
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
-_MOST = 20  # of an exponent
+_MOST = 20  # largest magnitude of an exponent
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The variables of a unit, in the order of their value references, as csrc/fmi/unit.h has them."""
+"""The variables of an FMU, in the order of their value references, as in csrc/fmi/unit.h."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from eomc.emit.package import start_formulas
 from eomc.model.symbols import Input
 from eomc.program.interpret import evaluate, nearby
 
-TIME_NAME = "t"  # which no scene can give to anything else
+TIME_NAME = "t"  # no scene can use this name for anything else
 
 
 @dataclass(frozen=True)

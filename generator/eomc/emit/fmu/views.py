@@ -1,4 +1,4 @@
-"""Views of the templates of FMUs: frozen dataclasses with values only."""
+"""Data for the templates of FMUs (views): frozen dataclasses with values only."""
 
 from __future__ import annotations
 

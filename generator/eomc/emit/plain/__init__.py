@@ -1,1 +1,1 @@
-"""The plain form of C: strict C99, any compiler, no tricks."""
+"""Portable C: strict C99 for any compiler."""

@@ -1,4 +1,4 @@
-"""Views of the templates for adaptive steps and events, in both forms of C."""
+"""Data for the templates (views) of adaptive steps and events, in both forms of C."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of the templates for constraints, in both forms of C."""
+"""Data for the templates (views) of constraints, in both forms of C."""
 
 from __future__ import annotations
 

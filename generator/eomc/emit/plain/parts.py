@@ -1,4 +1,4 @@
-"""Fields that views of both forms of C share."""
+"""Fields that the template data of portable and of optimised C share."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from eomc.emit.plain.views import (
 from eomc.integrators.tableaux import METHODS, RK4, Method
 from eomc.program.program import Program
 
-Show = Callable[[View], str]  # a view by its template
+Show = Callable[[View], str]  # renders template data as text
 
 MAX_ITERATIONS = {True: 50, False: 60}  # over the stages, with Newton's method and without
 

@@ -1,4 +1,4 @@
-"""Views of the templates of portable C: frozen dataclasses with values only."""
+"""Data for the templates of portable C (views): frozen dataclasses with values only."""
 
 from __future__ import annotations
 
