@@ -32,7 +32,8 @@ ZERO_GRADIENT_TOLERANCE = {"double": 1e-22, "float": 1e-12}
 class Constraints:
     """The m constraint equations of a system on a tape, holonomic equations first.
 
-    Each quantity is an atom of the tape of the equations of motion, see `Tape`.
+    Each quantity is an atom of the tape of the equations of motion: a number, the name of a
+    definition on the tape, or a number times a name.
 
     Attributes
     ----------

@@ -16,6 +16,8 @@ from eomc.model.system import System, dot, symbol, t
 class Energies:
     """Energies, forces and constraint residuals of a system, as atoms of `tape`.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
+
     Attributes
     ----------
     kinetic, potential : Expr
@@ -62,10 +64,10 @@ def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
 
 
 def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
-    """Return the stage (earliest time of evaluation) of each symbol that has no definition.
+    """Return the binding time (`Stage`) of each symbol of a tape that has no definition.
 
-    These are t, the parameters, inputs, q and qd of the system, and the symbols `velocities`, which
-    have the same stage as qd.
+    The symbols are t, the parameters, inputs, q and qd of the system, and further `velocities`,
+    which have the same stage as qd.
     """
     stages: dict[Symbol, Stage] = {t: Stage.TIME}
     stages |= {p.symbol: Stage.PARAMETER for p in system.parameters}

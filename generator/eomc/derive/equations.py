@@ -25,6 +25,8 @@ UNROLLED_SIZE_LIMIT = 2500
 class MotionTerms:
     """Terms of the equations of motion D qdd + bias = tau, as atoms of a tape.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
+
     Attributes
     ----------
     D : (nq, nq) or (1, nq)
@@ -56,6 +58,8 @@ class MotionTerms:
 @dataclass(frozen=True)
 class Equations(MotionTerms):
     """The equations of motion of a system, as atoms of `tape`.
+
+    An atom is a number, the name of a definition on the tape, or a number times a name.
 
     Attributes
     ----------

@@ -33,6 +33,7 @@ Twist = tuple[Vector, Vector]  # (velocity, angular velocity) or (force, moment)
 class Motions:
     """Kinematics of all frames that a system outputs, as atoms of the tape `tape`.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
     Each sequence lists one frame after the other. Vectors are along the world's axes; lengths are
     in m, angles in rad.
 

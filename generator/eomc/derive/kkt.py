@@ -34,6 +34,8 @@ DROPPED_PIVOT = sympy.Float("1e-9")  # replaces a dropped pivot, relative to its
 class KktFactors:
     """Factors L diag(d) L^T of a KKT matrix [D A^T; A 0], as atoms of `tape`.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
+
     Indices below `count` are coordinates, all others are constraint equations.
 
     Attributes
@@ -142,7 +144,10 @@ def factors(
     slides = dict[int, Expr]()
 
     def read(i: int, j: int) -> Expr:
-        """Return entry (i, j), i >= j, with the terms that remain added in a single sum."""
+        """Return the entry (i, j), i >= j, of the matrix during the elimination.
+
+        Changes of the entry by earlier steps are added first, in a single sum.
+        """
         if added := parts.pop((i, j), None):
             M[i, j] = M[j, i] = short(tape.total([M[i, j], *added]))
         return M[i, j]

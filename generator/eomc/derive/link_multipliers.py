@@ -39,7 +39,7 @@ Row = dict[int, Expr]  # nonzero entries of a sparse row, by column
 class UnsuitedError(Exception):
     """Raised with the reason why link multipliers do not apply to a system.
 
-    They apply to point masses on links only.
+    Link multipliers (tensions of massless links) require point masses on links.
     """
 
 
@@ -64,9 +64,10 @@ class PointMass:
 
 @dataclass(frozen=True)
 class LinkGroup:
-    """The increments e of positions that depend on the same angle phi = sum_i direction_i q_i.
+    """The increments of positions that depend on the same angle phi = sum_i direction_i q_i.
 
-    Their second time derivatives are slopes phidd + beta.
+    Positions are sums of increments e, each a function of one angle, such as l sin(phi). Their
+    second time derivatives are slopes phidd + beta.
 
     Attributes
     ----------
@@ -98,6 +99,8 @@ def prefer_short_chains(system: System) -> bool:
 
 def solution(system: System) -> Solution:
     """Return the accelerations qdd of a system of point masses by link multipliers.
+
+    Link multipliers are the tensions of massless links between the points.
 
     Raises
     ------
@@ -384,7 +387,10 @@ class _Links(Vectors):
         rows = [(g, n) for g, group in enumerate(groups) for n in group.perpendicular]
 
         def known_part(g: int, x: Vector) -> list[Expr]:
-            """Return x . edd for a row x of group g, without the part of the multipliers."""
+            """Return x . edd for a row x of group g, without the terms of the unknown multipliers.
+
+            edd are the second time derivatives of the group's increments.
+            """
             force_terms = [
                 tape.times(self._product(g, x, h, slopes[h]), force)
                 for h, force in enumerate(angle_forces)

@@ -205,13 +205,14 @@ class Recursion(Links):
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
         """Return the terms by which a rotation about joint k's axis changes a 2 x 2 matrix.
 
-        The matrix is [[first, b], [b', second]], and across = b + b'. With c and s of the joint's
-        angle, e = s (first - second) + c across and t = s e, the diagonal becomes first - t,
-        second + t, and the off-diagonal entries change by c e - across.
+        The matrix is [[first, b], [b', second]], and across = b + b'. With the cosine c and sine s
+        of the joint's angle, let e = s (first - second) + c across and t = s e. The rotated matrix
+        has the diagonal first - t, second + t; its off-diagonal entries change by c e - across.
 
         Returns
         -------
-        t, c e
+        t, c e : Expr
+            Atoms of the tape.
         """
         c, s = self.cosine[k], self.sine[k]
         e = self.add(self.times(s, self.add(first, self.minus(second))), self.times(c, across))

@@ -20,6 +20,8 @@ from eomc.model.system import System, t
 class Outputs:
     """The outputs of a scene and their derivatives, as atoms of the tape `tape`.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
+
     Attributes
     ----------
     values : (ny,)
@@ -90,7 +92,10 @@ def _outputs(
     rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True)), t: S.One}
 
     def value(expr: Expr) -> Expr:
-        """Return the atom of an expression; dot(...) by the chain rule, innermost first."""
+        """Return the atom of an expression on the tape.
+
+        Time derivatives dot(...) are replaced by the chain rule, the innermost first.
+        """
         rates_of: dict[Expr, Expr] = {}
         for derivative in expr.atoms(dot):
             if unknown_multipliers := sorted(map(str, derivative.free_symbols & multipliers)):

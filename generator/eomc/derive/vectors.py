@@ -36,16 +36,16 @@ class Vectors:
         return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
 
     def minus(self, a: Expr) -> Expr:
-        """Return -a."""
+        """Return -a, the negative of an atom."""
         return self.tape.scaled(S.NegativeOne, a)
 
     def vector(self, v: Sequence[Expr]) -> Vector:
-        """Return the vector with the atoms of v as entries."""
+        """Return the vector whose entries are the atoms of the three expressions v."""
         x, y, z = map(self.define, v)
         return (x, y, z)
 
     def plus(self, *vectors: Sequence[Expr]) -> Vector:
-        """Return the sum of the vectors."""
+        """Return the sum of vectors, entry by entry."""
         x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
         return (x, y, z)
 
@@ -66,6 +66,6 @@ class Vectors:
         return (x, y, z)
 
     def scaled(self, v: Sequence[Expr], x: Expr) -> Vector:
-        """Return x v."""
+        """Return the product x v of a vector and an atom."""
         a, b, c = (self.times(e, x) for e in v)
         return (a, b, c)

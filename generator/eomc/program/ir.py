@@ -64,7 +64,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Operand:
-    """A number times a name. The name is empty for a number alone."""
+    """A coefficient times a name, as an argument or a result. A number alone has an empty name."""
 
     coefficient: Expr
     name: str = ""

@@ -72,7 +72,7 @@ class _Reader(ScheduleBuilder):
         self.tape = tape
 
     def take(self, symbol: Symbol) -> None:
-        """Add the definition of a symbol."""
+        """Add the definition of a name on the tape to the assignments."""
         tape = self.tape
         if symbol in tape.weights:
             terms = tuple((w, self.leaf(name)) for name, w in tape.weights[symbol].items())
@@ -96,14 +96,14 @@ class _Reader(ScheduleBuilder):
             self.hints[symbol.name] = self.tape.hint[symbol]
 
     def operand(self, atom: Expr) -> Operand:
-        """Return the operand of an atom."""
+        """Return an atom of the tape (number times name) as an operand."""
         factor, symbol = split(atom)
         if symbol is None:
             return Operand(factor)
         return Operand(factor, self.leaf(symbol))
 
     def leaf(self, symbol: Symbol) -> str:
-        """Return the symbol's name, and record the binding time of a leaf."""
+        """Return the name of a symbol; if it has no definition, also record its binding time."""
         if symbol in self.tape.leaves:
             self.stages[symbol.name] = self.tape.leaves[symbol]
         return str(symbol.name)
@@ -178,7 +178,7 @@ def _renamed(function: Function, hints: Mapping[str, str], reserved: frozenset[s
     used_names = {*function.uses, *reserved}
 
     def assign_name(name: str, preferred: str) -> None:
-        """Assign a name, with underscores appended until it is unused."""
+        """Give a value the preferred name, with underscores appended until it is unused."""
         name_ = preferred
         while name_ in used_names:
             name_ += "_"

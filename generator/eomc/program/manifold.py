@@ -104,10 +104,10 @@ class Configuration:
         return self.metric_of(range(len(self.A)))
 
     def metric_of(self, rows: Sequence[int]) -> Vector:
-        """Return `metric` with the weights of the constraints `rows` only.
+        """Return `metric` with the weights of the constraint equations `rows` only.
 
-        The minimum-norm d with A d prescribed for these constraints does not depend on their
-        weights; weights of other constraints would change it.
+        The minimum-norm direction d with prescribed A d for these equations does not depend on
+        their weights; weights of other equations would change it.
         """
         D, A = (self.D + self.D.T) / 2, self.A[rows]
         if not self.singular:
@@ -204,7 +204,7 @@ class TangentSpace:
         return self._from_metric(y)
 
     def length(self, direction: Vector) -> float:
-        """Return the length of a direction of the free coordinates, in the metric."""
+        """Return the length of a direction (nq,), in the metric; only free coordinates count."""
         return float(np.linalg.norm(self.L.T @ direction[self.free]))
 
 

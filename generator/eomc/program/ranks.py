@@ -174,7 +174,10 @@ def _ranks(manifold: Manifold, start: Configuration) -> tuple[Ranks, list[Config
     result = Ranks(rank, (), tuple(shared.tolist()), True, sigma, len(places))
 
     def is_good(allow_double: bool) -> bool:
-        """Return True if the selected equations are independent and imply the others."""
+        """Return True if the selected equations are independent and imply the others.
+
+        With `allow_double`, constraints may be satisfied in double precision only.
+        """
         samples = [f.configuration for f in regular[:3]]
         return score >= MIN_SINGULAR_RATIO and all(
             _implied(manifold, x, left_out, allow_double) for x in samples
@@ -238,7 +241,10 @@ def _best(spans: Vector, random: np.random.Generator) -> tuple[float, Vector]:
     _, n, count = spans.shape
 
     def best(about: Vector, width: float, many: int) -> tuple[float, Vector]:
-        """Return the best of `many` random candidates around `about`."""
+        """Return the best score of `many` random candidates around `about`, and that candidate.
+
+        Candidates are weights of sums; the score is the least singular value on all spans.
+        """
         candidates_ = about + width * random.normal(size=(many, count, n))
         candidates = np.linalg.qr(candidates_.transpose(0, 2, 1))[0].transpose(0, 2, 1)
         projected = candidates[:, None] @ spans

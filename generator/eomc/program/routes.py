@@ -60,6 +60,8 @@ class RouteInputs:
 class Functions:
     """Functions of the equations of motion by one route, as atoms of `tape`.
 
+    An atom is a number, the name of a definition on the tape, or a number times a name.
+
     Attributes
     ----------
     outputs

@@ -39,7 +39,7 @@ class ScheduleBuilder:
         return self.known[value]
 
     def put(self, name: str, value: Value) -> None:
-        """Set the right-hand side of a name."""
+        """Set the right-hand side `value` of a name, and its binding time."""
         old = self.values.get(name)
         if old is not None:
             if old == value:

@@ -74,7 +74,10 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
     free = np.ones(len(start.q), dtype=bool)
 
     def sigma(place: Configuration | None) -> float:
-        """Return the ratio of singular values at a configuration."""
+        """Return the ratio of the smallest nonzero to the largest singular value of the Jacobian.
+
+        It is infinite without a configuration.
+        """
         if place is None:
             return np.inf
         frame = TangentSpace(place, free, manifold.rows)

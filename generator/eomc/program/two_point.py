@@ -144,9 +144,7 @@ def _sort_by_latency(function: Function) -> Function:
         if isinstance(value, Sum):
 
             def known(term: tuple[Expr, str]) -> tuple[int, bool]:
-                """Return when a term's last operand is available, and whether it needs a
-                multiplication.
-                """
+                """Return the cycle when a term is available, and whether it is a product."""
                 weight, name = term
                 if isinstance(inner := values.get(name), Product):
                     return max(ready.get(n, 0) for n in inner.factors), True

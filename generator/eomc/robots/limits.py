@@ -30,7 +30,7 @@ def intersection(one: Range, other: Range) -> Range | None:
 
 
 def with_input_limits(robot: Robot) -> Robot:
-    """Return the robot with each input limited by the limits of its drive and of its joint's force.
+    """Return the robot with each input limited to the range of its drive and of its joint's force.
 
     Servos limit their force instead of their input. The force limits of a joint that several
     drives or tendons act on apply to the sum of their forces; they are left out and noted in

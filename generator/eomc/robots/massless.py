@@ -43,9 +43,9 @@ def without_inertia(robot: Robot) -> list[str]:
 
 
 def light_root(robot: Robot) -> str:
-    """Return the name of a massless free body that carries exactly one joint, or "".
+    """Return the name of the free body without mass that carries exactly one joint, or "".
 
-    Bodies fixed to it count as part of it.
+    Bodies fixed to it count as part of it. Such a body cannot resist the motion of its joint.
     """
     for root in (b for b in robot.bodies if b.joint == "free" and b.parent == WORLD):
         mine, joints = {root.name}, list[RobotBody]()

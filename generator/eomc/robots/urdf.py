@@ -136,7 +136,7 @@ class _Reader:
         return with_joints_fixed(robot)
 
     def say(self, key: str, message: str) -> None:
-        """Record a fault of a link or joint."""
+        """Record a fault of the link or joint `key`, with its line in the file."""
         self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
     def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:

@@ -76,11 +76,11 @@ class _Builder:
         self.prefixes: dict[str, str] = {}  # of namespaces, as the file declares them
 
     def start_ns(self, prefix: str, uri: str) -> None:
-        """Store a prefix; that of xacro's namespace is always `xacro`."""
+        """Record the prefix of a namespace; that of xacro's namespace is always `xacro`."""
         self.prefixes[uri] = "xacro" if uri.endswith("/xacro") else prefix
 
     def written(self, name: str) -> str:
-        """Return a name as it is written in the file, from {namespace}name."""
+        """Return the name of an element as the file writes it, from "{namespace}name"."""
         uri, _, local = name[1:].rpartition("}") if name.startswith("{") else ("", "", name)
         prefix = self.prefixes.get(uri, "xml" if uri.endswith("/XML/1998/namespace") else "")
         return f"{prefix}:{local}" if prefix else local

@@ -39,18 +39,24 @@ class _Ends:
     anchors: Mapping[str, Vector]
 
     def of_file(self, body: str) -> Pose:
-        """Return the pose of the file's frame of a body in the world."""
+        """Return the pose in the world of a body's frame as the file defines it.
+
+        The frames of the file and of the scene differ by an offset.
+        """
         back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
         return self.poses[body].compose(back)
 
     def point(self, body: str, place: Vector) -> Vector:
-        """Return a point of the world in the scene's frame of a body."""
+        """Return the position of a point of the world in a body's frame in the scene (m)."""
         at, turn = self.poses[body]
         x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
         return _plain(x), _plain(y), _plain(z)
 
     def shifted(self, body: str, point: Vector) -> Vector:
-        """Convert a point from the file's frame of a body to the scene's."""
+        """Return the position of a point in a body's frame in the scene (m).
+
+        `point` is its position in the body's frame in the file.
+        """
         return plus(point, scaled(self.anchors.get(body, ORIGIN), -1.0))
 
 
@@ -98,7 +104,7 @@ class _Reading:
         self.couplings: list[Coupling] = []
 
     def read(self, tag: Tag) -> None:
-        """Read one constraint, or report it as left out."""
+        """Read one equality constraint, or note in the report that it is left out."""
         report = self.reader.report
         a = self.reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "equality")
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]

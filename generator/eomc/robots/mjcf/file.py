@@ -98,7 +98,10 @@ class Report:
 
 @dataclass(frozen=True)
 class AttributeReader:
-    """Typed access to the attributes of an element, its own or inherited; faults are reported."""
+    """Access to the attributes of an element (`tag`) as numbers, words or vectors.
+
+    Attributes may be the element's own or inherited. Faults in them are added to `report`.
+    """
 
     attributes: Attributes
     tag: Tag
@@ -180,7 +183,27 @@ EFFECTS = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of <compiler> and <option> in an MJCF file that affect masses and motion."""
+    """Settings of <compiler> and <option> in an MJCF file that affect masses and motion.
+
+    The names are those of the attributes in MJCF, except for these.
+
+    Attributes
+    ----------
+    degrees : bool
+        Whether angles are in degrees.
+    inertia : str
+        Whether masses follow from geoms: "true", "false", or "auto" for bodies without <inertial>.
+    groups : (float, float)
+        Range of the groups of geoms that have mass.
+    totalmass : float
+        Total mass to which all masses are scaled (kg), if positive.
+    balance : bool
+        Whether inertia tensors that violate the triangle inequality are replaced.
+    disabled : frozenset of str
+        Effects that flags of the file disable, values of `EFFECTS`.
+    off_groups
+        Groups of actuators that are disabled.
+    """
 
     degrees: bool = True
     eulerseq: str = "xyz"
@@ -283,7 +306,10 @@ def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
 
 
 def settings_of(root: Tag, report: Report) -> Settings:
-    """Return the settings of <compiler> and <option>; the last value of a repeated one counts."""
+    """Return the settings in the elements <compiler> and <option> of a file.
+
+    If a setting is repeated, the last value counts. Settings that are not modelled are reported.
+    """
     s = Settings()
     disabled = dict.fromkeys(EFFECTS, False)  # by flag; flags accumulate over all <option> elements
     groups: set[float] = set()

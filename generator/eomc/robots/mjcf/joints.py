@@ -209,7 +209,7 @@ def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
 
 
 def unique_name(name: str, taken: Collection[str]) -> str:
-    """Return `name`, with a number appended if it is taken."""
+    """Return `name`, with a number appended to it if it is already in `taken`."""
     free, number = name, 2
     while free in taken:
         free, number = f"{name}_{number}", number + 1
