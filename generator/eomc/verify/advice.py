@@ -136,10 +136,10 @@ class Advice:
         return message is not None
 
     def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """Return the scaled final state of a run over SPAN times `longest`, and the growth.
+        """Return the scaled final state of a run over SPAN times `longest` seconds, and the growth.
 
-        The larger of that of a small difference and of one so small that stiff forces, which are
-        soon at their bounds, are linear in it.
+        The growth is the larger of that of a small difference of the initial state and of a tiny
+        one, for which stiff forces, which are soon at their bounds, are linear.
         """
         s = self.stiffest_state
         signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
@@ -162,10 +162,11 @@ class Advice:
         return ends[0], float(max(growths))
 
     def _step_by_eigenvalues(self, method: str) -> float:
-        """Return the longest stable h, s, of the motion linearised at `stiff` by differences.
+        """Return the longest stable h, s, of the motion linearised at `stiffest_state`.
 
-        Under constraints the longer of two: along them, as what leaves them is put back after each
-        step, though they turn with the motion; and of all changes.
+        The derivatives are differences. Under constraints the longer of two steps counts: along the
+        constraints, since each step is corrected onto them, though they turn with the motion; and
+        along all directions.
         """
         candidates = [self._constrained_directions(self.stiffest_state)]
         if self.holonomic.size:
@@ -173,7 +174,7 @@ class Advice:
         return max(self._eigenvalue_limit(method, directions) for directions in candidates)
 
     def _eigenvalue_limit(self, method: str, directions: Vector) -> float:
-        """Return the longest stable h for perturbations of [q; q̇] in the span of `along`, s."""
+        """Return the longest stable h, s, for changes of [q; q̇] in the span of `directions`."""
         s = self.stiffest_state
         n, x = len(s.q), np.array([s.q, s.qd])
         rates = np.zeros_like(directions)

@@ -116,7 +116,10 @@ def _report(comparison: Comparison, module: Any) -> Report:
 
 
 def value_rows(comparison: Comparison) -> None:
-    """Append the rows that compare values, single steps and short runs with the reference."""
+    """Append checks of values, single steps and short runs to the report of `eomc check`.
+
+    They compare the module with the reference.
+    """
     row, rounding = comparison.row, "units of rounding"
     for name in (*VALUES, "acceleration"):
         row(name, LIMIT, rounding, partial(comparison.value, name))
@@ -129,7 +132,10 @@ def value_rows(comparison: Comparison) -> None:
 
 
 def property_rows(comparison: Comparison) -> None:
-    """Append the rows on derivatives and on laws for the module's values, such as D = Dᵀ."""
+    """Append checks of laws that the module's values must obey to the report of `eomc check`.
+
+    Such laws are D = Dᵀ, and that derivatives agree with differences.
+    """
     row, rounding = comparison.row, "units of rounding"
     row("D = D^T", LIMIT, rounding, comparison.symmetry)
     if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
@@ -144,7 +150,10 @@ def property_rows(comparison: Comparison) -> None:
 
 
 def compiled_rows(comparison: Comparison) -> None:
-    """Append the rows on runs, refusals and, if the module has them, batches of compiled C."""
+    """Append checks of runs, refusals and batches to the report of `eomc check`.
+
+    They need a module compiled from C; batches are checked if the module has them.
+    """
     runs, refusals = Runs(comparison), Refusals(comparison)
     runs.report()
     rows_sines.report(comparison)

@@ -80,7 +80,10 @@ class Comparison:
         self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
-        """Append the rows on orders of convergence, advised step sizes and the balance of power."""
+        """Append checks of orders, advised step sizes and power balance to the report.
+
+        See `convergence.Convergence`.
+        """
         runs, methods = self.convergence, self.methods
         for method in methods:
             least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
@@ -101,11 +104,12 @@ class Comparison:
         self, name: str, limit: float, unit: str, measure: Callable[[], float | Measurement],
         minimum: bool = False,
     ) -> None:  # fmt: skip
-        """Append the row `name` with the number that `measure` returns.
+        """Append a row, one line of the report, with the number that `measure` returns.
 
         It passes if the number is at most `limit` or, with `minimum`, greater than `limit`. It
-        fails if `measure` raises an exception. `unit` describes the number. A Measurement may
-        replace unit and limit, or give a reason why nothing is judged: the row then passes.
+        fails if `measure` raises an exception. `name` says what is checked, `unit` describes the
+        number. A Measurement may replace unit and limit, or give a reason why nothing is judged:
+        the row then passes.
         """
         try:
             result = measure()
@@ -129,9 +133,10 @@ class Comparison:
     def smooth_row(
         self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
-        """Append a row on an order of convergence, which must exceed `limit`.
+        """Append a row to the report for an order of convergence, which must exceed `limit`.
 
-        If it does not pass and the scene has discontinuities or kinks, it is not judged.
+        Arguments are as in `row`. If the row fails and the scene has discontinuities or kinks, it
+        is not judged.
         """
         self.row(name, limit, unit, measure, minimum=True)
         row = self.rows[-1]
@@ -142,7 +147,7 @@ class Comparison:
             self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
 
     def advice_row(self, method: str) -> None:
-        """Append the row on the step size h that the module advises for `method`.
+        """Append a row to the report for the step size h that the module advises for `method`.
 
         It passes if runs with an eighth of the advised h are stable and runs with twice that h are
         not.
@@ -185,12 +190,16 @@ class Comparison:
 
     @cached_property
     def corners(self) -> str:
-        """Text naming the scene's functions with discontinuities or kinks; "" without any."""
+        """Names of the scene's functions with discontinuities or kinks, as text; "" without any."""
         return nonsmooth_functions(self.system)
 
     @property
     def forms(self) -> list[tuple[Any, str]]:
-        """Modules with the prefix of their rows: "" for optimised C, "plain C: " for portable C."""
+        """Pairs of a module and the prefix of its checks' names.
+
+        The prefix is "" for the optimised form of the C code and "plain C: " for the portable form,
+        which may be missing.
+        """
         plain = [] if self.plain is None else [(self.plain, "plain C: ")]
         return [(self.module, ""), *plain]
 
@@ -204,7 +213,7 @@ class Comparison:
     # against the reference
 
     def metadata_differences(self) -> float:
-        """Count the module's names, defaults and start values that differ from the system's."""
+        """Return how many of names, defaults and initial values differ from the system's."""
         s, m, start = self.system, self.module, self.sampler.start
         pairs = [
             (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),
@@ -357,9 +366,10 @@ class Comparison:
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
     def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector, Vector]:
-        """The reference's run as far as it is sure: t (n,), states (n, 2, nq), growth (n, 1, 1).
+        """Return the reference's run while it is certain: t (n,), states, growth, rounding errors.
 
-        And what its own roundings have grown to, in units, (n, 2, nq).
+        The states are (n, 2, nq). growth (n, 1, 1): of a small difference of the initial state. The
+        rounding errors, (n, 2, nq), are in units of eps.
         """
         own = self.system.run.h
         spread = self.sampler.scale
@@ -384,7 +394,10 @@ class Comparison:
         return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
     def start_time(self, s: State) -> float:
-        """Return the start time of runs from a state: its own if constraints depend on time."""
+        """Return the start time of runs from a state, s: its own with constraints, else 0.
+
+        Constraints may depend on time, so that they hold at the state's own time only.
+        """
         return s.t if self.system.constraints else 0.0
 
     def simulate(self, s: State, **how: Any) -> Any:
@@ -416,7 +429,10 @@ class Comparison:
         return evaluate_module(self.module, name, s)
 
     def has_finite_accelerations(self, s: State) -> bool:
-        """Return whether the module's accelerations are finite, also in single precision."""
+        """Return whether the module's accelerations at `s` are finite in single precision.
+
+        In double precision the result is True.
+        """
         if self.dtype == np.float64:
             return True
         try:
@@ -449,7 +465,10 @@ class Comparison:
         return self.largest(error)
 
     def definiteness(self) -> float:
-        """Return the least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
+        """Return the least eigenvalue of D over all states, scaled to a unit diagonal.
+
+        The scaled matrix is D_ij / sqrt(D_ii D_jj).
+        """
 
         def least_eigenvalue(e: Expected) -> float:
             D = evaluate_module(self.module, "D", e.state)

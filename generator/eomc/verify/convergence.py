@@ -58,7 +58,10 @@ class _End(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """An initial state for runs, and the scale of its energy (J) for rounding errors."""
+    """An initial state for runs, and the size of its energy, J.
+
+    A rounding error of the energy is eps times that size.
+    """
 
     state: State
     energy: float
@@ -66,7 +69,11 @@ class Place:
 
 @dataclass(frozen=True)
 class _Ladder:
-    """Differences of final states over one span as h is halved. noise: rounding error."""
+    """Differences of final states over one time span as h is halved again and again.
+
+    span: duration of the runs, s. differences: change by each halving of h, relative to the scale
+    of the motion. noise: the part that is due to rounding.
+    """
 
     span: float
     differences: tuple[float, ...]
@@ -84,11 +91,14 @@ class _Ladder:
 
     @property
     def exact(self) -> bool:
-        """Whether all differences are rounding error."""
+        """Whether all differences are due to rounding."""
         return max(self.differences) <= NOISE_FACTOR * self.noise
 
     def best(self, least: float) -> float:
-        """The largest order, where it is at least so much and no finer halving tells otherwise."""
+        """Return the largest observed order that is at least `least`; nan if there is none.
+
+        It does not count if a finer halving has an order below half of `least`.
+        """
         observed = list(self.orders)
         for k, (order, _) in enumerate(observed):
             if order >= least and all(p >= least / 2 for p, clear in observed[k + 1 :] if clear):
@@ -97,7 +107,7 @@ class _Ladder:
 
     @property
     def agreed_order(self) -> float:
-        """Order on which the last two halvings above rounding error agree, or nan."""
+        """Order on which the last two halvings above rounding error agree; nan if they do not."""
         observed = [p for p, clear in self.orders if clear]
         if len(observed) < 2 or abs(observed[-1] - observed[-2]) > ORDER_TOLERANCE:
             return math.nan
@@ -155,9 +165,17 @@ class Convergence:
     def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
         """Return how far rounding moves the final state of a run, in units of the scale.
 
-        It is estimated from runs whose initial states differ by a rounding, and is at least one
-        rounding of the state. `end` computes the scaled final state of a run from a state, over
-        `span` seconds in `steps` steps; `there` is that of the run from `at`.
+        Runs start at states that differ from that of `at` by a rounding. The result is the largest
+        change of the final state, and at least one rounding.
+
+        Parameters
+        ----------
+        at : Place
+            The initial state of the run.
+        end : callable
+            Returns the scaled final state of a run of `steps` steps over `span` seconds.
+        there : (2, nq) array
+            The scaled final state of the run from `at`.
         """
         s = at.state
         size = np.abs(np.array([s.q, s.qd])) + np.abs(there) * self.scale
@@ -187,10 +205,11 @@ class Convergence:
         return _pick_order(orders, max, "too few halvings between rounding and a hundredth")
 
     def _order(self, at: Place, method: str, least: float) -> float:
-        """The best of a few spans; else of all from the shortest that shows a difference upwards.
+        """Return the best order over a few spans; else over longer and longer spans.
 
-        There a low order counts where two spans in a row agree on it: longer ones may be of
-        order 1 with any method, where steps leap over a bend of the forces.
+        These begin with the shortest that shows a difference. A low order counts if two successive
+        spans agree on it: over longer ones, any method may have order 1, where steps leap over a
+        kink of the forces.
         """
         ladders: dict[int, _Ladder | None] = {}
         end = partial(self.end, method=method)
@@ -318,8 +337,8 @@ class Convergence:
     def _closing(self, at: Place) -> float:
         """Return the order of the balance over spans of increasing length, until it has a residual.
 
-        A rest that two halvings leave as it is, in two spans in a row, is a wrong power, 0, or
-        rounding within formulas, which is another beside the state.
+        A residual that two halvings of h do not change, in two successive spans, means a wrong
+        power (order 0), or rounding within formulas, which differs near the state.
         """
         rest, closed = 0.0, False
         for power in BALANCE_SPANS:

@@ -49,7 +49,7 @@ def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, V
 
 
 def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
-    """Solve at one state; zero rows are ignored and have the multiplier 0."""
+    """Solve at one state; zero rows of A are ignored and have the multiplier 0."""
     multipliers, nonzero = np.zeros(len(A)), A.any(axis=1)
     A, level = A[nonzero], level[nonzero]
     n, m = len(D), len(A)

@@ -34,9 +34,11 @@ def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
 
 
 def units(values: Any, expected: Any, size: Any, eps: float) -> float:
-    """Return the largest of |values - expected| / (eps size), the error in units of rounding.
+    """Return the largest error of some values, |values - expected| / (eps size).
 
-    0 if there are no values; nan if one is nan. Raises ValueError if the shapes differ.
+    eps is the relative rounding error of a number and `size` the size of the terms that make up a
+    value, so that the result is in units of rounding. It is 0 without values and nan if one is nan.
+    Raises ValueError if the shapes differ.
     """
     difference = np.abs(np.asarray(values, float) - expected)
     if difference.shape != np.shape(expected):

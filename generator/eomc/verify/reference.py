@@ -205,7 +205,7 @@ class Reference(ABC):
         return tuple(p.value for p in self.system.parameters)
 
     def _values(self, params: Params) -> Values:
-        """Parameters in the system's order."""
+        """Return the parameters in the system's order, with `params` in place of defaults."""
         if not params:
             return self._defaults
         values = {p.name: p.value for p in self.system.parameters}
@@ -235,7 +235,7 @@ class Reference(ABC):
 
     @cached_property
     def _holonomic(self) -> Vector:
-        """1 for rows of positions, 0 for those of rates, of the constraints solved for."""
+        """For each of the r sums in `solved`, 1 if it is holonomic, else 0."""
         rows = self.system.constraints
         return np.array([float(rows[row[0][0]].holonomic) for row in self.system.solved])
 
@@ -257,7 +257,7 @@ class Reference(ABC):
     def _constrained(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """qdd and the multipliers of the rows that are solved for."""
+        """Return q̈ and the multipliers of the independent constraints that are solved for."""
         D, force = self._motion(q, qd, t, u, values)
         A, gamma = (
             self._value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
@@ -279,7 +279,7 @@ class Reference(ABC):
     def _constraint_values(
         self, name: str, q: Vector, qd: Vector, t: Any, values: Values
     ) -> Vector:
-        """D, or what is asked of the rows that are solved for."""
+        """Return D, or the value `name` of the independent constraints that are solved for."""
         u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
         value = np.asarray(self._value(name, q, qd, t, u, values))
         if name == "D":
@@ -296,7 +296,7 @@ class Reference(ABC):
         fixed: tuple[int, ...],
         nearest: bool,
     ) -> tuple[Vector, Vector]:
-        """`project` of one state: rows of rates alone say nothing of where q may be."""
+        """Apply `project` to one state; nonholonomic constraints alone do not restrict q."""
         positions = self._holonomic > 0
 
         def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
@@ -318,10 +318,10 @@ class Reference(ABC):
         return q, qd
 
     def _corrected(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
-        """States behind a step: q and qd corrected together, until corrections of q are small.
+        """Correct q and q̇ after a step together, until corrections of q are small.
 
-        Both with the matrix before the correction, the rates where it leads to the first order.
-        nan where that does not get there.
+        Both use the matrix before the correction; the velocities are those to the first order in
+        the correction. The results are nan for a state that does not converge.
         """
         if q.ndim == 1:
             q, qd = self._corrected(q[None], qd[None], t, values)
@@ -362,7 +362,7 @@ class Reference(ABC):
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """D and tau - bias."""
+        """Return D and tau - bias."""
         D, bias, tau = (self._value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
         return D, tau - bias
 

@@ -32,7 +32,7 @@ ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on adaptive steps to the report, if the scene has a tolerance."""
+    """Append checks of adaptive steps to the report, if the scene has a tolerance."""
     if check.system.run.tolerance is None:
         return
     tight = 1e-13 if check.dtype == np.float64 else 1e-6
@@ -63,9 +63,9 @@ def _adaptive(module: Any, s: State, x: Vector, T: float, tol: float, **how: Any
 
 
 def _start_run(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bool) -> Any:
-    """The run, or its first call of C, which has more steps than are compared.
+    """Return the run, or its part in the first call of C, which has more steps than are compared.
 
-    Jumps that add energy may come for ever, in less and less time.
+    Jumps that add energy may follow one another without end, in less and less time.
     """
 
     def stop_early(completed: int, total: int) -> None:
@@ -79,7 +79,10 @@ def _start_run(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bo
 
 
 def _error(check: Comparison, module: Any, tol: float, stiff: bool, s: State) -> float | None:
-    """At the end and at times within steps, from one state; None where nothing can be compared."""
+    """Return the error at the end and at times within steps of a run from one state.
+
+    The unit is the tolerance times steps and growth. None if nothing can be compared.
+    """
     x = np.concatenate([s.q, s.qd])
     spread = check.sampler.scale.ravel()
     first = _start_run(module, s, x, check.system.run.duration, tol, stiff)
@@ -123,7 +126,10 @@ def _error(check: Comparison, module: Any, tol: float, stiff: bool, s: State) ->
 def _reference(
     check: Comparison, s: State, x: Vector, times: Vector, grid: Vector
 ) -> tuple[Vector, Vector]:
-    """The states at some times, and their rates, (n, 2 nq); two fixed steps from each of a grid."""
+    """Return the reference's states and their rates at some times, both (n, 2 nq).
+
+    It makes two fixed steps between successive times of `grid` and `times`.
+    """
     n, rows, rates = len(s.q), [], []
     acceleration = check.accelerations(s)
     q, qd, t = x[:n], x[n:], s.t

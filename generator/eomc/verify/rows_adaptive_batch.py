@@ -52,9 +52,10 @@ class BatchResult:
 
 
 def report(check: Comparison, singular: list[State]) -> None:
-    """Append the rows on adaptive steps of batches, if the scene has a tolerance and batches.
+    """Append checks of batches with adaptive steps to the report of `eomc check`.
 
-    singular: states at which D is singular, which must be refused.
+    There are none if the scene has no tolerance or no batches. singular: states at which D is
+    singular, which must be refused.
     """
     if check.system.run.tolerance is None or not check.system.run.batch:
         return

@@ -25,7 +25,11 @@ TURNS = 1e7  # rad: sines of several angles at once come to their limit before
 
 @dataclass(frozen=True)
 class _RunResult:
-    """Results of a run of the C function: rows (n, 2 nq), their times (n,), its state (2 nq,)."""
+    """Results of an adaptive run by the C function.
+
+    status: 0, or the code of the error. rows: states at the ends of steps, (n, 2 nq). times: their
+    times, (n,), s. x: the last state, (2 nq,).
+    """
 
     status: int
     rows: Vector
@@ -34,14 +38,15 @@ class _RunResult:
 
     @property
     def refuses_cleanly(self) -> bool:
-        """True if the run refuses and leaves only finite states."""
+        """Whether the run has returned an error and made no step."""
         return self.status != OK and not len(self.rows)
 
 
 def report(check: Comparison, refusals: Refusals) -> None:
-    """Append the rows on refusals and longest step of adaptive runs, if the scene has a tolerance.
+    """Append checks of refusals and of the longest step in adaptive runs to the report.
 
-    refusals: the checks of refusals by fixed steps, which have found states with a singular D.
+    There are none if the scene has no tolerance. refusals: the checks of refusals by fixed steps,
+    which have found states with a singular D.
     """
     if check.system.run.tolerance is None:
         return

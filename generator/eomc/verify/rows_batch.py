@@ -47,7 +47,7 @@ class Batches:
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
     def report(self) -> None:
-        """Append the rows on batches to the report: for each method, values, bits and failures."""
+        """Append checks of batches to the report of `eomc check`: values, bits and failures."""
         row = self.check.row
         for method in self.check.methods:
             row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
@@ -168,11 +168,11 @@ class Batches:
         return self.check.units(end, alone.rows[:, 1], size)
 
     def places(self, method: str) -> float:
-        """Return the number of batches in which an instance has other bits than in the whole batch.
+        """Return the number of batch runs in which some instance does not have the expected bits.
 
-        The others are permuted batches, small ones, batches that store fewer states, single steps,
-        and batches beside instances with long steps. A batch with shared parameters may differ from
-        one with own parameters by rounding.
+        The expected bits are those in a run of all instances. The runs have another order, fewer
+        instances or fewer stored states, or are single steps; in others, instances with long steps
+        get other neighbours. Runs with shared and with own parameters must agree but for rounding.
         """
         wrong = 0
         for u in self.tables():

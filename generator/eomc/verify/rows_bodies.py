@@ -80,7 +80,7 @@ class Bodies:
         self.lines: dict[tuple[int, float], Line] = {}
 
     def report(self) -> None:
-        """Append the rows on energies of bodies and on the power of forces to the report."""
+        """Append checks of energies and of the power of forces to the report of `eomc check`."""
         limit = max(LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name

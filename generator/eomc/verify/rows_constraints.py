@@ -46,7 +46,7 @@ UNITS = "units of rounding"
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on constraints to the report of a scene that has constraints."""
+    """Append checks of constraints to the report of `eomc check`, for a scene that has some."""
     rows = FormRows(check, check.module)
     for name in VALUES:
         check.row(name, LIMIT, UNITS, partial(check.value, name))

@@ -19,7 +19,10 @@ SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on `linearize` and `sensitivity`, if the module has these functions."""
+    """Append checks of `linearize` and `sensitivity` to the report of `eomc check`.
+
+    They are checked if implicit methods or the scene require them.
+    """
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)
     for name in ("linearize", "sensitivity"):
         if _has(check, name):

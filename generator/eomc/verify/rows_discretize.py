@@ -30,7 +30,10 @@ Differences = Callable[[str, int, float], list[Vector]]  # of a method, state an
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on `discretize` for each method, if the scene has that function."""
+    """Append checks of `discretize` to the report of `eomc check`, if the scene requires it.
+
+    There is one for each method.
+    """
     if not check.system.run.discretize:
         return
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)
@@ -58,7 +61,7 @@ def _worst(
 
 
 def _scales(check: Comparison, s: State) -> Vector:
-    """(2 nq + nu,): what q, qd and u are of."""
+    """Return typical sizes of q, q̇ and u, (2 nq + nu,)."""
     n, nu = len(s.q), len(check.system.inputs)
     scales = np.concatenate([check.sampler.spread, check.sampler.speed, np.ones(nu)])
     if s.u is not None:
@@ -69,7 +72,10 @@ def _scales(check: Comparison, s: State) -> Vector:
 def _error(
     check: Comparison, module: Any, method: str, s: State, exact: Callable[[float], list[Vector]]
 ) -> float | None:
-    """The best of some widths for each entry; None where there are no finite differences."""
+    """Return the largest error at a state, the best of some widths for each entry.
+
+    None if there are no finite differences.
+    """
     n, scales = len(s.q), _scales(check, s)
     for h in (part * check.system.run.h for part in SHORTER):
         near = exact(h)
@@ -92,14 +98,18 @@ def _error(
 
 
 def _moves_far(check: Comparison, method: str, s: State, h: float) -> bool:
-    """Whether a step throws the state so far that no width of differences fits."""
+    """Return whether a step moves the state so far that no width of differences is suitable."""
     run = check.simulate(s, method=method, h=h, steps=1, t0=s.t)
     moved = np.abs(np.subtract([run.q[-1], run.qd[-1]], [s.q, s.qd]))
     return not bool(np.all(moved < MAX_DISTANCE * check.sampler.scale))
 
 
 def _differences(check: Comparison, method: str, s: State, h: float, by: Vector) -> Vector:
-    """d[q; qd]'/d[q, qd, u] of a step, (2 nq, 2 nq + nu); u: added to signals, where not given."""
+    """Return derivatives of a step's end with respect to q, q̇ and u, (2 nq, 2 nq + nu).
+
+    They are differences of the reference's steps. Changes of u are added to the signals if the
+    state has no inputs.
+    """
     n, nu = len(s.q), len(check.system.inputs)
     moved = np.concatenate([k * np.diag(by) for m, _ in STENCIL for k in (m, -m)])
     x = moved + np.concatenate([s.q, s.qd, np.zeros(nu)])

@@ -23,7 +23,7 @@ from eomc.verify.sampling import State
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on event functions and jumps, if the scene defines events."""
+    """Append checks of event functions and jumps to the report, if the scene defines events."""
     system = check.system
     events = system.own_events
     groups = {"events": [Output(e.name, e.when) for e in events]}
@@ -43,7 +43,7 @@ def report(check: Comparison) -> None:
 
 
 def _values(check: Comparison, module: Any, name: str, system: System) -> float:
-    """A function of all events beside its formulas, as far as these are the scene's."""
+    """Return the largest error of event functions or jumps, in units of rounding."""
     model = module._model
 
     def module_values(s: State) -> Vector:

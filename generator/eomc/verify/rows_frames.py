@@ -25,7 +25,10 @@ TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 
 
 def report(check: Comparison, scene: Scene) -> None:
-    """Append the rows on frames and momentum to the report, for functions that the module has."""
+    """Append checks of frames and momentum to the report of `eomc check`.
+
+    Functions that the module does not have are left out.
+    """
     run, eps = check.system.run, check.eps
     for module, form in check.forms:
         frames = _Frames(check, module, scene)
@@ -45,14 +48,20 @@ def report(check: Comparison, scene: Scene) -> None:
 
 
 def inverse_dynamics(check: Comparison) -> None:
-    """Append the rows on `inverse_dynamics`, compared with the reference's D q̈ + bias."""
+    """Append checks of `inverse_dynamics` to the report of `eomc check`.
+
+    It is compared with D q̈ + bias of the reference.
+    """
     for module, form in check.forms:
         measure = partial(check.largest, partial(_inverse, check, module), STATES)
         check.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
 
 
 def _inverse(check: Comparison, module: Any, e: Expected) -> float:
-    """At twice the accelerations of the motion, and of alternating signs."""
+    """Return the error of `inverse_dynamics` at a state, in units of rounding.
+
+    The accelerations are twice those of the motion, plus large ones of alternating signs.
+    """
     s, D = e.state, e.value["D"]
     qdd = 2 * e.value["acceleration"]
     qdd = qdd + check.sampler.speed**2 / check.sampler.spread * (-1.0) ** np.arange(len(qdd))

@@ -19,7 +19,7 @@ FAR = 3.0  # times what lies between limits
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on limits of inputs, if the scene has limits."""
+    """Append checks of limits of inputs to the report of `eomc check`, if the scene has limits."""
     if all(x is None for i in check.system.inputs for x in i.limits):
         return
     for module, form in check.forms:
@@ -27,7 +27,7 @@ def report(check: Comparison) -> None:
 
 
 def _differ(check: Comparison, module: Any) -> float:
-    """How many of applied inputs, accelerations and steps are not those at the limits."""
+    """Return how many inputs, accelerations and steps differ from those at the limits."""
     differing = 0
     for e in check.few(STATES):
         s = e.state
@@ -56,7 +56,7 @@ def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]
 
 
 def _beyond(least: Vector, most: Vector) -> Iterator[Vector]:
-    """Inputs below, above and between their limits, in turns."""
+    """Yield inputs of which some are below, some above and some between their limits."""
     width = np.where(np.isfinite(most - least), most - least, 1.0)
     low = np.where(np.isfinite(least), least, np.where(np.isfinite(most), most, 0) - 2 * width)
     high = np.where(np.isfinite(most), most, low + 2 * width)

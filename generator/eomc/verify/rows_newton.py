@@ -41,7 +41,10 @@ MAX_END_ERROR = 1e4  # roundings of the end, magnified as the fastest mode does
 
 @dataclass(frozen=True)
 class _Equilibrium:
-    """An equilibrium, a state beside it, and the derivatives of the accelerations there."""
+    """An equilibrium and a state near it.
+
+    slopes: derivatives of the accelerations with respect to q and q̇ there, (nq, 2 nq).
+    """
 
     centre: State
     start: State
@@ -49,14 +52,17 @@ class _Equilibrium:
 
     @property
     def fastest(self) -> float:
-        """The largest rate at which a difference turns, decays or grows; 1/s."""
+        """Largest |eigenvalue| of the linearised motion, 1/s.
+
+        It is the rate at which a difference turns, decays or grows fastest.
+        """
         n = len(self.slopes)
         matrix = np.block([[np.zeros((n, n)), np.eye(n)], [self.slopes]])
         return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on Newton's method, for each implicit method that has it.
+    """Append checks of Newton's method to the report, for each implicit method that has it.
 
     There are none in single precision, which leaves a motion near an equilibrium too few digits,
     nor under constraints, where a step is corrected after its stages are found.

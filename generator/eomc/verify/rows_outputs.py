@@ -36,7 +36,7 @@ _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on outputs and their derivatives to the report of a scene with outputs."""
+    """Append checks of outputs and of their derivatives to the report of `eomc check`."""
     formulas = Formulas(check.system)
     limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
     for module, form in check.forms:
@@ -52,7 +52,7 @@ def report(check: Comparison) -> None:
 
 
 def _values(check: Comparison, module: Any, formulas: Formulas) -> float:
-    """The outputs at some states, with the module's own accelerations and multipliers."""
+    """Return the largest error of the outputs at some states, in units of rounding."""
 
     def module_outputs(s: State) -> Vector:
         return np.asarray(module.output(s.q, s.qd, s.t, s.u, s.params), float)
@@ -125,9 +125,9 @@ def _slopes(
 
 
 def _multiplier_slopes(check: Comparison, s: State, by_parameters: bool) -> Iterator[Vector]:
-    """Derivatives of the multipliers, by differences of several widths.
+    """Yield derivatives of the multipliers, by differences of several widths.
 
-    With respect to q, qd and u, (nc, 2 nq + nu), or to the parameters, (nc, np).
+    They are with respect to q, q̇ and u, (nc, 2 nq + nu), or to the parameters, (nc, np).
     """
     first = 2 * len(s.q) + len(check.system.inputs)
     arguments = (check.reference, s, check.sampler.scale, check.sampler.defaults, "multipliers")
@@ -136,7 +136,7 @@ def _multiplier_slopes(check: Comparison, s: State, by_parameters: bool) -> Iter
 
 
 def _solved(module: Any, s: State) -> tuple[Vector, Vector]:
-    """The module's accelerations and multipliers."""
+    """Return the module's accelerations and multipliers at a state."""
     rows = getattr(module, "constraint_names", ())
     return evaluate_module(module, "acceleration", s), evaluate_module(
         module, "multipliers", s
@@ -144,7 +144,7 @@ def _solved(module: Any, s: State) -> tuple[Vector, Vector]:
 
 
 def _with_fixed_inputs(check: Comparison, module: Any, s: State) -> State:
-    """The state with inputs that don't follow it."""
+    """Return the state with the signals' values as inputs, which do not depend on it."""
     if s.u is not None or not check.system.inputs:
         return s
     return replace(s, u=np.asarray(module.signal(s.q, s.qd, s.t, s.params), float))
@@ -152,7 +152,10 @@ def _with_fixed_inputs(check: Comparison, module: Any, s: State) -> State:
 
 @dataclass
 class Formulas:
-    """The outputs of a system, evaluated from their formulas in many digits."""
+    """The outputs of a system, evaluated from their formulas in many digits.
+
+    Rates dot(...) in formulas are difference quotients along the motion.
+    """
 
     system: System
     _compiled: dict[Expr, tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]] = field(
@@ -231,7 +234,7 @@ class Formulas:
 
 
 def _real(motion: _Motion, formula: Expr) -> Any:
-    """The value of a formula; nan where that is not real, or a pole."""
+    """Return the value of a formula; nan if it is not real or has a pole."""
     try:
         value = mpmath.mpmathify(motion.value(formula, mpmath.mpf(0)))
     except (ZeroDivisionError, ValueError):

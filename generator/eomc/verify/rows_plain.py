@@ -40,7 +40,10 @@ COMPARED_VALUES = (*VALUES, "acceleration")
 
 
 def rows(check: Comparison) -> None:
-    """Append the rows on the portable form of C to the report, if there is a module of it."""
+    """Append checks of the portable form of the C code to the report of `eomc check`.
+
+    There are none if there is no module of that form.
+    """
     if check.plain is None:
         return
     unit, plain = "units of rounding", check.plain
@@ -69,7 +72,7 @@ def rows(check: Comparison) -> None:
 
 
 def _values(check: Comparison, plain: Any) -> float:
-    """All values at all states."""
+    """Return the largest difference of all values of both forms, in units of rounding."""
 
     def error(e: Expected) -> float:
         pairs = [
@@ -86,7 +89,7 @@ def _values(check: Comparison, plain: Any) -> float:
 
 
 def _slopes(module: Any, s: State) -> Vector | None:
-    """A and B side by side, and the sensitivity to parameters, as far as the module has them."""
+    """Return A, B and the derivatives by parameters side by side, if the module has them."""
     derivatives = []
     for name in ("linearize", "sensitivity"):
         try:
@@ -126,13 +129,19 @@ def _inputs(check: Comparison, s: State) -> Vector:
 
 
 def _runs(check: Comparison, plain: Any, method: str) -> float | Measurement:
-    """A short run of each form from the start and from a random state, as far as it can be said."""
+    """Return the largest difference of short runs of both forms, in units of rounding.
+
+    They start at the initial state and at a random one.
+    """
     differences = (_least_off(check, plain, method, e) for e in check.few(2))
     return largest(differences, "a difference grows too much in one step")
 
 
 def _least_off(check: Comparison, plain: Any, method: str, e: Expected) -> float | None:
-    """From one state, in steps that are short enough; None where not even one can be compared."""
+    """Return the difference of runs from one state, in steps that are short enough.
+
+    None if not even one step can be compared.
+    """
     least = None
     for part in STEP_FRACTIONS if METHODS[method].sweeps else (1,):
         off = _run_off(check, plain, method, e, check.system.run.h / part)
@@ -194,7 +203,10 @@ def _run_off(check: Comparison, plain: Any, method: str, e: Expected, h: float) 
 def _next_step_converges(
     check: Comparison, method: str, s: State, x: Vector, h: float, rows: int
 ) -> bool:
-    """Whether the next step is clear: of an implicit method, by plain sweeps or few of Newton's."""
+    """Return whether the reference's next step converges.
+
+    An implicit method needs fixed-point iteration or few iterations of Newton's method.
+    """
     m, t, acceleration = METHODS[method], s.t + (rows - 1) * h, check.accelerations(s)
     with np.errstate(all="ignore"):
         if np.all(np.isfinite(one_step.step(m, acceleration, x[0], x[1], t, h))):

@@ -36,9 +36,9 @@ OK, SINGULAR, NOT_FINITE, _, _, LOCKED = range(6)
 
 
 def report(of: Comparison, module: Any, form: str) -> None:
-    """Append the rows on `project` for the module of one form of C.
+    """Append checks of `project` to the report, for the module of one form of the C code.
 
-    of: the checks and their states. form: prefix of the rows' names.
+    of: the checks and their states. form: prefix of the checks' names.
     """
     rows = ProjectionChecks(of, module)
     of.row(f"{form}project", LIMIT, "units of rounding", partial(rows.projected, False))
@@ -47,7 +47,7 @@ def report(of: Comparison, module: Any, form: str) -> None:
 
 
 def of_inertia(of: Comparison, refusals: Refusals) -> None:
-    """Append the row on parameters with which D has no positive eigenvalue.
+    """Append a check of parameters with which D has no positive eigenvalue to the report.
 
     of: the checks and their states. refusals: the checks of refusals.
     """

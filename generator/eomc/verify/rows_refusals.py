@@ -69,7 +69,7 @@ class Refusals:
         self.regular: list[State] = []
 
     def report(self) -> None:
-        """Append the rows on refusals to the report."""
+        """Append checks of refusals to the report of `eomc check`."""
         row = self.check.row
         if self.check.system.constraints:
             self.report_constrained()
@@ -81,7 +81,7 @@ class Refusals:
             row(f"{method} too long", 0, "runs that end otherwise", find)
 
     def report_singular(self) -> None:
-        """Append the rows on a singular D, for a system without constraints."""
+        """Append checks of a singular D to the report, for a system without constraints."""
         row, unit = self.check.row, "states judged wrongly"
         row("singular D", 0, unit, self.definite)
         if not self.singular:
@@ -91,7 +91,7 @@ class Refusals:
         row("singular D in a run", 0, "runs that go on", self.run_into)
 
     def report_constrained(self) -> None:
-        """Append the rows on a D that is negative along motions which the constraints allow."""
+        """Append checks of a D that is negative on the constraints to the report."""
         row, unit = self.check.row, "calls that do not refuse"
         row("negative D along the rows", 0, unit, self.negative_inertia_errors)
         row("negative D along the rows: refusals", 0, unit, self.refuse)
@@ -467,9 +467,9 @@ class Refusals:
 
 
 def _least_eigenvalues(D: Vector) -> Vector:
-    """The least eigenvalue of D_ij / sqrt(|D_ii D_jj|) of each D (n, nq, nq): (n,).
+    """Return the least eigenvalue of D_ij / sqrt(|D_ii D_jj|) for each D (n, nq, nq): (n,).
 
-    0: a diagonal entry is; nan: not to be judged.
+    It is 0 if a diagonal entry is 0, and nan if a value is not finite.
     """
     diagonal = np.sqrt(np.abs(np.diagonal(D, axis1=1, axis2=2)))
     with np.errstate(all="ignore"):

@@ -162,7 +162,7 @@ class Runs:
             return self.sampler.expected(s)
 
     def report(self) -> None:
-        """Append the rows on runs to the report."""
+        """Append checks of runs to the report of `eomc check`."""
         row, rounding = self.check.row, "units of rounding"
         if self.check.methods[0] == "rk4":
             unit = rounding + ", times steps and growth"

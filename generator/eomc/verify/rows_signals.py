@@ -18,7 +18,10 @@ from eomc.verify.sampling import Expected
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on closed loops, if signals are a smooth feedback of the state."""
+    """Append checks of closed loops to the report of `eomc check`.
+
+    There are none unless the inputs' signals are a smooth feedback of the state.
+    """
     if not check.system.run.needs_derivatives or not _is_feedback(check.system):
         return
     signals = tuple(Output(i.name, i.signal) for i in check.system.inputs)

@@ -32,7 +32,7 @@ MOVES = (1e-6, -0.43, 0.31, 0.77, -0.68)
 
 
 def report(check: Comparison) -> None:
-    """Append the row on sines that vanish, if there are angles.
+    """Append a check of sines near their zeros to the report of `eomc check`, if there are angles.
 
     There is none in single precision, which takes its sines from double precision.
     """
@@ -61,7 +61,7 @@ def vanishing(check: Comparison) -> float | Measurement:
 
 
 def _sure(check: Comparison, i: int, quarters: int, e: Expected, errors: Errors) -> Iterable[float]:
-    """The errors that are the same, in parts of the entry, with other coordinates moved."""
+    """Return the errors that stay the same, relative to the entry, if other coordinates move."""
     if max(errors.values(), default=0.0) <= LIMIT:
         return errors.values()
     again = [dict(_entry_errors(check, i, quarters, other)) for other in _moved(e)]
@@ -100,9 +100,10 @@ def _entry_errors(
 
 
 def _error(off: Vector, entry: Vector, eps: float) -> float:
-    """In units; 0 where it is neither the same at all neighbours nor in proportion to the entry.
+    """Return the relative error of an entry, in units of rounding.
 
-    That is a module's way to the same entry by a sum that cancels.
+    It is 0 if it is neither constant at all neighbours nor proportional to the entry: then the
+    module computes the same entry by a sum that cancels.
     """
     errors = [
         float(np.max(np.abs(x))) if np.ptp(x) <= CLEAR * np.max(np.abs(x)) else 0.0

@@ -25,7 +25,7 @@ SIDES = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
 
 
 def report(check: Comparison) -> None:
-    """Append the rows on events in fixed steps, one for each method."""
+    """Append checks of events in fixed steps to the report of `eomc check`, for each method."""
     for module, form in check.forms:
         for method in check.methods:
             check.row(

@@ -210,11 +210,11 @@ class Sampler:
         self.scale = np.array([self.spread, self.speed])
 
     def _predicted_ranges(self, effort: SampleBudget) -> Vector:
-        """(2, nq): how far coordinates and velocities get, 0 where it is not finite.
+        """Return how far coordinates and velocities get, (2, nq); 0 where that is not finite.
 
-        In steps so short that half of them make no difference: the scene's own may be too long for
-        its motion, which then goes to 1e40. From the start, and turned from there, as what rests
-        where it starts moves from elsewhere.
+        Steps are halved until that makes no difference: the scene's h may be too long for its
+        motion, which then goes to 1e40. Runs begin at the start and, since a system at rest moves
+        from elsewhere, at angles turned by 1 rad from there.
         """
         start, h, steps = self.start, effort.stride * self.system.run.h, effort.prediction_steps
         q = np.array([start.q, start.q + self.angles])
@@ -323,7 +323,10 @@ class Sampler:
 
     @staticmethod
     def _random_factor_of(value: float, by: float) -> float:
-        """A parameter's, as far away as `by`; one that is 0, such as a friction, is tried too."""
+        """Return a random value near that of a parameter; one that is 0 is changed, too.
+
+        by: distance from the default, as a logarithm.
+        """
         return value * math.exp(by) if value else math.exp(by) - 0.5
 
     def _choose_modes(self, q: Vector, qd: Vector) -> None:

@@ -109,7 +109,7 @@ class TaylorReference(Reference):
     def _rows(
         self, name: str, q: Vector, qd: Vector, t: Any, u: Any, values: Sequence[Any]
     ) -> Vector:
-        """Return the arguments with one row for each state: q, qd (b, nq), u (b, nu) or None."""
+        """Return the value of `name` at b states: q, qd (b, nq), u (b, nu) or None."""
         if name == "signals" or not self.system.inputs:
             u = np.zeros((1, len(self.system.inputs)))
         elif u is None:
