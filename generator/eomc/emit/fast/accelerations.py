@@ -18,7 +18,7 @@ MAX_INLINED_OPERATIONS = 300  # of accelerations, up to which every stage inline
 
 @dataclass(frozen=True)
 class Accelerations:
-    """The accelerations of a scene, split as the integration methods of optimised C need them.
+    """The accelerations q̈ of a scene, split into functions for the methods of optimised C.
 
     Attributes
     ----------
@@ -29,14 +29,15 @@ class Accelerations:
     angles
         Angles whose sines and cosines are arguments of the remaining function.
     parts
-        Position-dependent and velocity-dependent part; None where the split is not faster.
+        The remaining function, split into a position-dependent and a velocity-dependent part; None
+        where this split is not faster.
     """
 
     target: Target
 
     @cached_property
     def function(self) -> Function:
-        """The whole function of the program for the accelerations."""
+        """The function of the program for the accelerations, before it is split."""
         return self.target.program["acceleration"]
 
     @cached_property
@@ -78,10 +79,10 @@ class Accelerations:
 
     @cached_property
     def correction(self) -> tuple[Function, bool]:
-        """The function for corrections onto the constraints, and whether sines are arguments of it.
+        """The function for corrections of a state onto the constraints, and a flag.
 
-        It takes expressions of the parameters alone as arguments. If the flag is True, it takes the
-        sines and cosines of the accelerations too; otherwise it computes its own.
+        The function reads precomputed expressions of the parameters. If the flag is True, it also
+        takes the sines and cosines that the accelerations take; if False, it computes its own.
         """
         assert self._split_projection is not None
         remaining = self._split_projection[1]
@@ -103,11 +104,11 @@ class Accelerations:
 
     @cached_property
     def rotated(self) -> tuple[tuple[Angle, ...], Function]:
-        """The angles, and the function for the accelerations that takes their sines as arguments.
+        """The angles in the accelerations, and the function for the accelerations without sines.
 
-        The function takes the sines and cosines of the angles instead of computing them, so that a
-        step can obtain them from those of another stage. There are no angles if eomc has no sine
-        and cosine for the type of numbers.
+        The function takes the sines and cosines of the angles as arguments, so that a step can
+        obtain them by rotating those of another stage. There are no angles if eomc has no sine and
+        cosine of its own for the type of numbers.
         """
         if not self.target.real.reach:
             return (), self.staged[1]
@@ -120,9 +121,9 @@ class Accelerations:
 
     @cached_property
     def parts(self) -> two_point.Parts | None:
-        """The position- and the velocity-dependent part, for RK4 in double precision.
+        """The accelerations, split into a position-dependent and a velocity-dependent function.
 
-        None for other methods and precisions, and where the split is not faster.
+        None if the scene does not use RK4 in double precision, or if the split is not faster.
         """
         target = self.target
         if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
@@ -134,14 +135,14 @@ class Accelerations:
 
     @property
     def simd_angles(self) -> bool:
-        """Whether the sines of four angles of one trajectory are computed in a vector register."""
+        """Whether single trajectories compute the sines of four angles in one vector register."""
         constrained = bool(self.target.system.constraints)
         return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
 
     @property
     def long(self) -> bool:
-        """Whether the C accelerations are too long to be inlined.
+        """Whether the C function for the accelerations is too long to be inlined in every stage.
 
-        If they were inlined in every stage, compilation would take long.
+        Compilation would take too long if it were inlined.
         """
         return outline.weight(self.rotated[1]) > MAX_INLINED_OPERATIONS

@@ -32,21 +32,26 @@ def four(n: int) -> int:
 
 
 def interleaved(k: int) -> int:
-    """Return the index of number k in a vector that interleaves two configurations.
+    """Return the position of coordinate or angle number `k` in the vectors of two_point.c.
 
-    In groups of four, the coordinates or angles are in the order 0, 2, 1, 3, as the template
-    two_point.c stores them.
+    That template computes with two configurations q in one vector register. In each group of four,
+    it stores the coordinates or angles in the order 0, 2, 1, 3.
     """
     return k - k % FOUR + (0, 2, 1, 3)[k % FOUR]
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Generator of the C text of the accelerations for one C type, called a *lane*.
+    """Generator of C functions, above all of the accelerations q̈, for one C type: a *lane*.
 
-    name: "" for plain numbers; "wide" for a vector register with one value of each of several
-    instances; "two" for a register with the values of two configurations. The C names of the
-    functions end in it.
+    Attributes
+    ----------
+    accelerations
+        The accelerations of the scene, as functions of the program.
+    name
+        Selects the C type: "" for plain numbers; "wide" for a vector register with one value of
+        each of several instances or stages; "two" for a register with the values of two
+        configurations q. The C names of the functions end in it.
     """
 
     accelerations: Accelerations
@@ -59,7 +64,7 @@ class Lane:
 
     @property
     def end(self) -> str:
-        """The suffix of the C names of this type, such as "_wide"; "" for plain numbers."""
+        """The suffix of C names for this lane type, such as "_wide"; "" for plain numbers."""
         return f"_{self.name}" if self.name else ""
 
     @cached_property
@@ -73,7 +78,11 @@ class Lane:
 
     @property
     def mask(self) -> str:
-        """The C type that records failures: int, or a mask with one element for each value."""
+        """The C type that records failures of a computation.
+
+        It is int for plain numbers, and for a vector register a mask with one element for each
+        value of the register.
+        """
         return f"{self.real.name}_mask" if self.name else "int"
 
     @property
@@ -83,7 +92,7 @@ class Lane:
 
     @cached_property
     def target(self) -> Target:
-        """The program and its C names, with this C type instead of that of numbers."""
+        """The program and its C names; the C type of numbers is replaced by this lane type."""
         return replace(self.accelerations.target, real=self.real)
 
     @property
@@ -98,29 +107,29 @@ class Lane:
 
     @property
     def qualifiers(self) -> Mapping[str, str]:
-        """C macros for the qualifiers of functions, by kind: INLINE and NOINLINE."""
+        """Names of the C macros that make a function inlined or not, by key INLINE or NOINLINE."""
         return {kind: f"{self.target.PREFIX}_{kind}" for kind in (INLINE, NOINLINE)}
 
     @property
     def names(self) -> dict[str, Any]:
-        """Template fields, by name, that all C text for this type shares; see `views.Laned`."""
+        """The fields of the template data class `views.Laned` for this lane type, by name."""
         inline = self.qualifiers[INLINE]
         return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
     @property
     def unroll(self) -> str:
-        """The C macro before loops over coordinates, which selects how compilers unroll them.
+        """The name of the C macro before loops over coordinates: it unrolls them or does not.
 
-        If the accelerations are split into two parts, compilers put these loops into vector
-        registers.
+        The loops are not unrolled if vectors of coordinates are padded: compilers then put the
+        loops into vector registers.
         """
         return f"{self.target.PREFIX}_{'ROLLED' if self.padded else 'UNROLL'}"
 
     @property
     def computes_own_sines(self) -> bool:
-        """Whether the C accelerations must be able to compute the sines of their angles.
+        """Whether the C function for the accelerations can compute the sines of its angles itself.
 
-        Otherwise all callers pass sines and cosines as an argument.
+        If False, all its callers pass sines and cosines as an argument.
         """
         run = self.target.system.run
         return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
@@ -129,7 +138,8 @@ class Lane:
     def padded(self) -> bool:
         """Whether C vectors of coordinates are padded with zeros to a multiple of four.
 
-        This is the case for plain numbers if the accelerations are split into two parts.
+        They are padded for plain numbers, if the accelerations are split into a position-dependent
+        and a velocity-dependent function.
         """
         return not self.name and self.accelerations.parts is not None
 
@@ -140,9 +150,10 @@ class Lane:
 
     @cached_property
     def width(self) -> int:
-        """Length of C vectors of coordinates.
+        """Number of elements of the C vectors of coordinates.
 
-        With padding, it includes the space for reading angles from them in groups of four.
+        This is the number of coordinates. If the vectors are padded, zeros are added so that the
+        coordinates, and the angles among them, can be read in groups of four.
         """
         n = len(self.target.names)
         if not self.padded:
@@ -152,14 +163,14 @@ class Lane:
 
     @property
     def extent(self) -> str:
-        """`width` as a C expression."""
+        """Number of elements of the C vectors of coordinates (`width`), as a C expression."""
         return str(self.width) if self.padded else self.NQ
 
     @cached_property
     def contiguous_angles(self) -> int | None:
-        """Index of the coordinate that is the first angle, if angles are consecutive coordinates.
+        """Index of the first of the coordinates that are the angles of the accelerations.
 
-        None if they are not.
+        None if the angles, whose sines the accelerations read, are not consecutive coordinates.
         """
         names = self.target.names
         indices = [
@@ -175,9 +186,11 @@ class Lane:
     # arguments
 
     def argument(self, name: str) -> CArgument:
-        """Return the C argument for q, qd, s, t, u or c.
+        """Return the declaration of the C argument `name`, with its type for this lane.
 
-        s: sines and cosines of the angles. c: precomputed expressions of the parameters.
+        name: "q" or "qd" for coordinates or velocities; "s" for the struct of sines and cosines of
+        the angles; "t" for the time; "u" for the inputs; "c" for the struct of precomputed
+        expressions of the parameters.
         """
         if name == "t":
             return CArgument(self.real.name, "t")
@@ -189,7 +202,12 @@ class Lane:
 
     @cached_property
     def argument_names(self) -> tuple[str, ...]:
-        """Names of the inputs of the C accelerations, in order: q, qd, s, t, u, c, if needed."""
+        """Names of the arguments that the C function for the accelerations takes, in order.
+
+        They are those of q, qd, s, t, u, c (see `argument`) that this scene has: s if it has
+        angles, t if its steps depend on time, u if it has inputs, c if it has precomputed
+        expressions.
+        """
         s = self.accelerations
         return (
             "q", "qd", *(["s"] if s.angles else []), *(["t"] if self.target.driven else []),
@@ -198,7 +216,11 @@ class Lane:
 
     @cached_property
     def names_of(self) -> dict[str, frozenset[str]]:
-        """For each C argument, by name: the names of the program's values that it supplies."""
+        """The names of the values that each C argument contains, by the argument's name.
+
+        The arguments are q, qd, t, u, s and c, see `argument`. For example, "q" contains all
+        coordinates.
+        """
         groups = self.target.groups()
         sines = {n for a in self.accelerations.angles for n in (a.sine, a.cosine)}
         groups = {k: v for k, v in groups.items() if k in ("q", "qd", "t", "u")}
@@ -206,7 +228,10 @@ class Lane:
 
     @cached_property
     def where(self) -> dict[str, str]:
-        """C expressions by name: of sines, cosines and precomputed parameter expressions."""
+        """The C expression, such as "s->s[0]", for each value in the structs s and c, by its name.
+
+        s contains sines and cosines of angles, c precomputed expressions of the parameters.
+        """
         expressions = {n: c.member("c", n) for n in self.accelerations.constants}
         for n, a in enumerate(self.accelerations.angles):
             k = interleaved(n) if self.name == "two" else n
@@ -241,7 +266,9 @@ class Lane:
         in_order: bool = False,
         inline: bool = True,
     ) -> Computed:
-        """Return a C function that evaluates a function of the program and returns its failures.
+        """Return a C function that evaluates a function of the program.
+
+        The C function stores the results in an argument, and returns where it failed (a `mask`).
 
         Parameters
         ----------
@@ -258,11 +285,11 @@ class Lane:
         doc
             The comment above the C function.
         takes
-            Names of the usual arguments, see `argument`; all of them by default.
+            Names of the arguments described in `argument`; by default all of `argument_names`.
         constants
             C expressions of precomputed values by name, where they differ from `where`.
         in_order
-            Whether the terms of sums stay in their order.
+            Whether the C code adds the terms of sums in the order of the program.
         inline
             Whether the C function is inlined, unless it is so long that it is split into several
             ones.
@@ -341,7 +368,10 @@ class Lane:
 
     @property
     def pivots(self) -> int:
-        """Number of pivots in the solution for the accelerations, for the pivot tolerance."""
+        """Number of pivots that are tested when D q̈ = τ - bias is solved for the accelerations.
+
+        The tolerance of these tests, which detect a singular D, depends on it.
+        """
         return len(self.accelerations.function.checks)
 
     def _fails(self, body: Body) -> bool:
@@ -379,12 +409,12 @@ class Lane:
 
     @cached_property
     def out(self) -> CArgument:
-        """The C argument for the accelerations."""
+        """The declaration of the C argument "a", the array into which accelerations are stored."""
         return c.output_array(self.real.name, "a")
 
     @cached_property
     def places(self) -> list[str]:
-        """C expressions of the elements of the accelerations, in the order of the coordinates."""
+        """C expressions of the elements of the array a of accelerations, one per coordinate."""
         return [self.target.element("a", n) for n in self.target.names]
 
     @cached_property
@@ -395,7 +425,10 @@ class Lane:
 
     @cached_property
     def signal(self) -> Computed | None:
-        """The C function for the scene's signals, its formulas for inputs; None without signals."""
+        """The C function for the scene's signals: formulas for the inputs u by time and state.
+
+        None if the scene has no signals.
+        """
         if "signal" not in self.target.program:
             return None
         arguments = [*(["t"] if self.target.signal_t else [])]
@@ -425,11 +458,14 @@ class Lane:
         )  # fmt: skip
 
     def linear(self, what: str, vector: str, offset: bool) -> CFunction:
-        """Return the C function for all angles, as linear combinations of the coordinates.
+        """Return the C function for the angles of the accelerations, or for changes of them.
 
-        what: its C name, without prefix and suffix. vector: the name of its argument, the
-        coordinates or a change of these. offset: whether the constant terms of the angles are
-        added: True for angles, False for changes of angles.
+        An angle is a linear combination of coordinates plus a constant; the accelerations read its
+        sine and cosine. The C function stores all angles in an array, in rad.
+
+        what: its C name, without prefix and suffix. vector: the name of its argument, a vector of
+        coordinates or of their changes. offset: True for angles; False for changes of angles, to
+        which the constants are not added.
         """
         angles = self.accelerations.angles
         values = [self.angle_text(a, vector, a.offset if offset else S.Zero) for a in angles]
@@ -453,9 +489,9 @@ class Lane:
 
     @cached_property
     def calls(self) -> tuple[str, ...]:
-        """Sorted names of the mathematical functions that the scene calls.
+        """Sorted names of the mathematical functions in the scene's accelerations and signals.
 
-        Sine and cosine are not included.
+        The projection onto the constraints is included; sine and cosine are not.
         """
         functions = [self.accelerations.function]
         others = ("signal", "projection")
@@ -475,16 +511,21 @@ class Lane:
 
     @property
     def angle_count(self) -> str:
-        """Length of C arrays of angles, as C text.
+        """Number of elements of C arrays of angles, as C text.
 
-        It is padded to a multiple of four if the sines of four angles are computed at once.
+        This is the number of angles. It is rounded up to a multiple of four if the sines of four
+        angles are computed at once.
         """
         n = len(self.accelerations.angles)
         return str(four(n) if self.accelerations.simd_angles and self.name != "wide" else n)
 
     @cached_property
     def all_in_one(self) -> CFunction:
-        """Prototype of the C accelerations, which compute signals and sines that are not given."""
+        """Prototype of the C function for the accelerations at a state.
+
+        If the inputs u are NULL, the function computes them from the scene's signals (formulas for
+        inputs). If the sines s of the angles are NULL, it computes these too.
+        """
         arguments = (self.out, *map(self.argument, self.argument_names))
         called = self.padded or self.accelerations.long
         return CFunction(
@@ -496,7 +537,10 @@ class Lane:
 
     @cached_property
     def configuration(self) -> Computed:
-        """The C function for the position-dependent part of the accelerations at two points."""
+        """The C function for the position-dependent part of the accelerations.
+
+        It computes this part for two configurations q at once.
+        """
         parts = self.accelerations.parts
         assert parts is not None
         out = c.output_array(f"{self.prefix}_configuration", "k")
@@ -509,9 +553,10 @@ class Lane:
 
     @cached_property
     def velocity(self) -> Computed:
-        """The C function for the accelerations at one of two configurations.
+        """The C function for the velocity-dependent part, which returns the accelerations.
 
-        It continues from the position-dependent part that `configuration` computes.
+        It reads the position-dependent part, which `configuration` computes for two configurations
+        q, at one of these two.
         """
         parts = self.accelerations.parts
         assert parts is not None

@@ -14,10 +14,10 @@ from eomc.program.program import TIME
 
 
 def view(functions: Functions, lane: Lane) -> Projection:
-    """Return the template data of the projection onto the constraints.
+    """Return the template data of the projection of a step's end onto the constraints.
 
-    lane: the C type to compute with, plain numbers or a vector register with one value of each of
-    several instances.
+    lane: the C type that the function computes with, plain numbers or a vector register with one
+    value of each of several instances.
     """
     correction, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = correction.function.call(**state)
@@ -36,8 +36,8 @@ def view(functions: Functions, lane: Lane) -> Projection:
 def projected(lane: Lane) -> CFunction:
     """Return the prototype of the C function that makes the end of a step satisfy the constraints.
 
-    It changes the increments r and v of q and q̇ in place. lane: plain numbers or a vector
-    register.
+    The C function changes r and v, the increments of q and q̇ in the step, in place. lane: the C
+    type that it computes with, plain numbers or a vector register.
     """
     out = tuple(c.output_array(lane.real.name, n) for n in "rv")
     singular_flag = () if lane.name else (CArgument("int *", "singular"),)
@@ -50,17 +50,19 @@ def projected(lane: Lane) -> CFunction:
 
 
 def ending(functions: Functions, lane: Lane, **passed: str) -> str:
-    """Return the C call that projects the end of a step onto the constraints; "" without these.
+    """Return the C call of `projected`, or "" if the scene has no constraints.
 
-    lane: plain numbers or a vector register. passed: C expressions for some arguments, by name.
+    lane: the C type that the function computes with, plain numbers or a vector register. passed: C
+    expressions for some arguments of the call, by name; the others are passed under their names.
     """
     return projected(lane).call(**passed) if functions.projection else ""
 
 
 def onto(lane: Lane) -> CFunction:
-    """Return the prototype of the C function that projects a stage onto the constraints.
+    """Return the prototype of the C function that projects one stage onto the constraints.
 
-    It makes one correction, which is accurate to first order.
+    A stage is an intermediate state (q, q̇) within a step. The function corrects the state once, so
+    that the constraint residuals vanish to first order. lane: the C type that it computes with.
     """
     state = tuple(c.output_array(lane.real.name, n) for n in ("at", "moving"))
     others = (n for n in _arguments(lane, sines=False) if n in "tc")
