@@ -14,7 +14,8 @@ from eomc.scene.schema import MAX_TOLERANCE
 def view(steppers: Steppers, form: SweepInterface) -> views.AdaptiveLanes:
     """Return the template data for adaptive steps of many instances side by side.
 
-    form: what optimised C supplies to the shared code of adaptive steps.
+    steppers: the scene's integration methods in optimised C. form: the C calls and arguments that
+    optimised C supplies to the code of adaptive steps, which both forms of C share.
     """
     one, wide, s, m = steppers.one, steppers.wide, steppers.accelerations, METHOD
     stepping, computed = Stepping(steppers.functions, form), runs.constants_call(steppers)

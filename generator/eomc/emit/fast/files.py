@@ -35,15 +35,19 @@ BINARY_FUNCTIONS = ("atan2", "pow", "min", "max", PIVOT)
 
 
 def steppers(target: Target) -> Steppers:
-    """Return the accelerations and the integration methods of a scene in optimised C."""
+    """Return the integration methods of a scene in optimised C, with its accelerations.
+
+    target: the scene's program and its C names.
+    """
     functions = Functions(target)
     return Steppers(Accelerations(target), functions, plain.linearization(functions))
 
 
 def rooms(steppers: Steppers) -> list[int]:
-    """Return the workspace sizes of runs in optimised C, as counts of numbers.
+    """Return the lengths of the workspaces that runs in optimised C need, as counts of numbers.
 
-    One size for each integration method with fixed steps, and last that of adaptive steps.
+    The list has one length for each integration method with fixed steps, and then the length for
+    adaptive steps.
     """
     system = steppers.one.target.system
     room = adaptive.workspace_size(system, steppers.one.width)
@@ -51,9 +55,9 @@ def rooms(steppers: Steppers) -> list[int]:
 
 
 def files(steppers: Steppers, show: Show) -> dict[str, str]:
-    """Return the header and the source of optimised C, as texts by file name.
+    """Return the header and the source of a scene in optimised C, as texts by file name.
 
-    show: renders template data as text.
+    steppers: the scene's integration methods. show: function that renders template data as text.
     """
     functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"

@@ -11,9 +11,9 @@ from eomc.integrators.tableaux import RK4, Method
 
 
 def predicts(steppers: Steppers, m: Method) -> bool:
-    """Return True if steps of the integration method `m` predict angles of the next step.
+    """Return True if steps of the integration method `m` extrapolate angles to the next step.
 
-    Sines and cosines of the predicted angles are computed in advance.
+    The sines and cosines of these predicted angles are then computed in advance.
     """
     return m is RK4 and steppers.predicted
 
@@ -36,7 +36,10 @@ def state(steppers: Steppers, m: Method) -> views.State:
 
 
 def state_size(steppers: Steppers, m: Method) -> int:
-    """Return the length of a run's workspace, in numbers, that the C header reserves."""
+    """Return the length of the workspace that a run by the method `m` needs.
+
+    It is a count of numbers of the C type of the scene, which the C header reserves.
+    """
     n, angles, s = len(steppers.one.target.names), len(steppers.accelerations.angles), m.stages
     size = 4 * steppers.one.width + 32
     if steppers.functions.projection:
@@ -51,7 +54,10 @@ def state_size(steppers: Steppers, m: Method) -> int:
 
 
 def constants_call(steppers: Steppers) -> str:
-    """Return the C call that evaluates expressions of the parameters before a run; "" for none."""
+    """Return the C call that precomputes expressions of the parameters before a run.
+
+    "" if there are no such expressions to compute and nothing to check.
+    """
     function = steppers.one.compute_constants.function
     is_empty = (
         not steppers.accelerations.constants and sum(len(b.lines) for b in function.body) == 2
@@ -132,8 +138,8 @@ def batch(steppers: Steppers, m: Method) -> views.Batch:
 
 
 def prediction_width(angles: int) -> int:
-    """Return the number of values in the vector type for predicted angles.
+    """Return the number of values in the C vector type for predicted angles.
 
-    It is twice the number of angles, rounded up to a power of two.
+    It is twice `angles`, the number of angles, rounded up to a power of two.
     """
     return 1 << (2 * angles - 1).bit_length()

@@ -40,14 +40,15 @@ class Steppers:
 
     @cached_property
     def one(self) -> Lane:
-        """The C text of the accelerations for plain numbers, for single trajectories."""
+        """Generator of the C functions for plain numbers, which single trajectories use."""
         return Lane(self.accelerations)
 
     @cached_property
     def wide(self) -> Lane:
-        """The C text of the accelerations for vector registers.
+        """Generator of the C functions for vector registers.
 
-        A register has one value of each of several instances of a batch, or of several stages.
+        A register has one value of each of several instances of a batch, or of several stages of
+        one step.
         """
         return Lane(self.accelerations, "wide")
 
@@ -62,9 +63,9 @@ class Steppers:
 
     @property
     def predicted(self) -> bool:
-        """Whether RK4 extrapolates the angles of a single trajectory from one step to the next.
+        """Whether RK4 extrapolates angles of a single trajectory from one step to the next.
 
-        Their sines and cosines are then computed in advance.
+        The sines and cosines of the extrapolated angles are then computed in advance.
         """
         s = self.accelerations
         few = 0 < len(s.angles) < two_point.MIN_ANGLES
@@ -72,9 +73,10 @@ class Steppers:
         return few and s.target.real is DOUBLE and free
 
     def corrected(self, method: Method) -> bool:
-        """Return True if steps of `method` pass sines to the projection onto the constraints.
+        """Return True if steps of `method` pass sines and cosines to the constraint projection.
 
-        These are the sines and cosines of the angles at the end of the step.
+        These are the sines and cosines of the angles at the end of the step, which the projection
+        of that state onto the constraints can reuse.
         """
         s = self.accelerations
         return method is RK4 and self.functions.projection is not None and s.correction[1]
@@ -95,16 +97,21 @@ class Steppers:
 
     @property
     def signals_supplied(self) -> bool:
-        """Whether all callers of the C accelerations compute the inputs from the signals first."""
+        """Whether all callers pass the inputs to the C function for the accelerations.
+
+        They compute them from the signals, the scene's formulas for its inputs. If False, the
+        function for the accelerations must be able to compute the signals itself.
+        """
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
         return self.shared_signals and alone and not self.predicted
 
     def accelerate(self, lane: Lane, **passed: str) -> str:
-        """Return the C call of the accelerations for a lane (one number or a vector register).
+        """Return a C call of the function for the accelerations.
 
-        passed: C expressions for some arguments, by name; the others are passed under their own
-        names. By default the sines are not supplied, but computed by the accelerations.
+        lane: the C type that it computes with, one number or a vector register. passed: C
+        expressions for some arguments, by name; the others are passed under their own names. By
+        default s, the sines of the angles, is NULL, so that the function computes them.
         """
         if self.accelerations.angles:
             passed = {"s": "NULL"} | passed
@@ -112,7 +119,10 @@ class Steppers:
 
     @property
     def driven(self) -> dict[str, Any]:
-        """Template fields by name: whether steps read time, inputs and precomputed expressions."""
+        """The fields of the template data class `views.Driven`, by name.
+
+        They state whether steps read time, inputs and precomputed expressions.
+        """
         target = self.accelerations.target
         return {
             "timed": target.driven, "inputs": bool(target.system.inputs),
@@ -120,20 +130,27 @@ class Steppers:
         }  # fmt: skip
 
     def looping(self, lane: Lane) -> dict[str, Any]:
-        """Return template fields by name: names of the scene, and the macro before loops."""
+        """Return template fields by name: the scene's C names, and the macro `unroll`.
+
+        The macro precedes loops over coordinates. lane: one number or a vector register.
+        """
         return self.functions.names | {"unroll": lane.unroll}
 
     def extended(self, lane: Lane) -> dict[str, Any]:
-        """Return template fields by name: names of the scene, and the length of vectors."""
+        """Return template fields by name: the scene's C names, and `extent`.
+
+        extent: length of the C vectors of coordinates. lane: one number or a vector register.
+        """
         return self.functions.names | {"extent": lane.extent}
 
     # what a step takes
 
     def stepping(self, lane: Lane) -> tuple[CArgument, ...]:
-        """Return the C arguments of a step that this scene needs, among q, qd, t, h, u and c.
+        """Return the arguments of the C function for one step: q, qd, t, h, u and c.
 
-        lane: one number or a vector register, which determines their types. c: the precomputed
-        expressions of the parameters.
+        Arguments that the scene does not need (t, u, c) are left out. h is the step size, and c the
+        struct of precomputed expressions of the parameters. lane: one number or a vector register;
+        it determines the C types.
         """
         real = self.accelerations.target.real.name
         names = [n for n in lane.argument_names if n != "s"]
@@ -142,10 +159,11 @@ class Steppers:
         return (*arguments[:position], CArgument(real, "h"), *arguments[position:])
 
     def advanced(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
-        """Return the prototype of the C function for the increments r of q and v of q̇ in a step.
+        """Return the prototype of the C function that computes one step of a method.
 
-        name: its C name, without prefix and suffix of the lane. extra: further arguments at the
-        end.
+        The function stores the increments of q and q̇ in its arguments r and v. lane: the C type
+        that it computes with. name: its C name without the scene's prefix and the lane's suffix.
+        extra: arguments added at the end.
         """
         out = tuple(c.output_array(lane.real.name, n) for n in "rv")
         return CFunction(
@@ -155,7 +173,10 @@ class Steppers:
     # methods
 
     def rk4(self, lane: Lane) -> views.RungeKutta4:
-        """Return the template data of a step of RK4 for one number or a vector register."""
+        """Return the template data of one step of RK4, the classical Runge-Kutta method.
+
+        lane: the C type that the step computes with, one number or a vector register.
+        """
         s = self.accelerations
         double, one = s.target.real is DOUBLE, not lane.name
         two_point = one and self.two_point
@@ -189,7 +210,10 @@ class Steppers:
         )
 
     def predictions(self) -> views.Predictions:
-        """Return the template data of the C functions that predict angles for RK4."""
+        """Return the template data of the C functions that extrapolate angles to the next RK4 step.
+
+        They compute the sines and cosines of these angles in advance.
+        """
         lane, angles = self.one, len(self.accelerations.angles)
         return views.Predictions(
             prefix=lane.prefix, real=lane.real.name, unroll=lane.unroll,
@@ -197,7 +221,10 @@ class Steppers:
         )  # fmt: skip
 
     def prediction(self) -> views.Predicted:
-        """Return the template data of the loop over steps of RK4 with predicted angles."""
+        """Return the template data of the C loop over steps of RK4 that use predicted angles.
+
+        Predicted angles are extrapolated from the step before.
+        """
         lane, s = self.one, self.accelerations
         signal = lane.signal.function if lane.signal else None
         shared = self.shared_signals
@@ -225,9 +252,10 @@ class Steppers:
         )
 
     def explicit(self, lane: Lane, m: Method) -> views.Explicit:
-        """Return the template data of a step of the explicit method `m`; RK4 has its own.
+        """Return the template data of a step of an explicit Runge-Kutta method `m`.
 
-        lane: one number or a vector register with values of several instances.
+        For RK4, `rk4` is used instead. lane: the C type that the step computes with, one number or
+        a vector register with values of several instances.
         """
         real = self.accelerations.target.real
 
@@ -274,7 +302,10 @@ class Steppers:
 
     @property
     def newton_p(self) -> bool:
-        """Whether the derivatives for Newton's method depend on the parameters p."""
+        """Whether the derivatives of the accelerations for Newton's method need the parameters p.
+
+        Newton's method solves the equations of the stages of implicit methods.
+        """
         slopes = self.slopes
         if slopes is None or not self.accelerations.target.needs_p:
             return False
@@ -332,7 +363,10 @@ class Steppers:
 
     @property
     def literals(self) -> dict[str, str]:
-        """Template fields by name: C literals and the name of the C function for |x|."""
+        """Template fields by name, for the C type of numbers.
+
+        f: suffix of C literals. fabs: name of the C function for |x|. eps: the rounding unit.
+        """
         real = self.one.real
         end = real.function_suffix
         return {
@@ -343,7 +377,8 @@ class Steppers:
     def sweep(self, m: Method) -> CFunction:
         """Return the prototype of the C function for one iteration over the stages of `m`.
 
-        It computes the stages side by side in vector registers.
+        From the accelerations at all stages of a step it computes improved ones, side by side in
+        vector registers.
         """
         P = f"{self.one.prefix}_{m.name}"
         out = c.output_array(f"{P}_stages", "b")
@@ -352,7 +387,10 @@ class Steppers:
         return c.static(f"{P}_sweep", "int", out, *arguments, *others)
 
     def stages(self, m: Method) -> views.Stages:
-        """Return the template data of one iteration over the stages of the method `m`."""
+        """Return the template data of the C function whose prototype `sweep` returns.
+
+        It makes one fixed-point iteration over all stages of a step by the implicit method `m`.
+        """
         lane, wide, real = self.one, self.wide, self.one.real
         fixed = m.name in lane.target.system.run.methods
 
@@ -382,7 +420,10 @@ class Steppers:
         )
 
     def sweeps(self, m: Method) -> views.Sweeps:
-        """Return the template data of a step of a method with a fixed number of iterations."""
+        """Return the template data of a step of an implicit method `m` that iterates `sweep`.
+
+        The number of iterations is fixed; if they do not converge, the step iterates further.
+        """
         lane, real = self.one, self.one.real
         P = f"{lane.prefix}_{m.name}"
         state = c.output_array(f"{P}_state", "m")
@@ -419,9 +460,10 @@ class Steppers:
 
 
 def stability(m: Method) -> str:
-    """Return the stability limits of a method as text for a comment.
+    """Return the stability limits of the method `m` as text for a C comment.
 
-    They are limits of h omega for undamped oscillation and of h lambda for pure decay.
+    The limits are the largest h omega for undamped oscillation with angular frequency omega, and
+    the largest h lambda for pure decay with rate lambda, where h is the step size.
     """
     undamped, decay = m.limits
     return f"h omega <= {undamped:.3g} undamped" + (
