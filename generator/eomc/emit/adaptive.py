@@ -37,14 +37,18 @@ EVENTS_PER_STEP = 32  # without events at the same time
 
 
 def memory(functions: Functions) -> str:
-    """Return the C type of the workspace of an adaptive run."""
+    """Return the name of the C struct for the workspace of a run with adaptive step-size control.
+
+    The workspace keeps data between the calls that continue a run.
+    """
     return f"{functions.prefix}_{METHOD.name}_adaptive_memory"
 
 
 def workspace_size(system: System, width: int) -> int:
-    """Return the number of floating-point numbers in the workspace of an adaptive run.
+    """Return the size of the workspace of an adaptive run, as a number of floating-point numbers.
 
-    width: length of a vector of coordinates in C, which may include padding.
+    The workspace keeps data between the calls that continue a run. `width` is the length of a
+    vector of coordinates in C, which may include padding.
     """
     vectors, scalars = (8, 26) if has_steep_terms(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
@@ -102,13 +106,14 @@ class Stepping:
 
     @property
     def method(self) -> str:
-        """The scene's name and the method's name, with which the C names begin."""
+        """The common prefix of the C names: the scene's name, "_" and the method's name."""
         return f"{self.functions.prefix}_{METHOD.name}"
 
     @property
     def constant_arguments(self) -> Sequence[CArgument]:
-        """The C arguments that are constant during a run: inputs u, precomputed c and parameters
-        p.
+        """The C arguments u, c and p, as far as this form has them; they are constant during a run.
+
+        These are the inputs, the precomputed expressions of parameters, and the parameters.
         """
         return [a for a in self.form.around if a.name in "ucp"]
 
@@ -123,7 +128,7 @@ class Stepping:
         return c.output_array(f"{self.method}_adaptive_state", "x")
 
     def number(self, name: str) -> CArgument:
-        """Return the C argument `name` for one floating-point number."""
+        """Return a C argument called `name` of the scene's floating-point type, passed by value."""
         return CArgument(self.functions.real, name)
 
     @cached_property
@@ -141,9 +146,10 @@ class Stepping:
 
     @property
     def may_rest(self) -> bool:
-        """Whether all bodies can be at rest although the motion depends on time.
+        """Whether all bodies can stay at rest although time-dependent forces act on them.
 
-        Friction may balance time-dependent forces. Rounding errors are then the only accelerations.
+        This is possible if the scene has friction that sticks, which may balance these forces.
+        Accelerations computed at rest are then rounding errors only.
         """
         target = self.functions.target
         return bool(target.system.modes) and target.driven
@@ -170,14 +176,18 @@ class Stepping:
 
     @cached_property
     def slopes(self) -> CFunction:
-        """The prototype of the function for the derivatives of the accelerations along q and qd."""
+        """The prototype of the function for the derivatives that Newton's method requires.
+
+        They are derivatives of the accelerations with respect to q and qd.
+        """
         out = c.output_array(f"{self.method}_newton", "m")
         return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
-        """The prototype of the function that makes the next step, whose size the tolerance
-        determines.
+        """The prototype of the function that makes the next adaptive step of a run.
+
+        The function chooses the step size by the error tolerance.
         """
         arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
@@ -187,7 +197,10 @@ class Stepping:
 
     @cached_property
     def interpolate(self) -> CFunction:
-        """The prototype of the function for the state at a fraction z of the last step."""
+        """The prototype of the function that interpolates q and qd within the last adaptive step.
+
+        Its argument z is the fraction of the step, from 0 to 1.
+        """
         out = tuple(c.output_array(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.input_array(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
@@ -204,8 +217,9 @@ class Stepping:
 
     @cached_property
     def fixed(self) -> CFunction:
-        """The prototype of the function that makes the next step of fixed size in a run with
-        events.
+        """The prototype of the function that makes the next step in a run of fixed step size.
+
+        Only scenes with events use it.
         """
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
         return c.static(
@@ -219,10 +233,10 @@ class Stepping:
 
     @cached_property
     def state_within(self) -> CFunction:
-        """The prototype of the function for the state at a fraction z of the last step, of any
-        kind.
+        """The prototype of the function that computes q and qd within the last step.
 
-        If the scene has events, the step may be adaptive or of fixed size.
+        Its argument z is the fraction of the step, from 0 to 1. If the scene has events, the last
+        step may be adaptive or of fixed size.
         """
         if not self.functions.target.system.events:
             return self.interpolate
@@ -231,9 +245,9 @@ class Stepping:
 
 
 def tableau(stepping: Stepping) -> dict[str, Any]:
-    """Return the template variables that all templates of adaptive steps share.
+    """Return the variables, by name, that all templates of adaptive steps share.
 
-    These are coefficients of the method, tolerances and names.
+    These are the coefficients of the integration method, tolerances and C names.
     """
     m, target = METHOD, stepping.functions.target
     real = target.real
@@ -257,7 +271,10 @@ def tableau(stepping: Stepping) -> dict[str, Any]:
 
 
 def steps(stepping: Stepping) -> Adaptive:
-    """Return the data for the template of one adaptive step and of the states within it."""
+    """Return the data for the template of the C code that makes one adaptive step.
+
+    The template also has the code that interpolates the state within the step.
+    """
     functions, m, form = stepping.functions, METHOD, stepping.form
     target, real = functions.target, functions.target.real
     references = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
@@ -308,7 +325,7 @@ def steps(stepping: Stepping) -> Adaptive:
 
 
 def fixed(stepping: Stepping) -> FixedSteps:
-    """Return the data for the template of steps of fixed size with event detection."""
+    """Return the data for the template of C code that makes steps of fixed size with event detection."""
     functions = stepping.functions
     target, real = functions.target, functions.target.real
     at = {"q": "q_at", "qd": "qd_at"}
@@ -335,18 +352,18 @@ def fixed(stepping: Stepping) -> FixedSteps:
 
 
 def max_events_per_step(system: System) -> int:
-    """Return the number of events in a step after which the step ends early."""
+    """Return the number of events in one step at which the step is ended early."""
     return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
 def row_storage(stepping: Stepping) -> CFunction:
-    """Return the prototype of the C function that stores q and qd in the output arrays of a run."""
+    """Return the prototype of the C function that stores a state (q, qd) in a run's output arrays."""
     arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 
 
 def tightest(real: Real) -> float:
-    """Return the smallest error tolerance that is possible with the C type of numbers."""
+    """Return the smallest error tolerance of adaptive steps that the type `real` permits."""
     return 1e-15 if real.epsilon < 1e-10 else 5e-7
 
 
@@ -425,7 +442,11 @@ def steps_in_parallel(target: Target) -> bool:
 
 
 def call_for_instance(functions: Functions) -> str:
-    """Return the C call that continues the adaptive run of instance k of a batch."""
+    """Return the C call that continues the adaptive run of one instance of a batch.
+
+    A batch is a number of instances of the system. The call is in a loop in which k is the index of
+    the instance.
+    """
     NQ = functions.NQ
     rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
     return functions.public.adaptive(METHOD.name).call(
@@ -439,9 +460,9 @@ def call_for_instance(functions: Functions) -> str:
 
 
 def batch(functions: Functions) -> AdaptiveBatch:
-    """Return the data for the template of a batch of adaptive runs.
+    """Return the data for the template of the C function that makes a batch of adaptive runs.
 
-    The C code steps one instance after the other.
+    A batch is a number of instances of the system. The C code steps one instance after the other.
     """
     return AdaptiveBatch(
         prefix=functions.prefix,

@@ -15,7 +15,7 @@ from eomc.integrators.tableaux import Method, Row
 
 
 def literal(x: Fraction, real: Real) -> str:
-    """Return a coefficient as a C literal in the type of numbers."""
+    """Return the fraction x as a C literal of the type `real`."""
     return c_expression.number(Rational(x.numerator, x.denominator), real)
 
 
@@ -26,10 +26,10 @@ def _nearest(x: Fraction, real: Real) -> Fraction:
 
 
 def rounded(weights: Row, real: Real) -> Row:
-    """Return weights rounded to the type of numbers, such that their sum is exact.
+    """Return the weights of a method rounded to the type `real` such that their sum stays exact.
 
-    An error of the sum would accumulate over steps. The smallest weight takes the rounding error of
-    the sum; for symmetric methods, two equal weights share it.
+    An error of the sum would accumulate over steps. It is therefore corrected in the smallest
+    weight for which this is exact, or in two equal weights if the method is symmetric.
     """
     if not real.dtype:  # 113 bits, for references
         return weights
@@ -45,13 +45,14 @@ def rounded(weights: Row, real: Real) -> Row:
 
 
 def numbers(row: Row, real: Real) -> tuple[str, ...]:
-    """Return a row of coefficients as C literals."""
+    """Return each coefficient of a row as a C literal of the type `real`."""
     return tuple(literal(x, real) for x in row)
 
 
 def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
-    """Return the rows of a square matrix as lines of a C initialiser; short rows are padded with
-    zeros.
+    """Return the lines of a C initialiser for a square matrix, one line for each row.
+
+    Rows shorter than the matrix are padded with zeros.
     """
     padded = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
     return c_function.in_braces(numbers(row, real) for row in padded)
@@ -72,7 +73,7 @@ class Tableau(TypedDict):
 
 
 def tableau(m: Method, real: Real) -> Tableau:
-    """Return the coefficients of a method as C literals in the type of numbers."""
+    """Return the coefficients of the integration method `m` as C literals of the type `real`."""
     return Tableau(
         c=numbers(m.c, real),
         A=matrix(m.a, real),

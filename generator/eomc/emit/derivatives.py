@@ -16,10 +16,11 @@ MAX_NEWTON_ITERATIONS = 50  # for the stages
 
 
 def derivatives(plain: Functions) -> Iterator[Derivative]:
-    """Yield the data for the template of the derivatives of a step, for each integration method.
+    """Yield, for each integration method, the data for the template of the derivatives of a step.
 
-    Yields nothing if the scene does not request derivatives. The first method's data include
-    functions that all methods share.
+    The derivatives are with respect to q, qd and u. Nothing is yielded if the scene does not
+    request them. The first method's data include the C functions that all methods share. `plain`
+    has the C functions in portable form.
     """
     target, real = plain.target, plain.target.real
     run = target.system.run

@@ -43,7 +43,7 @@ class Kind:
 
     @property
     def takes_u(self) -> bool:
-        """Whether the function may read inputs."""
+        """Whether the function may read the inputs u."""
         return "u" in self.takes.split()
 
     @property
@@ -128,10 +128,7 @@ _SPACE = {
 
 
 def doc(target: Target, name: str) -> str:
-    """Return the comment of the evaluation function `name` for the C header.
-
-    The wording depends on whether the system is planar or spatial.
-    """
+    """Return the text of the comment above the evaluation function `name` in the C header."""
     text = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
     if name == "inverse_dynamics" and target.system.constraints:
         text = text.replace("tau =", "tau + A^T lambda =")
@@ -139,7 +136,7 @@ def doc(target: Target, name: str) -> str:
 
 
 def c_array_size(target: Target, shape: str) -> str:
-    """Return the number of elements of a shape as a C expression.
+    """Return the number of elements of an output array as a C expression, such as "CARTPOLE_NQ".
 
     shape: sizes and products of them, as in `Kind.shape`: n coordinates, m inputs, y outputs, and
     so on. Returns "" for other shapes.
@@ -171,15 +168,15 @@ def c_array_size(target: Target, shape: str) -> str:
 def source(target: Target, name: str) -> Function | None:
     """Return the function of the program from which the C function `name` is generated.
 
-    It computes all results, or the product of a matrix with a direction, which gives one column.
-    None if the program has neither.
+    This function computes all results of the C function. For some matrices it computes the product
+    with a direction instead, which gives one column. Returns None if the program has neither.
     """
     functions = target.program.functions
     return functions.get(name) or functions.get(f"{name}_column")
 
 
 def refuses(target: Target, name: str) -> bool:
-    """Return True if the C function `name` returns a status.
+    """Return True if the evaluation function `name` returns a status code in C.
 
     It does so if it factors a matrix that may be singular.
     """
@@ -198,9 +195,9 @@ def takes_qdd(target: Target, name: str) -> bool:
 
 
 def takes_t(target: Target, name: str) -> bool:
-    """Return True if the evaluation function `name` depends on time.
+    """Return True if the evaluation function `name` takes the time as an argument.
 
-    It may do so through the signals, the functions by which the scene defines its inputs.
+    It may depend on time only through the signals, the functions that define the scene's inputs.
     """
     function = source(target, name)
     assert function is not None

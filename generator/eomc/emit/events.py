@@ -35,7 +35,7 @@ DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
 
 def nodes() -> Row:
-    """Return the nodes in [0, 1], as fractions of a step, at which event functions are evaluated.
+    """Return the fractions of a step, from 0 to 1, at which event functions are evaluated.
 
     They are the extrema of a Chebyshev polynomial and include both ends.
     """
@@ -45,9 +45,10 @@ def nodes() -> Row:
 
 
 def slopes(x: Row) -> Sequence[Row]:
-    """Return the differentiation matrix of polynomial interpolation at the nodes x.
+    """Return the differentiation matrix of polynomial interpolation at the points x.
 
-    It maps values at the nodes to the derivatives of the interpolating polynomial at the nodes.
+    The matrix maps a function's values at these points to the derivatives of the interpolating
+    polynomial at the same points.
     """
     weights = [1 / prod((a - b for b in x if b != a), start=Fraction(1)) for a in x]
     rows = [
@@ -60,9 +61,10 @@ def slopes(x: Row) -> Sequence[Row]:
 
 
 def last(count: int) -> Sequence[Row]:
-    """Return two rows of weights that give the last two Chebyshev coefficients of a function.
+    """Return two rows of weights that yield the last two Chebyshev coefficients of a function.
 
-    The weights apply to its values at `count` nodes (the extrema of a Chebyshev polynomial).
+    Each coefficient is the weighted sum of the function's values at `count` points, the extrema of
+    a Chebyshev polynomial.
     """
     top = count - 1
     ends = [Fraction(1, 2) if j in (0, top) else Fraction(1) for j in range(count)]
@@ -77,10 +79,10 @@ def last(count: int) -> Sequence[Row]:
 
 
 def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
-    """Return the integrals of (2 c - 1)^n over c from 0 to each x, a row for each x.
+    """Return the integrals of the powers (2 c - 1)^n over c, from 0 to each x.
 
-    Column n is the power, n < `count`. times: 1 for the integral, 2 for the integral of the
-    integral.
+    The result has a row for each x and a column for each power n < `count`. With `times` = 2, it
+    has the integrals of these integrals.
     """
     signs = [Fraction((-1) ** n) for n in range(count + 3)]
 

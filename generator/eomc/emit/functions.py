@@ -69,9 +69,9 @@ class Functions:
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
     def groups_angles(self, function: Function) -> bool:
-        """Return True if the C code computes sines of several angles at once in vector registers.
+        """Return True if `function` computes sines of several angles at once in vector registers.
 
-        D is excluded, because selftest.c verifies by it the sines that the steps use.
+        D is excluded: selftest.c uses D to verify the sines that the steps compute.
         """
         return self.target.real.reach > 0 and function.name not in ("D", "D_column")
 
@@ -103,7 +103,7 @@ class Functions:
 
     @property
     def singular(self) -> str:
-        """The status code for a mass matrix D that is not positive definite, as a C enumerator."""
+        """The status code, as a C enumerator, for a mass matrix D that is not positive definite."""
         return f"{self.PREFIX}_SINGULAR"
 
     @cached_property
@@ -113,7 +113,7 @@ class Functions:
 
     @cached_property
     def supplied_names(self) -> Mapping[str, frozenset[str]]:
-        """For each C argument (q, qd, u, p, ...), the names of the variables that it contains."""
+        """The names of the variables that each C argument (q, qd, u, p, ...) contains, by argument."""
         return self.target.groups()
 
     def argument(self, name: str) -> CArgument:
@@ -127,9 +127,9 @@ class Functions:
         return CArgument(self.real, name)
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
-        """Return the C arguments with these names, without those that the scene does not have.
+        """Return the arguments of C functions with the given names, such as q, qd, t, u or p.
 
-        A scene without inputs has no u, and one without parameters no p.
+        Arguments that the scene does not need are left out: u without inputs, p without parameters.
         """
         there = {"u": bool(self.target.system.inputs), "p": self.target.needs_p}
         return tuple(self.argument(n) for n in names if there.get(n, True))
@@ -142,9 +142,9 @@ class Functions:
 
     @property
     def moves_stages(self) -> tuple[CArgument, ...]:
-        """The C argument `onto`, a flag to project the stages of a step onto the constraints.
+        """The C argument `onto` in a tuple; the tuple is empty without constraints.
 
-        Empty without constraints.
+        It is a flag: whether the stages of a Runge-Kutta step are projected onto the constraints.
         """
         return (CArgument("int", "onto"),) if self.projection else ()
 
@@ -154,9 +154,9 @@ class Functions:
         return (*STATE, "t") if self.target.driven else STATE
 
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
-        """Return those of the C arguments `names` that a function of the program reads.
+        """Return those C arguments among `names` that a function of the program reads.
 
-        Arrays are passed as pointers, as in static functions.
+        Arrays are declared as pointers, without their size.
         """
         needed = [n for n in names if function.uses & self.supplied_names[n]]
         arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
@@ -168,10 +168,10 @@ class Functions:
 
     @cached_property
     def signal(self) -> CFunction | None:
-        """The prototype of the C function that computes u by the scene's signals.
+        """The prototype of the C function that computes the inputs u by the scene's signals.
 
-        A signal is the function of time and state by which the scene defines an input. None without
-        inputs.
+        A signal is the function of time and state by which the scene defines an input. None if the
+        scene has no inputs.
         """
         if "signal" not in self.target.program:
             return None
@@ -182,9 +182,10 @@ class Functions:
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
     def signals(self, function: Function) -> tuple[Block, ...]:
-        """Return C statements that set u to the scene's signals if the caller passes NULL for u.
+        """Return C statements that compute the inputs u if the caller passes NULL for u.
 
-        Empty if the function does not read the inputs.
+        They call the C function of the scene's signals, the functions of time and state that define
+        the inputs. Empty if `function` does not read inputs.
         """
         if self.signal is None or not self.reads_u(function):
             return ()
@@ -192,13 +193,15 @@ class Functions:
         return (Block("", (c.local(self.real, f"now[{self.NU}]"),)), Block("", lines))
 
     def reads_u(self, function: Function) -> bool:
-        """Return True if a function of the program reads inputs."""
+        """Return True if a function of the program reads inputs (elements of u)."""
         return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
     def read(self, function: Function, follows: bool = True) -> frozenset[str]:
-        """Return the names of the C arguments (q, qd, u, p, ...) that a function reads.
+        """Return the names of the C arguments (q, qd, u, p, ...) that a function of the program reads.
 
-        With `follows`, include the arguments of the scene's signals if the function reads inputs.
+        If the caller of a C function passes no inputs, the scene's signals compute them. These are
+        functions of time and state. With `follows`, their arguments are included in the result if
+        the function reads inputs.
         """
         names = {n for n, brings in self.supplied_names.items() if function.uses & brings}
         if follows and self.reads_u(function) and self.signal is not None:
@@ -210,7 +213,7 @@ class Functions:
     def loads(self, function: Function) -> Block:
         """Return definitions of C local variables for the array elements that a function reads.
 
-        For example `const double theta = q[CARTPOLE_THETA];`.
+        An example is `const double theta = q[CARTPOLE_THETA];`.
         """
         return Block(
             "", tuple(self.target.loads(function, self.target.element, self.target.element))
@@ -288,11 +291,14 @@ class Functions:
 
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
-        """The evaluation functions of the scene, such as D or energy, in header order."""
+        """The C functions that evaluate quantities such as D or energy, in the order of the header."""
         return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
 
     def evaluation(self, name: str) -> Computed:
-        """Return the C function that evaluates `name`, such as D, bias or signal, with its body."""
+        """Return the C function, with its body, that evaluates a quantity.
+
+        `name` is the name of the quantity, such as D, bias or signal.
+        """
         kind, target = KINDS[name], self.target
         function = source(target, name)
         assert function is not None
@@ -369,10 +375,11 @@ class Functions:
     def static(
         self, function: Function, name: str, out: str, doc: str, fails: bool = False
     ) -> Computed:
-        """Return a static C function `name` that computes a function of the program.
+        """Return a static C function that computes a function of the program.
 
-        out: name of the array that the results are written to. doc: its comment. fails: whether it
-        checks the pivots of a matrix factorization and returns a status.
+        name: name in C. out: name of the array that the results are written to. doc: comment above
+        the C function. fails: whether it checks the pivots of a matrix factorization and returns a
+        status code.
         """
         values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
@@ -397,7 +404,7 @@ class Functions:
 
     @cached_property
     def projection(self) -> Computed | None:
-        """The static C function for the corrections that project q and qd onto the constraints.
+        """The static C function that computes the corrections of q and qd onto the constraints.
 
         None without constraints.
         """
@@ -408,9 +415,10 @@ class Functions:
 
     @cached_property
     def rotation_errors(self) -> Computed | None:
-        """The static C function for the rotation errors of closed loops and their derivatives.
+        """The static C function that computes the rotation errors of closed kinematic loops.
 
-        None if no loop has axis equations. See `Constraint.rotation_error` for the definition.
+        It also computes their derivatives. None if no loop constrains the directions of axes. See
+        `Constraint.rotation_error` for the definition.
         """
         function = self.target.program.functions.get("rotation_errors")
         if function is None:
@@ -433,9 +441,11 @@ class Functions:
 
     @cached_property
     def rate_terms(self) -> Computed | None:
-        """The static C function for the rates of constraint equations that the projection may drop.
+        """The static C function that computes the rates (time derivatives) of constraint equations.
 
-        It also computes the sum of |terms| of each, as a scale. None if no equation may be dropped.
+        These are the equations that the projection may drop near singular configurations. The
+        function also computes, as a scale for each rate, the sum of |terms|. None if there are no
+        such equations.
         """
         function = self.target.program.functions.get("rate_terms")
         if function is None:
@@ -444,10 +454,10 @@ class Functions:
 
     @cached_property
     def projection_along(self) -> Computed | None:
-        """The static C function for corrections onto the constraints and their directional
-        derivatives.
+        """The static C function that computes corrections of q and qd and their derivatives.
 
-        None if the scene has no constraints or does not request derivatives of steps.
+        The corrections move q and qd onto the constraints. The derivatives are along a direction in
+        q, qd and u. None if the scene has no constraints or does not request derivatives of steps.
         """
         function = self.target.program.functions.get("projection_along")
         if function is None:
@@ -457,9 +467,9 @@ class Functions:
 
     @cached_property
     def projected(self) -> CFunction:
-        """The static C function of the portable form that projects the state after a step.
+        """The prototype of the static C function that projects the state after a step.
 
-        The prototype only; the body is in a template.
+        It belongs to the portable form of the C code. Its body is in a template.
         """
         moved, more = self._projection_arguments
         q, far = self.argument("q"), CArgument("int *", "singular")
@@ -467,9 +477,10 @@ class Functions:
 
     @cached_property
     def onto(self) -> CFunction:
-        """The static C function that projects the state at a stage onto the constraints.
+        """The prototype of the static C function that projects the state at a stage of a step.
 
-        It makes one correction, of first order. The prototype only; the body is in a template.
+        The function makes one correction onto the constraints, of first order. Its body is in a
+        template.
         """
         moved, more = self._projection_arguments
         return c.static(f"{self.prefix}_onto", "int", *moved, *more)
@@ -485,7 +496,7 @@ class Functions:
 
     @cached_property
     def acceleration(self) -> Computed:
-        """The C function that computes the accelerations qdd and returns a status."""
+        """The C function that computes the accelerations qdd; it returns a status code."""
         function = self.target.program["acceleration"]
         force = "tau + A^T lambda" if self.target.system.constraints else "tau"
         doc = [
@@ -520,7 +531,7 @@ class Functions:
 def portable_functions(program: Program, real: Real | None = None) -> Functions:
     """Return the C functions of a program in portable form, which uses sin and cos of libm.
 
-    real: C type of the numbers; by default that of the scene.
+    real: C type of the numbers; None for the type that the scene specifies.
     """
     return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
 
@@ -530,9 +541,10 @@ def indexed(
     items: Sequence[Constraint | Coordinate | Event | Input | Output],
     prefix: str = "",
 ) -> tuple[Indexed, ...]:
-    """Return the enumerator, unit and note of coordinates, inputs, outputs, constraints or events.
+    """Return the C enumerator, unit and note of each of the given items of the scene.
 
-    prefix: "OUT_", "EVENT_" or "CONSTRAINT_", by which `Target.enum` distinguishes equal names.
+    items: coordinates, inputs, outputs, constraints or events. prefix: "OUT_", "EVENT_" or
+    "CONSTRAINT_", which `Target.enum` adds to the names of such items.
     """
     enum = plain.target.enum
     return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in items)
@@ -547,10 +559,10 @@ def parameters(plain: Functions) -> tuple[Parameter, ...]:
 
 
 def handshake(plain: Functions) -> str:
-    """Return a hexadecimal C constant that the C source and its header must share.
+    """Return a hexadecimal C constant that must be the same in the C source and in its header.
 
-    The compiler compares them. Optimised C has another constant, since its workspaces differ in
-    size.
+    The C compiler reports a header of another scene or form. Optimised C has another constant than
+    portable C, since its workspaces differ in size.
     """
     digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
     return f"0x{digest[:8]}u"

@@ -25,18 +25,19 @@ STARTS = 16  # random starts, if the search from a state does not converge
 
 
 def near(target: Target) -> float:
-    """Return the square of the relative change of a coordinate above which a correction is large.
+    """Return the threshold above which a correction by the projection onto constraints is large.
 
-    It is a few times the rounding error of the type of numbers.
+    It applies to the square of the relative change of a coordinate. It is a few times the rounding
+    error of the C type of numbers.
     """
     return 8 * target.real.epsilon
 
 
 def width(target: Target) -> int:
-    """Return the number of results of the C function that computes the corrections onto the
-    constraints.
+    """Return the number of results of the C function that computes corrections for constraints.
 
-    These are corrections of q and qd, and inverse pivots of the constraint equations.
+    The results are the corrections that move q and qd onto the constraints, and one inverse pivot
+    for each constraint equation.
     """
     return len(target.program["projection"].outputs)
 
@@ -107,8 +108,9 @@ def view(
 
 
 def plain(functions: Functions) -> Projection | None:
-    """Return the data for the projection onto the constraints in portable C; None without
-    constraints.
+    """Return the data for the template of the projection onto the constraints, in portable C.
+
+    Returns None if the scene has no constraints. Portable C is the form for all compilers.
     """
     projection = functions.projection
     if projection is None:

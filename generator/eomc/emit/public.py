@@ -22,10 +22,10 @@ class Public:
     target: Target
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
-        """Return the C arguments with these names, without those that the scene does not have.
+        """Return the arguments of C functions with the given names, such as q, qd, t, u or p.
 
-        A scene without inputs has no u, one without parameters no p, and one whose motion does not
-        depend on time no t.
+        Arguments that the scene does not need are left out: u without inputs, p without parameters,
+        and t if the motion does not depend on time.
         """
         target, real = self.target, self.target.real.name
         arguments = {
@@ -42,11 +42,17 @@ class Public:
         return tuple(a for name in names if (a := arguments[name]))
 
     def evaluations(self) -> tuple[CFunction, ...]:
-        """Return the prototypes of all evaluation functions of the scene, such as D and energy."""
+        """Return the prototypes of the C functions that evaluate one quantity, such as D or energy.
+
+        Quantities that the scene does not have are left out.
+        """
         return tuple(map(self.evaluation, (n for n in KINDS if source(self.target, n) is not None)))
 
     def evaluation(self, name: str) -> CFunction:
-        """Return the prototype of the evaluation function `name`, such as D or energy."""
+        """Return the prototype of the C function that evaluates a quantity.
+
+        `name` is the name of the quantity, such as D or energy.
+        """
         kind, target, real = KINDS[name], self.target, self.target.real.name
         signal = name == "signal"
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
@@ -72,16 +78,20 @@ class Public:
 
     @property
     def acceleration(self) -> CFunction:
-        """The prototype of the function that computes qdd and returns a status."""
+        """The prototype of the C function that computes the accelerations qdd.
+
+        The function returns a status code.
+        """
         target = self.target
         qdd = output_array(target.real.name, "qdd", f"{target.PREFIX}_NQ")
         return self._status("acceleration", qdd, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
     def linearization(self) -> CFunction:
-        """The prototype of the function that computes the derivatives of the accelerations.
+        """The prototype of the C function that linearizes the accelerations.
 
-        These are the matrices A_q, A_qd and B, along q, qd and u. The function returns a status.
+        It computes their partial derivatives A_q, A_qd and B with respect to q, qd and u. The
+        function returns a status code.
         """
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
         widths = {"A_q": NQ, "A_qd": NQ}
@@ -96,9 +106,9 @@ class Public:
 
     @property
     def project(self) -> CFunction:
-        """The prototype of the function that projects a state onto the constraints.
+        """The prototype of the C function that projects a state (q, qd) onto the constraints.
 
-        It overwrites the state and returns a status.
+        It overwrites the state and returns a status code.
         """
         names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
         t = self.arguments(*["t"] if any(takes_t(self.target, n) for n in names) else [])
@@ -106,29 +116,31 @@ class Public:
         return self._status("project", *self._state, *t, fixed, *self.arguments("p"))
 
     def step(self, method: str) -> CFunction:
-        """Return the prototype of the function for one step of a method.
+        """Return the prototype of the C function that makes one step of fixed size.
 
-        It overwrites the state and returns a status.
+        `method` is the name of the integration method. The function overwrites q and qd with the
+        state after the step and returns a status code.
         """
         return self._status(f"{method}_step", *self._state, *self.arguments("t", "h", "u", "p"))
 
     @property
     def fixed_step(self) -> CFunction:
-        """The prototype for calls of a step of fixed size through a function pointer.
+        """The prototype of the function pointer by which an adaptive run makes steps of fixed size.
 
-        The pointer is a member of the workspace of an adaptive run, `memory->step`.
+        The pointer is a member of the workspace of the run, `memory->step`.
         """
         return replace(self.step("fixed"), name=member("memory", "step"))
 
     @property
     def fixed_type(self) -> CFunction:
-        """The function type of a step of fixed size, for its typedef in the header."""
+        """The type of functions that make a step of fixed size, for a typedef in the header."""
         return self.step("fixed")
 
     def derivative(self, method: str) -> CFunction:
-        """Return the prototype of the function for the derivatives of one step of a method.
+        """Return the prototype of the C function that differentiates one step of a method.
 
-        These are Phi, along [q, qd], and Gamma, along u. The function returns a status.
+        It computes the partial derivatives of the state [q, qd] after the step: Phi with respect to
+        [q, qd] before the step, and Gamma with respect to u. The function returns a status code.
         """
         target, NQ = self.target, f"{self.target.PREFIX}_NQ"
         out = [output_array(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
@@ -139,8 +151,9 @@ class Public:
         )
 
     def run(self, method: str) -> CFunction:
-        """Return the prototype of the function for many steps of a method, which overwrites the
-        state.
+        """Return the prototype of the C function that makes many steps of fixed size by a method.
+
+        The function overwrites q and qd with the final state.
         """
         P = self.target.prefix
         strides = [CArgument("long", "u_stride")] if self.target.system.inputs else []
@@ -155,8 +168,10 @@ class Public:
         )  # fmt: skip
 
     def batch(self, method: str) -> CFunction:
-        """Return the prototype of the function for many steps of several instances of the
-        system.
+        """Return the prototype of the C function that makes many steps of fixed size for a batch.
+
+        `method` is the name of the integration method. A batch is a number of instances of the
+        system, each with its own state.
         """
         target, real = self.target, self.target.real.name
         strides = [CArgument("long", name) for name in ("u_instance", "u_step", "p_instance")]
@@ -173,7 +188,10 @@ class Public:
         )  # fmt: skip
 
     def adaptive(self, method: str) -> CFunction:
-        """Return the prototype of the function for a run with adaptive step-size control."""
+        """Return the prototype of the C function that makes a run with adaptive step-size control.
+
+        `method` is the name of the integration method.
+        """
         P, real = self.target.prefix, self.target.real.name
         name = f"{P}_{method}_adaptive"
         return CFunction(
@@ -191,8 +209,10 @@ class Public:
         )  # fmt: skip
 
     def adaptive_batch(self, method: str) -> CFunction:
-        """Return the prototype of the function for adaptive runs of several instances of the
-        system.
+        """Return the prototype of the C function that makes adaptive runs of a batch.
+
+        `method` is the name of the integration method. A batch is a number of instances of the
+        system, each with its own state and time.
         """
         target, real = self.target, self.target.real.name
         name = f"{target.prefix}_{method}_adaptive"
@@ -215,10 +235,10 @@ class Public:
 
     @property
     def adaptive_events(self) -> tuple[CArgument, ...]:
-        """The C arguments of an adaptive run that receive the detected events.
+        """The C arguments by which an adaptive run returns the detected events.
 
-        They are the maximum number of events, their number, their indices, and rows with time and
-        state.
+        They are the capacity of the arrays, the number of events so far, the index of each event,
+        and an array with the time and state of each event.
         """
         return (
             CArgument("long", "room"), output_array("long", "events"), output_array("int", "which"),
