@@ -325,7 +325,7 @@ def steps(stepping: Stepping) -> Adaptive:
 
 
 def fixed(stepping: Stepping) -> FixedSteps:
-    """Return the data for the template of C code that makes steps of fixed size with event detection."""
+    """Return the data for the template of steps of fixed size in which events are detected."""
     functions = stepping.functions
     target, real = functions.target, functions.target.real
     at = {"q": "q_at", "qd": "qd_at"}
@@ -357,7 +357,7 @@ def max_events_per_step(system: System) -> int:
 
 
 def row_storage(stepping: Stepping) -> CFunction:
-    """Return the prototype of the C function that stores a state (q, qd) in a run's output arrays."""
+    """Return the prototype of the C function that stores a state in a run's output arrays."""
     arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 

@@ -113,7 +113,7 @@ class Functions:
 
     @cached_property
     def supplied_names(self) -> Mapping[str, frozenset[str]]:
-        """The names of the variables that each C argument (q, qd, u, p, ...) contains, by argument."""
+        """For each C argument (q, qd, u, p, ...), the names of the variables in it."""
         return self.target.groups()
 
     def argument(self, name: str) -> CArgument:
@@ -197,7 +197,7 @@ class Functions:
         return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
     def read(self, function: Function, follows: bool = True) -> frozenset[str]:
-        """Return the names of the C arguments (q, qd, u, p, ...) that a function of the program reads.
+        """Return the names of the C arguments (q, qd, u, p, ...) that a function reads.
 
         If the caller of a C function passes no inputs, the scene's signals compute them. These are
         functions of time and state. With `follows`, their arguments are included in the result if
@@ -291,7 +291,7 @@ class Functions:
 
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
-        """The C functions that evaluate quantities such as D or energy, in the order of the header."""
+        """The C functions that evaluate quantities such as D or energy, in header order."""
         return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
 
     def evaluation(self, name: str) -> Computed:
