@@ -31,9 +31,9 @@ DRAWS = 2  # of starts that are a rounding off
 
 
 class Batches:
-    """Checks of batches: runs of COUNT instances by fixed steps, computed side by side.
+    """Checks of batches: COUNT instances of a system, run side by side by fixed steps.
 
-    runs: the checks of single runs. singular: states at which D is singular.
+    runs: the checks of single runs. singular: states at which the mass matrix D is singular.
     """
 
     def __init__(self, runs: Runs, singular: list[State]) -> None:
@@ -47,7 +47,10 @@ class Batches:
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
     def report(self) -> None:
-        """Append checks of batches to the report of `eomc check`: values, bits and failures."""
+        """Append the checks of batches to the report of `eomc check`.
+
+        They concern the values, the equality of bits with single runs, and instances that fail.
+        """
         row = self.check.row
         for method in self.check.methods:
             row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
@@ -59,10 +62,10 @@ class Batches:
                     partial(self.failures, method))  # fmt: skip
 
     def sample_instances(self) -> list[State]:
-        """Return COUNT initial states with parameters of their own, all with a regular D.
+        """Return COUNT initial states with different parameters, all with a regular mass matrix D.
 
-        Some have angles of many turns, some velocities so high that sines can't be predicted in a
-        step.
+        Some have angles of many turns. Some have velocities so high that the C code can't update
+        sines within a step from the previous ones.
         """
         sampler, instances = self.check.sampler, []
         t = self.runs.states[-1].t
@@ -83,8 +86,8 @@ class Batches:
     def projected(self, s: State, near: State) -> State:
         """Return the state `s` projected onto the constraints.
 
-        If that fails, return the projection of the state `near` or else the initial state of the
-        scene.
+        If the projection fails, return that of the state `near`; if that fails too, return the
+        scene's initial state.
         """
         if not self.check.system.constraints:
             return s
@@ -116,10 +119,11 @@ class Batches:
             )  # fmt: skip
 
     def tables(self) -> list[Vector | None]:
-        """Return the kinds of inputs to be tried: None, (COUNT, nu) and (COUNT, STEPS, nu).
+        """Return the kinds of inputs with which batches are tried, as arguments of `simulate`.
 
-        None stands for the scene's signals, the second are constant inputs and the third have
-        values for each step. For a scene without inputs only None is returned.
+        They are None for the scene's signals (its formulas for inputs), constant inputs (COUNT,
+        nu), and inputs that change from step to step (COUNT, STEPS, nu). Without inputs, the list
+        is [None].
         """
         if not self.model.nu:
             return [None]
@@ -128,11 +132,11 @@ class Batches:
         return [None, rows[:, 0], rows]
 
     def compare_with_single_steps(self, method: str) -> float | Measurement:
-        """Return the largest difference of steps in a batch from single steps, in roundings.
+        """Return the largest difference between steps in a batch and single steps, in roundings.
 
-        Each single step starts at the state that the instance had in the batch before that step.
-        Whole runs are not compared: where steps are too long for the motion, they diverge by
-        rounding alone.
+        Each single step starts at the state that an instance had in the batch before its step.
+        Whole runs are not compared: if steps are too long for the motion, runs diverge by rounding
+        alone.
         """
         errors: list[float | None] = []
         for u in self.tables():
@@ -147,10 +151,10 @@ class Batches:
         return largest(errors, "no step of an instance has digits to compare")
 
     def step_off(self, method: str, s: State, end: Vector) -> float | None:
-        """Return the difference of a step in a batch from a single step, in units of rounding.
+        """Return the difference between a step in a batch and a single step, in units of rounding.
 
-        s: the state before the step. end: q and q̇ after it in the batch, (2, nq). None if rounding
-        leaves no digit to compare.
+        s: the state before the step. end: q and q̇ after the step in the batch, (2, nq). The result
+        is None if rounding errors leave no digit to compare.
         """
         x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
         spread = self.runs.sampler.scale
@@ -170,9 +174,10 @@ class Batches:
     def places(self, method: str) -> float:
         """Return the number of batch runs in which some instance does not have the expected bits.
 
-        The expected bits are those in a run of all instances. The runs have another order, fewer
-        instances or fewer stored states, or are single steps; in others, instances with long steps
-        get other neighbours. Runs with shared and with own parameters must agree but for rounding.
+        The expected bits are those of a run of all instances together. They are compared with runs
+        of the instances in another order, of fewer instances, with fewer stored states, and with
+        single calls of `step_batch`. Without constraints, instances with long steps are also run
+        beside other neighbours. Runs with shared and with own parameters may differ by rounding.
         """
         wrong = 0
         for u in self.tables():
@@ -206,7 +211,7 @@ class Batches:
         )
 
     def rounded(self, states: list[State]) -> list[State]:
-        """Return copies of the states in which each number of q and q̇ is off by one rounding."""
+        """Return copies of the states with each number of q and q̇ changed by about one rounding."""
         eps, n = self.check.eps, len(states[0].q)
         signs = self.random.choice([-eps, eps], (len(states), 2, n))
         moved = [
@@ -216,10 +221,12 @@ class Batches:
         return [replace(s, q=x[0], qd=x[1]) for s, x in zip(states, moved, strict=True)]
 
     def near(self, one: Any, other: Any, rounded: Sequence[Any]) -> bool:
-        """Return whether batch runs with shared and with own parameters differ by rounding only.
+        """Return whether two batch runs, `one` and `other`, differ by rounding only.
 
-        A compiler takes products of shared parameters out of its loop, and rounds them there.
-        rounded: batch runs from initial states that differ by one rounding.
+        In one of them all instances share their parameters, in the other each has its own. Results
+        may differ by rounding since a compiler may compute products of shared parameters before its
+        loop. rounded: batch runs from initial states that are changed by one rounding; they show
+        the effect of rounding.
         """
         spread = self.runs.sampler.scale[:, None, None]
         rows, others, *near = (np.array([x.q, x.qd], float) for x in (one, other, *rounded))
@@ -233,10 +240,10 @@ class Batches:
         return bool(np.all(alike) and np.all(codes))
 
     def long_step_cases(self) -> Iterator[tuple[list[State], float]]:
-        """Yield initial states of a batch with a step size h, s, with which steps are long.
+        """Yield pairs of initial states for a batch and a step size h (s) that is long for them.
 
-        In a step some angle moves too far for its sine to be predicted, by velocity or by
-        acceleration.
+        In such a step some angle moves too far for the C code to update its sine from the previous
+        one: in some cases because of its velocity, in others because of its acceleration.
         """
         sampler, first = self.check.sampler, self.instances[0]
         fast = [replace(s, qd=s.qd + 0.7 * sampler.spread / self.h) for s in self.instances]
@@ -246,19 +253,19 @@ class Batches:
             yield rest, self.runs.large_step(replace(first, qd=0 * first.qd), part)
 
     def differs_with_neighbours(self, method: str, states: list[State], h: float) -> int:
-        """Return whether runs from `states` have other bits in a batch with other neighbours.
+        """Return 1 if the bits of instances change when they get other neighbours, else 0.
 
-        In that batch, an instance with short steps is beside each of them.
+        states: initial states of the instances, which are run by `method` with steps of h seconds.
+        In the second run an instance with short steps is placed beside each of them.
         """
         mixed = [s for pair in zip(states, self.instances, strict=True) for s in pair]
         alone, other = (self.simulate(method, x, None, h=h) for x in (states, mixed))
         return not _are_permuted(alone, other, 2 * np.arange(COUNT))
 
     def first_step_agrees(self, method: str, whole: Any, u: Vector | None) -> bool:
-        """Return whether `step_batch` gives the same bits as the first step of a batch run.
+        """Return whether one call of `step_batch` gives the bits of the first step of a batch run.
 
-        whole: the batch's run by `method`. u: its inputs. `step_batch` overwrites q and qd in
-        place.
+        whole: the batch run by `method`. u: its inputs, or None for the scene's signals.
         """
         q, qd = (np.array(x[:, 0]) for x in (whole.q, whole.qd))
         names = self.check.sampler.defaults
@@ -274,10 +281,10 @@ class Batches:
         )
 
     def failures(self, method: str) -> float:
-        """Return the number of errors in batches in which some instances fail.
+        """Return the number of errors in batch runs in which some instances fail.
 
-        Instances that do not fail must keep their bits, and those that fail must end as in single
-        runs.
+        It is an error if an instance that does not fail has other bits than in a batch without
+        failing ones, or if a failing instance ends otherwise than in a single run.
         """
         states, bad = list(self.instances), [0, *range(5, COUNT, 11)]
         fast = 1e-3 * float(np.finfo(self.model.dtype).max)
@@ -304,7 +311,11 @@ class Batches:
         return float(wrong + self.singular_starts_that_move(method))
 
     def singular_starts_that_move(self, method: str) -> int:
-        """Return the number of instances with a singular D that are not refused as such."""
+        """Return how many instances with a singular mass matrix D are not stopped at their start.
+
+        The batch run by `method` must give each of them the error code for a singular D and make no
+        step.
+        """
         starts = self.singular[:: 1 + len(self.singular) // COUNT]
         states = [replace(self.instances[0], q=s.q, qd=s.qd, params=s.params) for s in starts]
         if not states:
@@ -313,9 +324,10 @@ class Batches:
         return int(np.sum((batch._codes != SINGULAR) | (batch.steps != 0)))
 
     def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
-        """Return whether a failing instance of a batch run ends otherwise than a single run.
+        """Return whether a failing instance of a batch run ends otherwise than in a single run.
 
-        whole: the batch run. k: index of the instance in it. s: the initial state of the instance.
+        whole: the batch run by `method`. k: index of the failing instance. s: its initial state,
+        with its inputs.
         """
         alone = run_in_c(self.model, method, s, self.h, STEPS)
         steps, status = int(whole.steps[k]), int(whole._codes[k])
@@ -341,11 +353,11 @@ class Batches:
     def differs_beyond_rounding(
         self, method: str, s: State, stored: Vector, alone: RunResult
     ) -> bool:
-        """Return whether an instance's last state differs from its single run beyond rounding.
+        """Return whether an instance's last state in a batch differs by more than rounding.
 
-        stored: q and q̇ of the instance, (2, n, nq). alone: its single run. The effect of rounding
-        follows from runs with slightly changed initial velocities: the cosine of 1e304 changes from
-        one double to the next.
+        It is compared with the same state of a single run. s: the initial state. stored: q and q̇
+        of the instance in the batch, (2, n, nq). alone: the single run. How much rounding may
+        change the state follows from runs with slightly changed initial velocities.
         """
         known, far = alone.rows[:, stored.shape[1] - 1], 1e-3
         near = [

@@ -43,9 +43,10 @@ MARK = -7.0  # what is to be left alone
 
 
 def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
-    """Yield copies of the state with nan or inf in place of one coordinate or velocity.
+    """Yield copies of a state in which one coordinate or velocity is replaced by nan or inf.
 
-    Each is a tuple of the field ("q" or "qd"), the index in it, nan or inf, and the state.
+    Each item is (field, index, value, state): `field` is "q" or "qd", `index` the entry in it, and
+    `value` nan or inf.
     """
     for field in ("q", "qd"):
         for i in range(len(s.q)):
@@ -56,9 +57,10 @@ def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
 
 
 class Refusals:
-    """Checks of refusals: states and steps for which functions must return an error.
+    """Checks that the module refuses states and steps, by returning an error, when it must.
 
-    singular, regular: states with a singular and with a regular D, collected by the checks.
+    singular, regular: states with a singular and with a regular mass matrix D. The checks of D
+    collect them, and later checks use them.
     """
 
     def __init__(self, check: Comparison) -> None:
@@ -81,7 +83,7 @@ class Refusals:
             row(f"{method} too long", 0, "runs that end otherwise", find)
 
     def report_singular(self) -> None:
-        """Append checks of a singular D to the report, for a system without constraints."""
+        """Append the checks of a singular mass matrix D, for a system without constraints."""
         row, unit = self.check.row, "states judged wrongly"
         row("singular D", 0, unit, self.definite)
         if not self.singular:
@@ -91,7 +93,10 @@ class Refusals:
         row("singular D in a run", 0, "runs that go on", self.run_into)
 
     def report_constrained(self) -> None:
-        """Append checks of a D that is negative on the constraints to the report."""
+        """Append the checks of states with negative inertia, for a system with constraints.
+
+        At such a state vᵀ D v < 0 for a velocity v that the constraints permit.
+        """
         row, unit = self.check.row, "calls that do not refuse"
         row("negative D along the rows", 0, unit, self.negative_inertia_errors)
         row("negative D along the rows: refusals", 0, unit, self.refuse)
@@ -99,10 +104,11 @@ class Refusals:
     # where D is singular
 
     def negative_inertia_errors(self) -> float:
-        """Return the number of states whose D is negative on the constraints but not refused.
+        """Return the number of states with negative inertia that the module does not refuse.
 
-        D alone may be singular, since constraints determine coordinates without inertia. States
-        that are refused are collected in `singular`.
+        At such a state vᵀ D v < 0 for a velocity v that the constraints permit. D may be singular,
+        since constraints determine coordinates without inertia. States that are refused are
+        collected in `singular`.
         """
         wrong = 0
         for s in self.suspects():
@@ -119,9 +125,10 @@ class Refusals:
         return float(wrong)
 
     def definite(self) -> float:
-        """Return the number of states at which the module wrongly accepts or refuses D.
+        """Return the number of states at which the module accepts a bad or refuses a good D.
 
-        States that are judged correctly are collected in `singular` and `regular`.
+        The mass matrix D is good if it is positive definite. States that the module judges
+        correctly are collected in `singular` and `regular`.
         """
         suspects = self.suspects()
         stacked: dict[str, Any] = {
@@ -148,36 +155,38 @@ class Refusals:
         return float(wrong)
 
     def exact(self, s: State) -> bool:
-        """Return whether it does not depend on rounding if D is singular at a state.
+        """Return whether rounding has no influence on whether D is singular at a state.
 
-        That is so unless a parameter is tiny or huge: if one inertia is 2^60 times another, D or a
-        pivot may have lost the other.
+        It has an influence if a parameter is tiny or huge relative to its default: if one inertia
+        is 2^60 times another, the smaller one is lost in sums.
         """
         sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
         return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)
 
     def natural(self, s: State) -> bool:
-        """Return whether all parameters have the signs of their defaults.
+        """Return whether all parameters of a state have the signs of their defaults.
 
-        The method of link multipliers divides by masses: it refuses one that is not positive,
-        whatever D is.
+        If not, a module that divides by masses (method of link multipliers) may refuse a mass that
+        is not positive, even if D is regular.
         """
         pairs = [(x, self.defaults[name]) for name, x in (s.params or {}).items()]
         return all(x * default > 0 or default == 0 for x, default in pairs)
 
     def lacks_precision(self, s: State, D: Vector) -> bool:
-        """Return whether the module's D differs so much from the exact D that rounding decides.
+        """Return whether the module's D is so inexact that rounding decides if it is singular.
 
-        That happens, for instance, where lengths are huge.
+        D: the exact mass matrix (nq, nq) at `s`. The module's D is so inexact if, for instance,
+        lengths are huge.
         """
         size = np.sqrt(np.abs(np.diag(D)))
         off = np.abs(self.check.ask("D", s) - D)
         return bool(np.any(off > PRECISION_LOSS * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
-        """Return states whose parameters are changed so that D may be singular.
+        """Return states at which D may be singular since their parameters are changed.
 
-        Single parameters are zero, negative, tiny or huge, and all are random with random signs.
+        In some, a single parameter is zero, negative, tiny or huge; in others, all parameters are
+        random with random signs.
         """
         states = self.places()
         suspects_ = []
@@ -203,9 +212,10 @@ class Refusals:
         return [suspects_[k] for k in sorted(order)]
 
     def places(self) -> list[State]:
-        """Return states at which D may be singular: the start, three random states, and others.
+        """Return states at which D may be singular for some parameters.
 
-        The others have all coordinates equal to 0, π/2 or π.
+        They are the initial state, three random states, and states with all coordinates equal to 0,
+        π/2 or π.
         """
         own = self.check.sampler.start
         drawn = [e.state for e in self.check.few(4)[1:]]
@@ -215,9 +225,9 @@ class Refusals:
         return [replace(s, t=0.0, u=None) for s in states]
 
     def accelerate(self, s: State) -> tuple[int, bool]:
-        """Return the status of the C function `acceleration`, and whether its outputs are right.
+        """Return the status of the C function `acceleration`, and whether its outputs are valid.
 
-        After an error they must be unchanged, otherwise finite.
+        After an error the outputs must be unchanged; otherwise they must be finite.
         """
         model = self.model
         a = np.full(model.nq, MARK, model.dtype)
@@ -232,7 +242,7 @@ class Refusals:
         return status, clean
 
     def refuse(self) -> float:
-        """Return the number of calls that do not refuse a singular state, or write to outputs.
+        """Return the number of calls at singular states that return no error or write to outputs.
 
         The functions are acceleration, multipliers, steps and runs by all methods, and derivatives.
         """
@@ -254,9 +264,9 @@ class Refusals:
         return getattr(self.module, name)(s.q, s.qd, t=s.t, u=s.u, params=s.params)
 
     def raises(self, call: Callable[[], Any], status: str) -> bool:
-        """Return whether a call raises ArithmeticError with this status.
+        """Return whether a call raises ArithmeticError with the given status.
 
-        The message must contain the state.
+        status: name of the error, such as "singular". The message must contain the coordinates q.
         """
         try:
             call()
@@ -265,7 +275,7 @@ class Refusals:
         return False
 
     def stays(self, method: str, s: State, status: str) -> bool:
-        """Return whether a step and a run from `s` stop at once, with this status.
+        """Return whether a step and a run from `s` stop at once with the error `status`.
 
         The step must leave its outputs unchanged, and the run must store the initial state only.
         """
@@ -284,10 +294,10 @@ class Refusals:
         )
 
     def run_into(self) -> float:
-        """Return the number of runs that go on past a singular D, or store nan or inf.
+        """Return the number of runs that continue past a singular D, or store nan or inf.
 
-        The runs start where D is regular, and lead to states where it is singular. States at which
-        rounding decides whether D is singular are left out.
+        The runs start at states with a regular D and lead to states where D is singular. States at
+        which rounding decides whether D is singular are left out.
         """
         wrong = tried = 0
         h = self.check.system.run.h
@@ -309,10 +319,11 @@ class Refusals:
         return float(wrong)
 
     def regular_neighbour(self, s: State, turn: int) -> list[State]:
-        """Return a regular state that differs from the singular `s` in one coordinate, in a list.
+        """Return a list with one regular state near the singular state `s`, or an empty list.
 
-        Its velocities are zero; the list is empty if none is found. turn: selects the coordinate. A
-        run from there moves that coordinate alone, slowly, to the singular state.
+        The regular state differs from `s` in one coordinate, which the number `turn` selects, and
+        has zero velocities. The list is empty if no displacement of that coordinate gives a regular
+        D.
         """
         i = turn % len(s.q)
         for by in DISPLACEMENTS:
@@ -324,9 +335,10 @@ class Refusals:
         return []
 
     def goes_on(self, method: str, s: State, steps: int) -> bool:
-        """Return whether a run from `s` makes a step from a D that is not positive definite.
+        """Return whether a run makes a step from a state at which D is not positive definite.
 
-        Storing a state that is not finite counts, too.
+        The run starts at `s`, by `method`, with up to steps + 3 steps. The result is True as well
+        if the run stores a state that is not finite.
         """
         run = run_in_c(self.model, method, s, self.check.system.run.h, steps + 3)
         rows = run.rows[:, : run.steps + 1].astype(float)
@@ -346,9 +358,10 @@ class Refusals:
         return bool(np.any(least < -EIGENVALUE_TOLERANCE))
 
     def positions_along_step(self, starts: Vector, ends: Vector) -> list[Vector]:
-        """Return positions within n steps by cubic interpolation, (n, nq) for each of STEP_POINTS.
+        """Return positions within n steps, by cubic interpolation, as one array (n, nq) per point.
 
-        starts, ends: q and q̇ before and after the steps, (2, n, nq).
+        The points are the fractions STEP_POINTS of a step. starts, ends: q and q̇ before and after
+        the steps, (2, n, nq).
         """
         (q, qd), (r, v), h = starts, ends, self.check.system.run.h
         return [
@@ -357,9 +370,10 @@ class Refusals:
         ]
 
     def least_eigenvalues(self, q: Vector, s: State) -> Vector:
-        """Return the least eigenvalue of the reference's D at n positions, (n,).
+        """Return the least eigenvalue of the reference's D at each of n positions, (n,).
 
-        q: (n, nq). s: its parameters are used. D is scaled to a unit diagonal.
+        D is first scaled to a unit diagonal. q: the positions (n, nq). s: a state whose parameters
+        are used.
         """
         if not len(q):
             return np.zeros(0)
@@ -370,7 +384,7 @@ class Refusals:
     # what is not finite
 
     def nonfinite_errors(self) -> float:
-        """Return the number of calls that do not refuse a state with nan or infinity."""
+        """Return the number of calls that return no error for a state with nan or infinity."""
         s, wrong = self.check.few(2)[-1].state, 0
         for field, i, what, at in with_nonfinite_entries(s):
             status, clean = self.accelerate(at)
@@ -387,7 +401,7 @@ class Refusals:
         return float(wrong)
 
     def multiplied(self, s: State) -> bool:
-        """Return whether `multipliers` in C gives finite values or, with an error, nan."""
+        """Return whether the C function `multipliers` gives finite values, or an error and nan."""
         model = self.model
         multipliers = np.zeros(len(model.constraint_names), model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -412,7 +426,7 @@ class Refusals:
     def bounded(self, s: State) -> bool:
         """Return whether the reference's D, bias and tau are finite at a state with nan or inf.
 
-        tanh and atan, for instance, are finite at infinity.
+        They may be, since functions such as tanh and atan are finite at infinity.
         """
         with np.errstate(all="ignore"):
             values = [
@@ -422,7 +436,7 @@ class Refusals:
         return all(bool(np.all(np.isfinite(value))) for value in values)
 
     def linearized(self, s: State) -> bool:
-        """Return whether `linearization` in C gives finite values or, after an error, none.
+        """Return whether the C function `linearization` gives finite values or returns an error.
 
         After an error its outputs must be unchanged.
         """
@@ -439,10 +453,10 @@ class Refusals:
         return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
-        """Return the number of runs that end wrongly because steps are too long.
+        """Return the number of runs with far too long steps that do not end as required.
 
-        States overflow, or stages of implicit methods do not converge. A run must then return an
-        error and store finite states only.
+        With such steps the state overflows, or the iteration for the stages of an implicit method
+        does not converge. The run must then return an error and store finite states only.
         """
         s, wrong = self.check.few(2)[-1].state, 0
         ended = []

@@ -85,20 +85,26 @@ def run_in_c(
     model: Any, method: str, s: State, h: float, steps: int, *, cuts: Sequence[int] = (),
     every: int = 1, moved: float = 0.0, fresh_memory: bool = False,
 ) -> RunResult:  # fmt: skip
-    """Return a run of `steps` steps of h seconds from `s`, by the C function for `method`.
+    """Return the result of a run from `s` by the compiled C function for `method`.
 
     Parameters
     ----------
+    model : object
+        The compiled module's model, which gives access to its C functions.
     s : State
-        Its u may have a value for each step, (steps, nu), in place of (nu,).
+        Initial state. Its u is (nu,), or (steps, nu) with a value for each step.
+    h : float
+        Step size, s.
+    steps : int
+        Number of steps of the whole run.
     cuts : sequence of int
-        Numbers of steps after which a call ends and the next one continues the run.
+        Numbers of steps after which a call of the C function ends and the next one continues.
     every : int
         Only each `every`-th state is stored.
     moved : float
         Change of the first coordinate between two calls, relative to 1 + its size.
     fresh_memory : bool
-        Whether each call has a workspace of its own.
+        Whether each call gets a new workspace instead of that of the call before.
     """
     _, run, _, _, work_type, _ = model._loops[method]
     q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -137,10 +143,11 @@ def _reads_time(system: System) -> bool:
 
 
 class Runs:
-    """Checks of runs by fixed steps, in C.
+    """Checks of runs by fixed steps, made with the compiled C functions.
 
-    starts: the initial state and a random one with reference values. states: the same without
-    these. turning: such states with velocities of several sizes.
+    starts: the scene's initial state and a random state, each with the values of the reference (the
+    independent evaluation in Python). states: the same states without these values. turning: such
+    states with velocities of several sizes.
     """
 
     def __init__(self, check: Comparison) -> None:
@@ -183,7 +190,7 @@ class Runs:
     limit = 1e3
 
     def written(self) -> float:
-        """Return the number of functions that do not write all entries of their output."""
+        """Return the number of functions of the module that leave some entry of `out` unwritten."""
         s, n, left = self.states[-1], self.model.nq, 0
         for name in ("D", "C", "g", "bias", "tau"):
             out = np.full((n, n) if name in "DC" else n, np.nan, self.model.dtype)
@@ -193,9 +200,10 @@ class Runs:
         return float(left)
 
     def large_step(self, s: State, part: float) -> float:
-        """Return a step size, s, with which the fastest coordinate moves by a part of its range.
+        """Return a step size, s, in which the fastest coordinate moves by a part of its range.
 
-        s: the state at which the step begins. part: the fraction of the range of the motion.
+        s: the state at which the step begins. part: the part, as a fraction of the range that the
+        coordinate covers in the motion.
         """
         spread = part * self.sampler.spread
         a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
@@ -204,10 +212,11 @@ class Runs:
         return float(min(np.min(h), 100 * self.h)) or self.h
 
     def turning_step(self, s: State, turned: float = TURNED, moved: float = math.inf) -> float:
-        """Return a step size, s, with which angles turn by a given amount.
+        """Return a step size h, in s, with which angles turn by a given amount in half a step.
 
-        In half of the step, accelerations turn some angle by `turned`, or velocities by `moved`,
-        rad; the shorter step counts.
+        h is the shorter of two step sizes: the one with which the accelerations at `s` turn some
+        angle by `turned` (rad), and the one with which the velocities turn some angle by `moved`
+        (rad).
         """
         a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
         fastest, rate = (
@@ -218,10 +227,10 @@ class Runs:
         return min([*steps, 100 * self.h]) if steps else self.h
 
     def long(self) -> float | Measurement:
-        """Return the largest error of runs by long steps, in units of rounding.
+        """Return the largest error of runs with long steps, in units of rounding.
 
-        Angles move too far for their sines to be predicted. The runs are compared with the
-        reference.
+        In such steps angles move so far that the C code can't update their sines from the previous
+        ones and computes them anew. The runs are compared with runs of the reference.
         """
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         pairs = [
@@ -239,19 +248,19 @@ class Runs:
         return largest(errors, "a difference grows too much in one long step")
 
     def short(self) -> float | Measurement:
-        """Return the largest error of runs by short steps, in units of rounding.
+        """Return the largest error of runs with short steps, in units of rounding.
 
-        Angles hardly change, so that their sines are predicted. The runs are compared with the
-        reference.
+        In such steps angles hardly change, so that the C code updates their sines from the previous
+        ones. The runs are compared with runs of the reference.
         """
         starts = self.check.few(2 if self.check.large else 8)
         errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
         return largest(errors, "a difference grows too much in one short step")
 
     def sines(self) -> float:
-        """Return the largest error of D, g and bias at angles around the circle, in roundings.
+        """Return the largest error of D, g and bias at angles all around the circle, in roundings.
 
-        There sines need all of their terms.
+        At these angles the polynomials for sines and cosines need all of their terms.
         """
         e = self.check.few(2)[-1]
         s, n = e.state, len(e.state.q)
@@ -285,12 +294,16 @@ class Runs:
         ]
 
     def far(self) -> float:
-        """Return the largest error of values and steps at angles of many turns and late times.
+        """Return the largest error of values and steps at angles of many turns and at late times.
 
-        There the inlined sines can't be used. An angle is as exact as its last digit, so that a
-        unit is a rounding of the angle. Times are earlier where formulas contain larger angles,
-        such as t**3, or where single precision does not resolve a step. States are left out if
-        angles are still larger than the integers that a double represents.
+        The values are those of the dynamics, such as D and the accelerations; the steps are single
+        steps by each method. The error is in units of the effect of one rounding error of the
+        angles.
+
+        The C code's own inlined sines do not cover such angles. The time is reduced if formulas
+        then contain larger angles, such as t**3, or if single precision does not resolve a step. A
+        state is left out if one of its angles exceeds 2/eps, beyond which neighbouring doubles are
+        more than a radian apart.
         """
         errors, angle = [], largest_angle(self.check.system)
         for e in self.check.few(2):
@@ -331,9 +344,10 @@ class Runs:
         return float(np.max(errors, initial=0))
 
     def holds(self, s: State) -> bool:
-        """Return whether constraints hold at a state whose angles are many turns away.
+        """Return whether the constraints hold at a state with angles that are many turns away.
 
-        They may not: angles of gears need different numbers of turns.
+        Adding whole turns to angles may violate a constraint: two geared angles, for instance, need
+        different numbers of turns.
         """
         off, size = self.sampler.value_and_size(
             partial(self.sampler.reference.evaluate, "constraints"), s
@@ -341,10 +355,10 @@ class Runs:
         return bool(np.all(np.abs(off) <= 1e3 * self.check.eps * size))
 
     def solved(self, e: Expected) -> Expected:
-        """Return `e` with larger sizes of accelerations, for the stages of implicit methods.
+        """Return a copy of `e` with larger error units of accelerations, for implicit methods.
 
-        Stages are solved for with velocities that a rounding of q changes; accelerations follow
-        these velocities.
+        The unit grows since the stages of an implicit method are found by iteration: a rounding
+        error of q changes the velocities of the stages, and hence their accelerations.
         """
         s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
         scale = self.sampler.scale
@@ -355,14 +369,15 @@ class Runs:
         return replace(e, size={**e.size, "acceleration": gain})
 
     def resolves_steps(self, t: float) -> bool:
-        """Return whether the module's numbers resolve 1/64 of a step at the time t, s."""
+        """Return whether times near t (s) are precise enough for 1/64 of the scene's step size."""
         return bool(64 * np.spacing(np.asarray(t, self.check.dtype)) <= self.h)
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Return the error of a few RK4 steps from `s`, in units of rounding.
 
-        The steps are compared with the reference. acceleration: size of the accelerations for their
-        rounding errors, (nq,). The result is 0 if the steps lead too far to be compared.
+        The steps are compared with those of the reference. acceleration (nq,): the size of the
+        accelerations, by which their rounding errors are measured. The result is 0 if the steps
+        move the state so far that a comparison means nothing.
         """
         h, x, scale = self.h, self.sampler.rounded(s), self.sampler.scale
         u = None if s.u is None else np.array([s.u] * x.shape[1])
@@ -379,9 +394,11 @@ class Runs:
         return self.check.units(end, x[:, 0], size)
 
     def inputs(self) -> float | Measurement:
-        """Return the largest error of runs with other inputs in each step, in units of rounding.
+        """Return the largest error of runs whose inputs change from step to step.
 
-        They are compared with the reference and, bit by bit, with runs by `simulate`.
+        The error is in units of rounding and relative to a run of the reference. It is inf if the C
+        run differs in any bit from that of the Python method `simulate`. Nothing is judged (a
+        Measurement with the reason) if the first step of each run already leads too far.
         """
         errors, spread = [], self.sampler.scale
         for s in self.states:
@@ -404,10 +421,11 @@ class Runs:
         return largest(errors, "the first step leads too far")
 
     def driven(self, s: State, u: Vector, spread: Vector) -> tuple[int, Vector, float]:
-        """Return the reference's run with the inputs `u`, (steps, nu), while it stays near `s`.
+        """Return a run of the reference with given inputs, as far as the state stays near `s`.
 
-        The results are the number of steps, the state after them (2, nq), and the growth of a small
-        difference of the initial state. spread: typical sizes of q and q̇, (2, nq).
+        The results are the number of steps, the state after them (2, nq), and the factor by which a
+        small difference of the initial state has grown. u (steps, nu): inputs of each step. spread
+        (2, nq): typical sizes of q and q̇.
         """
         x = np.array([s.q, s.qd])[:, None] + [[0.0], [NUDGE]] * spread[:, None]  # (2, 2, nq)
         start = x[:, 0]
@@ -424,10 +442,10 @@ class Runs:
         return sure
 
     def cut(self, method: str) -> float:
-        """Return the number of runs whose bits depend on how a run is divided or stored.
+        """Return the number of runs whose bits depend on how the run is divided or stored.
 
-        A run by `method` in several calls, or with fewer stored states, must equal that in one
-        call.
+        A run by `method` that is divided into several calls, or that stores fewer states, must give
+        the same bits as the run in one call.
         """
         wrong = 0
         for s in self.states:
@@ -439,16 +457,17 @@ class Runs:
         return float(wrong)
 
     def table(self, s: State) -> State:
-        """Return the state with random inputs for each step, (STEPS, nu)."""
+        """Return a copy of the state with random inputs, (STEPS, nu), that change between steps."""
         u = self.random.normal(size=(STEPS, self.model.nu))
         u[::2] = u[1::2]  # inputs that jump at some steps and not at others
         return replace(s, u=u)
 
     def differ(self, method: str, s: State, h: float) -> int:
-        """Return the number of runs from `s` with steps of h seconds that have other bits.
+        """Return how many variants of a run differ from the run in one call in any bit.
 
-        They are a run in several calls, one with fewer stored states, and one whose state is
-        changed between calls, which must not use its workspace.
+        The run starts at `s` with steps of h seconds. The variants are: a run divided into several
+        calls; one that stores fewer states; and one whose state is changed between two calls, which
+        must then ignore what its workspace contains from the call before.
         """
         whole = run_in_c(self.model, method, s, h, STEPS)
         pieces = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS)
@@ -469,12 +488,14 @@ class Runs:
         return wrong + (not moved.is_identical(fresh))
 
     def fine(self, method: str) -> float | Measurement:
-        """Return how far rounding moves the end of a run of thousands of steps, in roundings.
+        """Return how far rounding moves the end of a run of thousands of steps, in units of rounding.
 
-        Two runs over the same time in so short steps that the method is exact differ by rounding
-        alone. The median over some states counts: where a difference grows fast, rounding does too.
-        Nothing is judged if forces jump or have kinks, or if they are so steep that shorter steps
-        still differ less.
+        Two runs with different, very short steps cover the same time. The method's error is then
+        below rounding, so that their difference is due to rounding alone. The result is the median
+        over some states, since rounding errors grow fast along some motions.
+
+        Nothing is judged if forces have jumps or kinks, or if they are so steep that still shorter
+        steps reduce the difference.
         """
         states, errors = self.check.few(4), list[float]()
         for parts in FINE:
@@ -488,10 +509,10 @@ class Runs:
         return min(errors)
 
     def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
-        """Return the median difference of two runs over the same time, in units of rounding.
+        """Return the median difference of the final states of two runs, in units of rounding.
 
-        parts: for each run, the number of its steps in one step of the scene. states: initial
-        states.
+        The median is over the initial `states`. Both runs cover the same time by `method`. parts:
+        for each of the two runs, the number of its steps in one step of the scene.
         """
         errors, T = [], 2 * self.h
         for e in states:
