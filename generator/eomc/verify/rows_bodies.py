@@ -49,13 +49,15 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
 
 
 def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[float]:
-    """Yield widths, s, of time intervals along which quantities are interpolated at a state.
+    """Yield half-widths, in s, of time intervals on which a motion is interpolated at a state.
 
-    spread: how far each coordinate goes in a motion. qd, qdd: velocities and accelerations. First
-    come fractions of the time in which a coordinate moves that far. If that is short, as with a
-    stiff spring, differences are rounding, so longer intervals follow, up to one in which a
-    coordinate moves by one unit. The interval with the smallest error counts: none makes a wrong
-    value right.
+    The first ones are fractions of the time in which some coordinate moves as far as in the whole
+    motion. If that time is short, as with a stiff spring, differences between the nodes are mostly
+    rounding. Therefore longer intervals follow, up to one in which a coordinate moves by one unit.
+    Callers use the interval with the smallest error, since no interval makes a wrong value right.
+
+    spread: how far each coordinate moves in the whole motion, (nq,). qd, qdd: velocities and
+    accelerations at the state.
     """
 
     def rate(far: Vector) -> float:
@@ -70,9 +72,9 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
 
 
 class Bodies:
-    """Checks of energies and power, which are recomputed from the bodies in the scene's own tables.
+    """Checks of energies and power, which are recomputed from the bodies in the scene file.
 
-    lines: the lines of motion computed so far, by state and width.
+    lines: the lines of motion computed so far (see `Line`), by state and width.
     """
 
     def __init__(self, check: Comparison, scene: Scene) -> None:
@@ -88,17 +90,19 @@ class Bodies:
                            partial(self.compare, name))  # fmt: skip
 
     def compare(self, name: str) -> float:
-        """Return the largest relative error of a quantity of the module over the states.
+        """Return the largest relative error of a quantity of the module over some states.
 
-        name: "kinetic_energy", "potential_energy" or "power", the power of forces.
+        name: "kinetic_energy", "potential_energy" or "power" (the power of the forces). The
+        expected value is recomputed from the scene's bodies.
         """
         return self.check.largest(partial(self.off, name), STATES)
 
     def off(self, name: str, e: Expected) -> float:
-        """Return the relative error of the quantity `name` at one state, from the bodies.
+        """Return the relative error of the module's quantity `name` at the state of `e`.
 
-        The width of the interpolated line of motion (see `widths`) with the smallest error counts.
-        The result is nan if there is no value to compare with.
+        The expected value is recomputed from the scene's bodies by interpolation in time. Of
+        several widths of the interval (see `widths`) the one with the smallest error counts. The
+        result is nan if there is no expected value.
         """
         s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
@@ -124,10 +128,16 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a body at the n points of a line of motion.
+    """Position and rotation of a body's frame at n times along a motion.
 
-    at: origins in the world, (n, 3), m. turn: rotations as unit quaternions, real part first, (n,
-    4). angle: rotation angles about the z axis, (n,), rad, for scenes in the plane.
+    Attributes
+    ----------
+    at : (n, 3) array
+        Origins of the frame in world coordinates, m.
+    turn : (n, 4) array
+        Rotations as unit quaternions, real part first.
+    angle : (n,) array
+        Rotation angles about the z axis, rad, for scenes in the plane.
     """
 
     at: Vector
@@ -142,11 +152,11 @@ class Frame:
         return self.at + rotate(self.turn, x)
 
     def slid(self, by: Vector, axis: Vector) -> Frame:
-        """Return the frame translated along its own `axis` by the distances `by`, (n,), m."""
+        """Return the frame translated along its own `axis` (3,) by the distances `by` (n,), in m."""
         return replace(self, at=self.point(by[:, None] * axis))
 
     def turned(self, by: Vector, axis: Vector) -> Frame:
-        """Return the frame rotated about its own `axis` by the angles `by`, (n,), rad."""
+        """Return the frame rotated about its own `axis` (3,) by the angles `by` (n,), in rad."""
         half = by[:, None] / 2
         turn = np.hstack([np.cos(half), np.sin(half) * axis])
         return Frame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
@@ -154,23 +164,24 @@ class Frame:
 
 @dataclass
 class Line:
-    """The bodies of a scene along a line of motion through a state, for interpolation in time.
+    """The bodies of a scene along a line of motion: a short motion through one state.
 
-    Coordinates are q + stretch qd s + bend s²/2 at the times t + s, |s| <= width. Each quantity is
-    an array of its values at the n nodes s; rates are derivatives of the interpolating polynomial.
+    The coordinates at the time t + s are q + stretch qd s + bend s²/2, |s| <= width. Quantities are
+    arrays of their values at n interpolation nodes, which are values of s. Time derivatives at the
+    nodes are those of the interpolating polynomial.
 
     Attributes
     ----------
     state : State
-        The state in the middle of the line.
+        The state in the middle of the line, with its time t.
     width : float
         Half the duration of the line, s.
     stretch : float
         Factor of all velocities.
-    bend : array or 0
+    bend : (nq,) array or 0
         Accelerations.
     slides : mapping
-        Names of coordinates with stick-slip friction, and the direction in which each slides.
+        Directions of sliding, 1 or -1, of coordinates with stick-slip friction, by name.
     frames : dict
         Frames of the bodies and of the world, by name.
     known : dict
@@ -224,13 +235,13 @@ class Line:
         return self.scene.assembly
 
     def evaluate(self, formula: Formula) -> Any:
-        """Return the value of a formula at the nodes of the line, (n,), or one constant number."""
+        """Return the value of a formula at the n nodes of the line, (n,), or a single number."""
         return formulas.evaluate(formula, self.algebra, self.value_of_name)
 
     def at_rest(self, formula: Formula) -> Any:
-        """Return the value of a formula at the nodes, with all velocities set to zero.
+        """Return the value of a formula at the nodes of the line, with all velocities set to zero.
 
-        That is the energy of a potential.
+        For a generalized potential, which depends on velocities, this value is its energy.
         """
         known, algebra = self.known, self.algebra
         self.known = {name: x for name, x in known.items() if name not in self.formulas}
@@ -243,17 +254,20 @@ class Line:
 
     @cached_property
     def formulas(self) -> Mapping[str, Formula]:
-        """Formulas of definitions and signals, which may refer to one another."""
+        """Formulas of the scene's definitions and of the signals of its inputs, by name."""
         return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
 
     def value_of_name(self, name: str) -> Any:
-        """Return the value of a name in the scene's formulas at the nodes of the line."""
+        """Return the value of a definition or input at the nodes of the line."""
         if name not in self.known:
             self.known[name] = self.limited(name, self.evaluate(self.formulas[name]))
         return self.known[name]
 
     def limited(self, name: str, value: Any) -> Any:
-        """Return the value clipped to the limits of the input `name`; unchanged without limits."""
+        """Return `value` clipped to the limits of the input `name`.
+
+        It is returned unchanged if there is no such input or the input has no limits.
+        """
         for ends in (i.limits for i in self.scene.inputs if i.name == name):
             for end, within in zip(ends, (np.maximum, np.minimum), strict=True):
                 value = value if end is None else within(value, self.evaluate(end))
@@ -271,9 +285,10 @@ class Line:
         return frame
 
     def attach(self, body: Body) -> None:
-        """Add the frame of a body, and the coordinates of its centre of mass to the known names.
+        """Compute and store the frame of a body that has a joint.
 
-        body: one with a joint; the frame of its parent must have been added.
+        body: the body; the frame of its parent must be stored already. The coordinates of its
+        centre of mass are added to the names known in formulas.
         """
         frame = self.frames[body.parent]
         if body.offset:
@@ -294,10 +309,10 @@ class Line:
     # --- energies --------------------------------------------------------------------------------
 
     def value(self, name: str) -> float:
-        """Return a quantity at the state in the middle of the line, from the scene's tables.
+        """Return an energy or power of the scene at the state in the middle of the line.
 
-        name: "kinetic_energy" or "potential_energy", J, or "power", the power of all forces and of
-        dissipation, W.
+        name: "kinetic_energy" or "potential_energy", in J, or "power", the power of all forces and
+        of dissipation, in W.
         """
         if name == "kinetic_energy":
             return self.at_middle(
@@ -323,15 +338,16 @@ class Line:
         return immovable
 
     def at_middle(self, values: Any) -> float:
-        """Return the entry for the middle node of an array of values at the nodes."""
+        """Return the entry of an array of values at the nodes that belongs to the middle node."""
         return float((values + 0 * self.nodes)[self.middle])
 
     def points(self, body: Body) -> list[tuple[float, Vector]]:
-        """Return point masses with the body's mass, centre of mass and inertia.
+        """Return point masses with the same mass, centre of mass and inertia as the body.
 
-        Each is a pair of a mass, kg, and a position in the body's frame, m; some masses are
-        negative. With the second moments J = tr(I)/2 - I, there are two for each eigenvector of J,
-        at unit distance from the centre of mass, and the rest is in the centre of mass.
+        Each is a pair of a mass, kg, which may be negative, and a position in the body's frame, m.
+        They are two masses for each eigenvector of J = tr(I)/2 - I, the second moments of the mass:
+        these are at unit distance on both sides of the centre of mass. The rest of the mass is in
+        the centre.
         """
         m, centre = float(self.evaluate(body.mass)), self.vector(body.center)
         xx, yy, zz, xy, xz, yz = (float(self.evaluate(entry)) for entry in body.inertia)
@@ -343,9 +359,9 @@ class Line:
         return masses
 
     def kinetic(self, body: Body) -> Vector:
-        """Return the kinetic energy of a body at the nodes, (n,), J.
+        """Return the kinetic energy of a body and of the rotors at its joint, in J, at the nodes, (n,).
 
-        It is that of the body's point masses and of the rotors at its joint.
+        The energy of the body is that of its point masses, see `points`.
         """
         frame, energy = self.frames[body.name], 0 * self.nodes
         for m, x in self.points(body):
@@ -356,18 +372,24 @@ class Line:
         return energy
 
     def rates(self, body: Body) -> Iterator[Vector]:
-        """Yield the velocity of each motion of a body's joint at the nodes, (n,)."""
+        """Yield the time derivative of each joint coordinate of a body at the line's nodes, (n,).
+
+        A body's joint has one such coordinate, in m or rad, for each direction or axis of motion.
+        """
         for formula in body.coordinates:
             yield self.rate @ (self.evaluate(formula) + 0 * self.nodes)
 
     def weight(self, body: Body) -> Vector:
-        """Return the potential energy of a body's weight at the nodes, -m g·c, (n,), J."""
+        """Return the potential energy -m g·c of a body's weight, in J, at the line's nodes, (n,).
+
+        c is the position of the centre of mass and g the acceleration of gravity.
+        """
         centre = self.frames[body.name].point(self.vector(body.center))
         energy: Vector = -self.evaluate(body.mass) * centre @ self.vector(self.assembly.gravity)
         return energy
 
     def length(self, line: Spring | Damper) -> Vector:
-        """Return the length (m) or angle (rad) of a spring or damper at the nodes, (n,)."""
+        """Return the length (m) or angle (rad) of a spring or damper at the line's nodes, (n,)."""
         if line.coordinate:
             return np.asarray(self.known[line.coordinate])
         assert line.bodies is not None
@@ -381,7 +403,10 @@ class Line:
         return np.asarray(np.linalg.norm(b - a, axis=1))
 
     def spring(self, spring: Spring) -> Vector:
-        """Return the energy of a spring, k/2 times its squared extension, at the nodes, (n,), J."""
+        """Return the potential energy of a spring, in J, at the line's nodes, (n,).
+
+        It is k/2 times the squared extension of the spring.
+        """
         longer = self.length(spring) - self.evaluate(spring.length)
         energy: Vector = self.evaluate(spring.stiffness) / 2 * longer**2
         return energy
@@ -389,9 +414,9 @@ class Line:
     # --- forces ----------------------------------------------------------------------------------
 
     def forces(self) -> Vector:
-        """Return the power of forces, friction and drives at the nodes, (n,), W.
+        """Return the power of forces, friction and drives, in W, at the line's nodes, (n,).
 
-        That of the dissipation function is not included; see `loss`.
+        The power of the dissipation function is not included; `loss` returns it.
         """
         power = 0 * self.nodes
         for name, formula in self.scene.forces.items():
@@ -417,20 +442,21 @@ class Line:
         return power
 
     def unit_friction_power(self, name: str, rate: Vector, width: Formula | None) -> Vector:
-        """Return the absolute power of Coulomb friction of 1 N or N m, (n,), W.
+        """Return the power that Coulomb friction of 1 N or N m takes from a coordinate, in W, (n,).
 
-        name: the coordinate. rate: its velocity at the nodes. Friction is smoothed over `width`, or
-        has a fixed direction if the coordinate has stick-slip friction.
+        name: the coordinate. rate: its velocity at the n nodes of the line. Friction is smoothed as
+        tanh(rate/width). For a coordinate with stick-slip friction, its direction is that of
+        sliding.
         """
         if name in self.slides:
             return self.slides[name] * rate
         return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate
 
     def work(self, force: Force, at_rest: Line) -> Vector:
-        """Return the power of a force and torque on a body at the nodes, (n,), W.
+        """Return the power of a force and torque that act on a body, in W, at the line's nodes, (n,).
 
-        at_rest: the line of motion with zero velocities, whose power is subtracted: that of points
-        that move with time alone.
+        The power along `at_rest`, the same line with zero velocities, is subtracted. It comes from
+        points that move with time even though the coordinates do not.
         """
         frame, zero = self.frames[force.body], 0 * self.nodes
         F, torque = (
@@ -444,17 +470,19 @@ class Line:
         return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
 
     def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
-        """Return the velocity of a point of a frame, and the frame's angular velocity, both (n, 3).
+        """Return the velocity of a point of a frame and the frame's angular velocity, both (n, 3).
 
-        point: its coordinates in the frame, (3,), m. Both are world coordinates, in m/s and rad/s.
+        They are in world coordinates, in m/s and rad/s, at the n nodes of the line. point:
+        coordinates of the point in the frame, (3,), m.
         """
         turning = quaternion_product(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
         return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
     def loss(self) -> float:
-        """Return the power of dissipation at the state, ∂R/∂q̇ · q̇, W.
+        """Return the power of dissipation at the state in the middle of the line, ∂R/∂q̇ · q̇, in W.
 
-        It is a difference quotient of R at velocities that are a little larger and smaller.
+        R is the dissipation function. The derivative is a difference quotient: R is evaluated with
+        all velocities multiplied by factors near 1.
         """
         total = 0.0
         if not self.loses():
@@ -472,7 +500,10 @@ class Line:
         return bool(joints or self.assembly.dampers or self.scene.dissipation.text != "0")
 
     def dissipation(self) -> Vector:
-        """Return the dissipation function R of scene, joints and dampers at the nodes, (n,), W."""
+        """Return the dissipation function R in W, at the line's nodes, (n,).
+
+        It is the sum of the scene's own function and the terms of damped joints and dampers.
+        """
         R: Vector = self.evaluate(self.scene.dissipation) + 0 * self.nodes
         for body in self.assembly.bodies:
             for damping, rate in zip(body.damping, self.rates(body), strict=False):

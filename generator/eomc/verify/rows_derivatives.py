@@ -19,9 +19,10 @@ SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 
 
 def report(check: Comparison) -> None:
-    """Append checks of `linearize` and `sensitivity` to the report of `eomc check`.
+    """Append checks of the derivatives of accelerations to the report of `eomc check`.
 
-    They are checked if implicit methods or the scene require them.
+    The module's functions are `linearize` and `sensitivity`. They are checked if the scene requires
+    them or an implicit method uses them.
     """
     limit = max(SLOPE_LIMIT, LIMIT * check.eps)
     for name in ("linearize", "sensitivity"):
@@ -40,9 +41,10 @@ def _has(check: Comparison, name: str) -> bool:
 def slopes(check: Comparison, name: str) -> float | Measurement:
     """Return the largest relative error of the module's derivatives of accelerations.
 
-    name: "linearize" (derivatives by q, q̇ and u) or "sensitivity" (by parameters). They are
-    compared with differences of the reference's accelerations. Of several widths, the smallest
-    error counts for each entry: no width makes a wrong entry right.
+    name: "linearize" (derivatives with respect to q, q̇ and u) or "sensitivity" (with respect to
+    the parameters). The exact values are difference quotients of the reference's accelerations with
+    steps of several widths. For each entry the width with the smallest error counts, since no width
+    makes a wrong entry right.
     """
     scale = check.sampler.scale
     n, nu = len(check.system.q), len(check.system.inputs)
@@ -70,8 +72,8 @@ def slopes(check: Comparison, name: str) -> float | Measurement:
 def module_derivatives(check: Comparison, name: str, s: State) -> Vector | None:
     """Return the module's derivatives of accelerations at a state, (nq, k).
 
-    name: "linearize", with the k = 2 nq + nu columns q, q̇ and u, or "sensitivity", with a column
-    for each parameter. None if the rest of A and B does not say that the derivative of q is q̇.
+    name: "linearize", with k = 2 nq + nu columns for q, q̇ and u, or "sensitivity", with one column
+    for each parameter. The result is None if the module's matrices A and B contradict dq/dt = q̇.
     """
     n, arguments = len(check.system.q), {"u": s.u, "t": s.t, "params": s.params}
     if name == "sensitivity":

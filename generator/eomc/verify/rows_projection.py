@@ -36,9 +36,10 @@ OK, SINGULAR, NOT_FINITE, _, _, LOCKED = range(6)
 
 
 def report(of: Comparison, module: Any, form: str) -> None:
-    """Append checks of `project` to the report, for the module of one form of the C code.
+    """Append checks of the module's function `project` to the report of `eomc check`.
 
-    of: the checks and their states. form: prefix of the checks' names.
+    of: the comparison with its states, to whose report the checks are appended. module: the module
+    of the optimised or the portable C code. form: prefix of the checks' names.
     """
     rows = ProjectionChecks(of, module)
     of.row(f"{form}project", LIMIT, "units of rounding", partial(rows.projected, False))
@@ -47,9 +48,10 @@ def report(of: Comparison, module: Any, form: str) -> None:
 
 
 def of_inertia(of: Comparison, refusals: Refusals) -> None:
-    """Append a check of parameters with which D has no positive eigenvalue to the report.
+    """Append a check of the refusal of parameters without inertia to the report.
 
-    of: the checks and their states. refusals: the checks of refusals.
+    With these parameters D has no positive eigenvalue. of: the comparison with its states, to whose
+    report the check is appended. refusals: the checks of refusals.
     """
     checks = MasslessParameters(of, refusals)
     row = of.row
@@ -61,19 +63,21 @@ def of_inertia(of: Comparison, refusals: Refusals) -> None:
 
 @dataclass(frozen=True)
 class ProjectionChecks:
-    """Checks of the function `project`, which puts a state onto the constraints.
+    """Checks of the function `project`, which moves a state onto the constraints.
 
-    of: the checks and their states. module: that of one form of C, optimised or portable.
+    of: the comparison, which supplies states and reference. module: the module of the optimised or
+    the portable C code.
     """
 
     of: Comparison
     module: Any
 
     def projected(self, with_fixed: bool) -> float | Measurement:
-        """Return the largest error of projected states, in units of rounding.
+        """Return the largest error of the states that `project` returns, in units of rounding.
 
-        Displaced states are compared with the reference's projection. with_fixed: one coordinate
-        and its velocity are fixed. Nothing is judged if there is no state to compare.
+        States displaced from the constraints are projected by the module and by the reference.
+        with_fixed: whether one coordinate and its velocity are kept fixed. Nothing is judged (a
+        Measurement with the reason) if there is no state to compare.
         """
         of = self.of
         scale = of.sampler.scale
@@ -213,7 +217,7 @@ class ProjectionChecks:
 class MasslessParameters:
     """Checks of refusals at states and parameters with which D has no positive eigenvalue.
 
-    of: the checks and their states. refusals: the checks of refusals.
+    of: the comparison, which supplies states and reference. refusals: the checks of refusals.
     """
 
     def __init__(self, of: Comparison, refusals: Refusals) -> None:
@@ -233,9 +237,10 @@ class MasslessParameters:
                     yield s
 
     def refuse(self) -> float:
-        """Return the number of calls that do not refuse such a state, or that write to outputs.
+        """Return the number of calls without inertia that return no error or write to outputs.
 
-        The functions are acceleration, a run by each method, and `project`.
+        The calls are `acceleration`, a run by each method, and `project`, with parameters with
+        which D has no positive eigenvalue.
         """
         wrong = 0
         for s in self.states[:12]:

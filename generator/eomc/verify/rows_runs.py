@@ -488,7 +488,7 @@ class Runs:
         return wrong + (not moved.is_identical(fresh))
 
     def fine(self, method: str) -> float | Measurement:
-        """Return how far rounding moves the end of a run of thousands of steps, in units of rounding.
+        """Return how far rounding moves the end of a run of thousands of steps, in roundings.
 
         Two runs with different, very short steps cover the same time. The method's error is then
         below rounding, so that their difference is due to rounding alone. The result is the median

@@ -43,11 +43,22 @@ DRAWS = 8  # how often: the influence is known to a quarter of itself
 
 @dataclass(frozen=True)
 class SampleBudget:
-    """How much is compared with the reference, depending on the cost of its evaluation.
+    """How many states and steps are compared with the reference, by the cost of its evaluation.
 
-    states: number of states. prediction_steps: number of steps that estimate the range of the
-    motion, each of `stride` times the scene's h. few: number of states from which single steps
-    start. run: number of steps of a compared run.
+    The reference is the independent evaluation of the equations in Python.
+
+    Attributes
+    ----------
+    states : int
+        Number of states.
+    prediction_steps : int
+        Number of steps of the run that estimates the range of the motion.
+    stride : int
+        Length of each of these steps, as a multiple of the scene's step size h.
+    few : int
+        Number of states from which single steps start.
+    run : int
+        Number of steps of a run that is compared.
     """
 
     states: int
@@ -84,8 +95,9 @@ OF_INPUTS = ("tau", "power", "acceleration", "multipliers")
 class State:
     """Arguments at which functions of a module or of the reference are evaluated.
 
-    q, qd: (nq,). t: time, s. u: inputs (nu,), or None for the scene's signals. params: all
-    parameters by name, or None for their defaults.
+    q, qd: coordinates and velocities, (nq,). t: time, s. u: inputs, (nu,), or None for the scene's
+    signals (its formulas for the inputs). params: all parameters by name, or None for their
+    defaults.
     """
 
     q: Vector
@@ -120,7 +132,10 @@ def simulate(module: Any, s: State, **how: Any) -> Any:
 
 
 def states_of_run(run: Any, s: State) -> list[State]:
-    """Return the states that a run has stored, with the inputs and parameters of its start `s`."""
+    """Return the states that a run has stored, each with the inputs and parameters of `s`.
+
+    s: the initial state of the run.
+    """
     rows = zip(run.t, run.q, run.qd, strict=True)
     return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
 
@@ -128,8 +143,8 @@ def states_of_run(run: Any, s: State) -> list[State]:
 def perturb_each_input(s: State, defaults: Mapping[str, float]) -> list[State]:
     """Return copies of the state, in each of which one number is multiplied by 1 + NUDGE.
 
-    Each coordinate, velocity, input, parameter and the time that is not zero is changed in turn.
-    Without parameters in the state, those are `defaults`.
+    The numbers are all nonzero coordinates, velocities and inputs, the time if it is not zero, and
+    the parameters. If the state has no parameters, they are the `defaults`.
     """
     states = []
     for field in ("q", "qd", "u"):
@@ -171,10 +186,10 @@ def _stacked(states: Sequence[State], defaults: Mapping[str, float]) -> dict[str
 
 @dataclass(frozen=True)
 class Expected:
-    """The reference's values at a state, and the sizes in units of which their errors are measured.
+    """The reference's values at a state, and their sizes, which define the units of errors.
 
-    value, size: by name, such as "D" or "acceleration"; an error of eps times the size is one unit
-    of rounding.
+    value, size: by name, such as "D" or "acceleration". An error of eps times the size is one unit
+    of rounding; eps is the relative rounding error of a number.
     """
 
     state: State
@@ -183,10 +198,20 @@ class Expected:
 
 
 class Sampler:
-    """Draws random states around the initial state of the scene, at which D is finite and regular.
+    """Source of random states around the scene's initial state.
 
-    effort: how many states and steps are used. spread, speed: how far coordinates and velocities go
-    in a motion, (nq,); scale is both, (2, nq). rejected: number of states left out.
+    At all of them the mass matrix D is finite and regular.
+
+    Attributes
+    ----------
+    effort : SampleBudget
+        How many states and steps are used.
+    spread, speed : (nq,) array
+        How far coordinates and velocities go in the scene's motion.
+    scale : (2, nq) array
+        Both of these.
+    rejected : int
+        Number of random states left out so far.
     """
 
     def __init__(
@@ -235,8 +260,8 @@ class Sampler:
     def states(self, count: int) -> list[Expected]:
         """Return `count` states with the reference's values there; fewer if too many are rejected.
 
-        The first is the initial state. A quarter of them have the parameters' defaults, the others
-        random parameters; every second one has random inputs.
+        The first is the initial state. A quarter of the states have the default parameters, the
+        others random ones. Every second state has random inputs.
         """
         states_: list[Expected] = []
         nearness = 1.0  # every rejection moves the next draw closer to the start
@@ -259,10 +284,11 @@ class Sampler:
         return states_
 
     def unusual_states(self, slow: int) -> list[Expected]:
-        """Return reference values at states that runs hardly reach, those with a regular D.
+        """Return the reference's values at states that runs hardly reach.
 
-        One state is about a unit of each coordinate away from the start. In `slow` others all
-        velocities are almost zero, where the functions that smooth friction are steep.
+        In one state all coordinates differ from the start by about one unit (1 m or 1 rad). In up
+        to `slow` other states all velocities are almost zero, where smoothed friction is steep.
+        States with a singular D are left out.
         """
         drawn = [self.draw(1.0, True, False) for _ in range(1 + slow)]
         way = np.array([drawn[0].q - self.start.q, drawn[0].qd - self.start.qd])
@@ -273,10 +299,10 @@ class Sampler:
         return [e for state in states if (e := self.regular_expected(self.project(state)))]
 
     def far_states(self) -> list[Expected]:
-        """Return one state FAR_FACTOR times as far from the start as others, in a list.
+        """Return a list with one state, with reference values, that is very far from the start.
 
-        The list is empty if D is not regular there. Terms that are small near the start count
-        there.
+        It is FAR_FACTOR times as far as other random states. There, terms that are small near the
+        start become visible. The list is empty if D is not regular at that state.
         """
         drawn = [self.draw(FAR_FACTOR, True, False) for _ in range(4)]
         state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
@@ -284,11 +310,11 @@ class Sampler:
         return [] if expected is None else [expected]
 
     def draw(self, nearness: float, with_defaults: bool, with_inputs: bool) -> State:
-        """Return a random state, projected onto the constraints; nan if that fails.
+        """Return a random state, projected onto the constraints; nan if the projection fails.
 
-        nearness: distance from the initial state, relative to that of a motion. with_defaults: use
-        the parameters' defaults in place of random values. with_inputs: draw inputs in place of the
-        signals.
+        nearness: distance from the initial state, relative to the range of the scene's motion.
+        with_defaults: use the default parameters instead of random ones. with_inputs: draw random
+        inputs instead of using the scene's signals.
         """
         random, n, start = self.random, len(self.start.q), self.start
         centre = np.where(self.angles, nearness < 1, 1) * start.q
@@ -315,7 +341,7 @@ class Sampler:
         return state
 
     def with_discrete_parameters(self, s: State) -> State:
-        """Return the state with discrete variables among the parameters, as in the scene."""
+        """Return the state with the discrete variables (parameters that jumps set) as parameters."""
         if not self.discrete:
             return s
         values = {self.system.coordinates[k].name: float(s.q[k]) for k in self.discrete}
@@ -367,24 +393,29 @@ class Sampler:
         return find_wrong_rotations(self.system)
 
     def wrong_rotations(self, s: State) -> list[str]:
-        """Return the names of the loops closed by a wrong rotation though their equations hold."""
+        """Return the names of closed loops whose bodies meet with a wrong rotation.
+
+        The equations of such a loop hold although the rotation is not the required one.
+        """
         if not (self.system.reactions and np.all(np.isfinite(s.q))):
             return []
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
     def rows(self, name: str, s: State) -> Vector:
-        """Return `name` of the independent constraint equations that are solved for.
+        """Return the residuals, rates or Jacobian of the independent constraint equations at a state.
 
-        name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq).
+        name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq). The r
+        equations are those that remain if redundant ones are left out.
         """
         values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
         return np.asarray(self.reference.solved @ values)
 
     def regular(self, s: State) -> bool:
-        """Return whether D is finite and far from singular at a state.
+        """Return whether the reference's D is finite and far from singular at a state.
 
-        With random parameters, D must also be positive definite. Under constraints the KKT matrix
-        must be far from singular, and D not negative.
+        With random parameters, D must also be positive definite. Under constraints, the KKT matrix
+        of D and the constraint Jacobian must be far from singular, and D nonnegative for permitted
+        velocities.
         """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
@@ -491,11 +522,11 @@ class Sampler:
         ])  # fmt: skip
 
     def rounded(self, s: State, *others: Vector) -> Vector:
-        """Return q and qd of a state and of neighbours, stacked as (2, n, nq).
+        """Return q and qd of a state and of states near it, stacked as (2, n, nq).
 
-        others: further states, (2, nq) each. Under constraints three states are added that differ
-        from `s` in the last digits: near a singular position, rounding errors of a step grow by
-        more than differences of its initial state.
+        others: further states (2, nq), which are appended. Under constraints, three states are
+        added that differ from `s` by rounding only: near a singular position, rounding errors of a
+        step grow more than a larger difference of its initial state suggests.
         """
         x = np.array([s.q, s.qd])
         digits = EPS * (np.abs(x) + self.scale)
@@ -504,18 +535,23 @@ class Sampler:
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
-        """Return the reference's energy K + P (J) at a state, and the size for its roundings."""
+        """Return the reference's energy K + P at a state, J, and the size that defines its rounding.
+
+        An error of eps times the size is one unit of rounding.
+        """
         names = ("kinetic", "potential")
         K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
         size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
         return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def value_and_size(self, function: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
-        """Return f and |f| + Σ |x_i ∂f/∂x_i|, the size for its rounding errors, at a state.
+        """Return the value f of a function at a state, and the size by which its errors are measured.
 
-        function: f of the arguments of `evaluate`, for many states at once. With more than
-        MOST_NUDGES inputs x_i, the sum is replaced by the root of the sum of squares, estimated
-        from DRAWS random changes of all inputs: it is smaller at most by the root of their number.
+        The size is |f| + Σ |x_i ∂f/∂x_i|: eps times this is the effect of one rounding error in
+        each input x_i. With more than MOST_NUDGES inputs, the sum is estimated from DRAWS random
+        changes of all inputs, as the root of the sum of squares.
+
+        function: f, with the arguments of `Reference.evaluate` for many states at once.
         """
         near = perturb_each_input(s, self.defaults)
         many = len(near) > MOST_NUDGES

@@ -122,9 +122,9 @@ def _constraint_expressions(
 
 
 def without_definitions(system: System) -> System:
-    """Return the system with its definitions substituted and its energies simplified.
+    """Return an equal system without definitions, with simplified energies.
 
-    It has no definitions, outputs and reactions.
+    Definitions are substituted into all formulas. The new system has no outputs and no reactions.
     """
     expand = _expander(system)
     names = ("kinetic", "potential", "linear_potential", "dissipation")
@@ -139,10 +139,11 @@ def without_definitions(system: System) -> System:
 
 
 def reference_for(system: System) -> Reference:
-    """Return the reference for a system: symbolic for small ones, else by Taylor arithmetic.
+    """Return the reference of a system: its independent evaluation in Python, used by the checks.
 
-    Systems with parameters that jumps set have a `DiscreteReference` around one of these. Raises
-    EomcError as `derive` and `TaylorReference` do.
+    It is symbolic (`derive`) for a small system, otherwise numerical (`TaylorReference`). If jumps
+    at events set parameters, the result is a `DiscreteReference`, which contains such a reference.
+    Raises EomcError if the equations of motion can't be derived.
     """
     if system.discrete:
         return DiscreteReference(system, reference_for(with_constant_parameters(system)))
@@ -150,9 +151,9 @@ def reference_for(system: System) -> Reference:
 
 
 def is_small(system: System, most: float | None = None) -> bool:
-    """Return whether the expanded equations have few enough operations for `derive`.
+    """Return whether the system's expanded equations have few enough operations for `derive`.
 
-    most: the largest number of operations; MAX_SIZE by default.
+    most: the largest permitted number of operations; MAX_SIZE by default.
     """
     return _expanded_size(system) <= (MAX_SIZE if most is None else most)
 
@@ -249,21 +250,27 @@ class SymbolicReference(Reference):
 
     @cached_property
     def motion(self) -> ImmutableMatrix:
-        """Entries of D by rows, bias and tau in one column, (nq^2 + 2 nq, 1), for accelerations."""
+        """Column with the entries of D (row by row), of bias and of tau, (nq^2 + 2 nq, 1).
+
+        Accelerations need all of them; one function evaluates them together.
+        """
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
     @cached_property
     def energy_terms(self) -> Expr:
-        """Expression of the sum of the sizes of all terms of K and P."""
+        """Expression of the sum of the absolute values of all terms of K and P."""
         return _magnitude(self.kinetic) + _magnitude(self.potential)
 
     @cached_property
     def power_terms(self) -> Expr:
-        """Expression of the sum of the sizes of all terms of the power."""
+        """Expression of the sum of the absolute values of all terms of `power`, in W."""
         return _magnitude(self.power)
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the sizes of all terms of "energy" or "power", as `Reference.terms`."""
+        """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
+
+        s: the arguments of `evaluate` by name.
+        """
         return float(self.evaluate(f"{name}_terms", **s))
 
     def _value(
