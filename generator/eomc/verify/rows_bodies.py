@@ -152,7 +152,7 @@ class Frame:
         return self.at + rotate(self.turn, x)
 
     def slid(self, by: Vector, axis: Vector) -> Frame:
-        """Return the frame translated along its own `axis` (3,) by the distances `by` (n,), in m."""
+        """Return the frame translated along its own `axis` (3,) by distances `by` (n,), in m."""
         return replace(self, at=self.point(by[:, None] * axis))
 
     def turned(self, by: Vector, axis: Vector) -> Frame:
@@ -181,7 +181,8 @@ class Line:
     bend : (nq,) array or 0
         Accelerations.
     slides : mapping
-        Directions of sliding, 1 or -1, of coordinates with stick-slip friction, by name.
+        Modes of coordinates with stick-slip friction, by name: the direction of sliding, 1 or
+        -1, or 0 if the coordinate sticks.
     frames : dict
         Frames of the bodies and of the world, by name.
     known : dict
@@ -359,7 +360,7 @@ class Line:
         return masses
 
     def kinetic(self, body: Body) -> Vector:
-        """Return the kinetic energy of a body and of the rotors at its joint, in J, at the nodes, (n,).
+        """Return the kinetic energy of a body and of rotors at its joint at the nodes, (n,), in J.
 
         The energy of the body is that of its point masses, see `points`.
         """
@@ -453,7 +454,7 @@ class Line:
         return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate
 
     def work(self, force: Force, at_rest: Line) -> Vector:
-        """Return the power of a force and torque that act on a body, in W, at the line's nodes, (n,).
+        """Return the power of a force and torque on a body, in W, at the line's nodes, (n,).
 
         The power along `at_rest`, the same line with zero velocities, is subtracted. It comes from
         points that move with time even though the coordinates do not.
@@ -479,7 +480,7 @@ class Line:
         return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
     def loss(self) -> float:
-        """Return the power of dissipation at the state in the middle of the line, ∂R/∂q̇ · q̇, in W.
+        """Return the power of dissipation in the middle of the line, ∂R/∂q̇ · q̇, in W.
 
         R is the dissipation function. The derivative is a difference quotient: R is evaluated with
         all velocities multiplied by factors near 1.

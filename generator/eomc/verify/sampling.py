@@ -202,10 +202,17 @@ class Sampler:
 
     At all of them the mass matrix D is finite and regular.
 
+    Parameters
+    ----------
+    reference : Reference
+        Evaluates the system's equations in Python.
+    random : Generator
+        Source of random numbers.
+    effort : SampleBudget
+        Number and length of the steps that estimate the range of the motion.
+
     Attributes
     ----------
-    effort : SampleBudget
-        How many states and steps are used.
     spread, speed : (nq,) array
         How far coordinates and velocities go in the scene's motion.
     scale : (2, nq) array
@@ -341,7 +348,7 @@ class Sampler:
         return state
 
     def with_discrete_parameters(self, s: State) -> State:
-        """Return the state with the discrete variables (parameters that jumps set) as parameters."""
+        """Return the state with discrete variables (parameters set by jumps) as parameters."""
         if not self.discrete:
             return s
         values = {self.system.coordinates[k].name: float(s.q[k]) for k in self.discrete}
@@ -402,10 +409,11 @@ class Sampler:
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
     def rows(self, name: str, s: State) -> Vector:
-        """Return the residuals, rates or Jacobian of the independent constraint equations at a state.
+        """Return residuals, rates or Jacobian of the independent constraint equations at a state.
 
         name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq). The r
-        equations are those that remain if redundant ones are left out.
+        equations are those that remain if redundant ones are left out; some may be sums of the
+        system's equations.
         """
         values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
         return np.asarray(self.reference.solved @ values)
@@ -535,7 +543,7 @@ class Sampler:
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
-        """Return the reference's energy K + P at a state, J, and the size that defines its rounding.
+        """Return the reference's energy K + P at a state, J, and the size that defines a rounding.
 
         An error of eps times the size is one unit of rounding.
         """
@@ -545,7 +553,7 @@ class Sampler:
         return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def value_and_size(self, function: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
-        """Return the value f of a function at a state, and the size by which its errors are measured.
+        """Return the value f of a function at a state, and the size that its errors refer to.
 
         The size is |f| + Σ |x_i ∂f/∂x_i|: eps times this is the effect of one rounding error in
         each input x_i. With more than MOST_NUDGES inputs, the sum is estimated from DRAWS random
