@@ -26,9 +26,9 @@ Pairs = tuple[tuple[Expr, Expr], ...]
 
 
 class MasslessError(Exception):
-    """Raised when a joint has no inertia along its axis: d = 0, so no acceleration follows.
+    """Raised when a joint has no inertia along its axis, so that its acceleration is undetermined.
 
-    `link` is the index of the link that the joint moves.
+    The attribute `link` is the index of the link that the joint moves.
     """
 
     def __init__(self, link: int) -> None:
@@ -41,10 +41,10 @@ def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Exp
     Parameters
     ----------
     recursion : Recursion
-        The tree with the inertias of its links.
+        The kinematic tree with the inertias of its links.
     drive : sequence of Expr
-        For each joint, the generalized force along it (force in N or moment in N m), minus the
-        forces of everything that is not part of the tree.
+        For each joint, the generalized force along it (force in N or moment in N m). Inertial and
+        other forces of everything that is not part of the tree are already subtracted.
 
     Returns
     -------

@@ -10,10 +10,10 @@ from sympy import Expr, Mul, S, Symbol
 
 
 def split(atom: Expr) -> tuple[Expr, Symbol | None]:
-    """Return the number and the name whose product is `atom`.
+    """Return the pair (number, name) whose product is `atom`.
 
-    An atom is a number, a name, or a number times a name. The number is 1 if `atom` is a name; the
-    name is None if `atom` is a number.
+    An atom is a number, a symbol (the name of a value), or a number times a symbol. The returned
+    number is 1 if `atom` is a symbol. The returned name is None if `atom` is a number.
     """
     if atom.is_Symbol:
         return S.One, atom
@@ -26,22 +26,24 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
 
 
 def is_negative(number: Expr) -> bool:
-    """Return True if `number` is negative.
+    """Return True if `number`, a SymPy number, is negative.
 
-    Rational numbers are decided by their numerator, which is faster than SymPy's test.
+    For a rational number the sign of its numerator is tested, which is faster than SymPy's test.
     """
     return bool(number.p < 0 if number.is_Rational else number.is_negative)
 
 
 class Sums(Protocol):
-    """The attributes of a `Tape` that `expand_sums` reads.
+    """The attributes of a `Tape` (list of named operations) that `expand_sums` reads.
 
     Attributes
     ----------
     leaves
-        The symbols without definition.
-    weights, constant
-        For each name that is defined as a sum: the weight of each name in it, and its constant.
+        The symbols without definition, such as coordinates and parameters.
+    weights
+        For each name that is defined as a sum: the weight of each name in the sum.
+    constant
+        For each name that is defined as a sum: the constant term of the sum.
     """
 
     leaves: dict[Symbol, Any]
@@ -52,11 +54,11 @@ class Sums(Protocol):
 def expand_sums(
     weights: dict[Symbol, Expr], constant: Expr, sums: Sums
 ) -> tuple[dict[Symbol, Expr], Expr]:
-    """Return a sum in which nested sums of leaves are replaced by their terms if this shortens it.
+    """Return the sum sum_k weights[k] k + constant, simplified, as the pair (weights, constant).
 
-    For example, q1 + (q2 - q1) becomes q2. This also avoids a rounding error that is large where
-    q1 is large. A sum is given and returned as the weight of each name and a constant. `sums` is
-    the tape on which the names are defined.
+    A name in the sum may itself be defined as a sum of leaves (symbols without definition). It is
+    replaced by its terms if the result is then shorter. For example, q1 + (q2 - q1) becomes q2,
+    which also avoids a large rounding error for large q1. The names are defined on the tape `sums`.
     """
     for symbol, weight in weights.items():
         inner = sums.weights.get(symbol)

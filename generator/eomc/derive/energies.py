@@ -16,7 +16,8 @@ from eomc.model.system import System, dot, symbol, t
 class Energies:
     """Energies, forces and constraint residuals of a system, as atoms of `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------

@@ -25,7 +25,8 @@ UNROLLED_SIZE_LIMIT = 2500
 class MotionTerms:
     """Terms of the equations of motion D qdd + bias = tau, as atoms of a tape.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------
@@ -59,7 +60,8 @@ class MotionTerms:
 class Equations(MotionTerms):
     """The equations of motion of a system, as atoms of `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------

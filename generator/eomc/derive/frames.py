@@ -33,9 +33,11 @@ Twist = tuple[Vector, Vector]  # (velocity, angular velocity) or (force, moment)
 class Motions:
     """Kinematics of all frames that a system outputs, as atoms of the tape `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
-    Each sequence lists one frame after the other. Vectors are along the world's axes; lengths are
-    in m, angles in rad.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
+
+    Each sequence has one entry for each frame. Components of vectors are along the world's axes;
+    lengths are in m, angles in rad.
 
     Attributes
     ----------
@@ -59,10 +61,10 @@ class Motions:
 
 
 def wrenches(system: System) -> list[Symbol]:
-    """Return the symbols for the force (N) and moment (N m) at each frame that the system outputs.
+    """Return one symbol for each component of the force (N) and moment (N m) at each output frame.
 
-    The components are along the world's axes: fx fy fz mx my mz, in the plane fx fy mz. The names
-    end in an underscore, so no name of a scene coincides with them.
+    The components are along the world's axes: fx fy fz mx my mz for each frame, in the plane
+    fx fy mz. The names end in an underscore, so that they differ from all names in a scene.
     """
     entries = "fx fy mz" if system.plane else "fx fy fz mx my mz"
     count = len(system.output_frames)
@@ -72,7 +74,7 @@ def wrenches(system: System) -> list[Symbol]:
 def motions(system: System) -> Motions:
     """Return poses, velocities, accelerations and Jacobians of the frames `system.output_frames`.
 
-    They are derived on a new tape.
+    The result includes the new tape (list of elementary operations) on which they are defined.
     """
     entries = wrenches(system)
     tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(entries, Stage.TIME))
@@ -98,16 +100,19 @@ def motions(system: System) -> Motions:
 
 @dataclass(frozen=True)
 class FrameKinematics:
-    """Pose, velocity, acceleration and Jacobian of a frame, along the world's axes.
+    """Pose, velocity, acceleration and Jacobian of a frame, as symbolic expressions.
 
-    A `Twist` is a pair of vectors (linear, angular).
+    Components of vectors are along the world's axes. A `Twist` is a pair of vectors (linear,
+    angular).
 
     Attributes
     ----------
     link : int
         Index of the link that the frame is fixed to; -1 for a frame placed by formulas.
-    arm, at : Vector
-        Position relative to the link's origin, and position in the world.
+    arm : Vector
+        Vector from the link's origin to the frame's origin (m).
+    at : Vector
+        Position of the frame's origin in the world (m).
     rotation : sequence of Vector
         Rotation matrix by rows.
     angle : Expr
@@ -129,19 +134,23 @@ class FrameKinematics:
 
 
 class Sweep(Links):
-    """Kinematics of a tree's links and of frames, along the world's axes, from base to leaves.
+    """Kinematics of the links of a tree and of frames, computed from the base to the leaves.
+
+    Components of vectors are along the world's axes.
 
     Attributes
     ----------
-    d, width : int
-        Number of entries of a position (2 in the plane, 3 in space) and of a twist, which is a
-        linear and an angular velocity (3 in the plane, 6 in space).
+    d : int
+        Number of entries of a position: 2 in the plane, 3 in space.
+    width : int
+        Number of entries of a twist (linear and angular velocity): 3 in the plane, 6 in space.
     columns, origin, step
         For each link, the columns of its rotation matrix, the position of its origin, and the
-        vector from its parent's origin to its own.
-    velocity, acceleration, spin, turning
-        For each link, the velocity and acceleration of its origin, its angular velocity and
-        its angular acceleration.
+        vector from the origin of its parent to its own origin.
+    velocity, acceleration
+        For each link, the velocity and acceleration of its origin.
+    spin, turning
+        For each link, its angular velocity and angular acceleration.
     """
 
     def __init__(self, tape: Tape, system: System, frames: Sequence[Frame]) -> None:
@@ -218,9 +227,9 @@ class Sweep(Links):
         return self.columns[k][self.links[k].axis]
 
     def propagate(self, moving: Twist, accelerating: Twist, r: Vector) -> Twist:
-        """Return the velocity and acceleration of the point at `r` from a reference point.
+        """Return the velocity and acceleration of a point of a body, from those of another point.
 
-        Both points belong to the same body, and `r` is the vector from the reference point.
+        The other point is the reference point.
 
         Parameters
         ----------
@@ -228,6 +237,8 @@ class Sweep(Links):
             Velocity of the reference point, and angular velocity of the body.
         accelerating : Twist
             Acceleration of the reference point, and angular acceleration of the body.
+        r : Vector
+            Vector from the reference point to the point.
         """
         (v, omega), (a, alpha) = moving, accelerating
         rotational = self.cross(omega, r)
@@ -255,7 +266,11 @@ class Sweep(Links):
 
     @cached_property
     def known(self) -> Mapping[Symbol, Expr]:
-        """The atoms of all definitions of the scene that occur in formulas of frames, by symbol."""
+        """The value on the tape of each definition in the scene that the formulas of frames use.
+
+        The keys are the symbols that the scene defines. A value is a number, a name on the tape, or
+        a number times a name.
+        """
         formulas = [formula for f in self.frames for formula in self._formulas(f)]
         known: dict[Symbol, Expr] = {}
         for name, formula in needed(self.system.definitions, formulas):
@@ -268,11 +283,17 @@ class Sweep(Links):
         return (*placed, f.angle) if self.plane else placed
 
     def value(self, e: Expr) -> Expr:
-        """Return the atom of the formula `e`, which may contain the scene's definitions."""
+        """Return the value of the formula `e` on the tape: a number, a name, or a number times it.
+
+        The formula may contain symbols that the scene defines by other formulas.
+        """
         return self.define(e.xreplace(self.known))
 
     def pose(self, frame: FrameKinematics) -> Sequence[Expr]:
-        """Return position and rotation matrix by rows, 12 entries; in the plane x, y and angle."""
+        """Return the position (3 entries) and rotation matrix by rows (9 entries) of a frame.
+
+        In the plane, return x, y and the angle (rad).
+        """
         if self.plane:
             return (*frame.at[:2], frame.angle)
         return (*frame.at, *(x for row in frame.rotation for x in row))
@@ -334,9 +355,9 @@ class Sweep(Links):
     def forces(self, frames: Sequence[FrameKinematics], wrenches: Sequence[Twist]) -> list[Expr]:
         """Return the generalized force on each coordinate of forces and moments that act at frames.
 
-        `wrenches` contains the pair (force, moment) for each frame. With the frame's Jacobian J_k
-        and wrench w_k, the result is sum_k J_k^T w_k. One pass from the leaves to the base computes
-        it for all frames that are fixed to links.
+        `wrenches` contains the pair (force, moment) for each of `frames`. With the Jacobian J_k of
+        frame k and its pair w_k, the result is sum_k J_k^T w_k. For frames that are fixed to links,
+        the sum is computed in one pass over the links, from the leaves to the base.
         """
         force, moment = [[ZERO] * self.n for _ in range(2)]
         generalized: dict[Symbol, list[Expr]] = {q: [] for q in self.system.q}

@@ -18,9 +18,10 @@ from eomc.model.system import System
 
 
 def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """Return a tape and the (nq,) generalized forces tau = D qdd + C qd + g on it.
+    """Return the pair (tape, tau) with the generalized forces tau = D qdd + C qd + g, shape (nq,).
 
-    tau is a function of q, qd, qdd and t. It is derived without forming the matrix D.
+    The tape is the list of elementary operations that compute tau from q, qd, qdd, t and the
+    parameters. tau is derived without forming the matrix D.
     """
     tree = system.tree
     energies = (tree.other_kinetic, tree.other_potential) if tree else None

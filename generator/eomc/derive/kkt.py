@@ -34,7 +34,8 @@ DROPPED_PIVOT = sympy.Float("1e-9")  # replaces a dropped pivot, relative to its
 class KktFactors:
     """Factors L diag(d) L^T of a KKT matrix [D A^T; A 0], as atoms of `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Indices below `count` are coordinates, all others are constraint equations.
 

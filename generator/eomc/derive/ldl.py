@@ -21,7 +21,8 @@ MAX_PIVOTS_PER_PRODUCT = 8  # products of 8 pivots from 1e-38 to 1e38 stay in a 
 class Solution:
     """The solution of D qdd = tau - bias by one method, as atoms of `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------

@@ -29,15 +29,16 @@ STICKS = (
 
 
 def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
-    """Return the derivatives [da/dq, da/dqd, da/du] of accelerations a at constant inputs.
+    """Return the derivatives [da/dq, da/dqd, da/du] of the accelerations a.
 
-    The result has the shape (nq, 2 nq + nu), by rows. Where that would be long it is a single row:
-    the derivative of a along the direction with the components `tangent_symbols(system)`.
+    The result is a matrix (nq, 2 nq + nu) by rows. If its expressions would be too long, return a
+    single row (nq,) instead: the directional derivative of a. The components of the direction, one
+    for each coordinate, velocity and input, are then the symbols `tangent_symbols(system)`.
 
     Raises
     ------
     SceneError
-        If the accelerations jump.
+        If the accelerations contain a discontinuous function.
     """
     entries = tangent_symbols(system)
     if len(entries) * len(tape.live(accelerations)) > UNROLLED_SIZE_LIMIT:
@@ -47,10 +48,12 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
 
 
 def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
-    """Return the derivative of each value along the direction `tangent_symbols(system)`.
+    """Return the directional derivative of each of `values`, which depend on q, qd and u.
 
-    The values are functions of state and inputs on the tape. The direction has one component for
-    each coordinate, velocity and input. Raises SceneError if a value jumps.
+    The direction v has one component for each coordinate, velocity and input; the components are
+    the symbols that `tangent_symbols(system)` returns. The result for a value f is
+    sum_x df/dx v_x over all x in (q, qd, u). The values and results are defined on `tape`, a list
+    of elementary operations. Raises SceneError if a value contains a discontinuous function.
     """
     return _slopes(system, tape, values, [tangent_symbols(system)])[0]
 
@@ -58,7 +61,8 @@ def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) 
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
     """Return the derivatives da/dp of accelerations a with respect to the parameters, (nq, np).
 
-    Inputs are held constant. Raises SceneError if the accelerations jump.
+    The state and the inputs are held constant. Raises SceneError if the accelerations contain a
+    discontinuous function.
     """
     entries = [{p.symbol: S.One} for p in system.parameters]
     return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))

@@ -16,11 +16,12 @@ from eomc.model.system import System
 
 
 def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """Return a tape and, on it, total mass, centre of mass and momenta of all moving bodies.
+    """Return the pair (tape, values) with total mass, centre of mass and momenta of all bodies.
 
-    The values are the mass (kg), the position of the centre of mass (m), the momentum (kg m/s) and
-    the angular momentum about the centre of mass (kg m^2/s), along the world's axes; in the plane
-    m, x, y, px, py, L. The rotors of drives do not count.
+    The tape is the list of elementary operations that compute the values. These are, for all moving
+    bodies together: the mass (kg), the position of the centre of mass (m), the momentum (kg m/s)
+    and the angular momentum about the centre of mass (kg m^2/s). Vectors are along the world's
+    axes. In the plane the values are m, x, y, px, py, L. Rotors of drives are not included.
 
     Raises
     ------

@@ -20,7 +20,8 @@ from eomc.model.system import System, t
 class Outputs:
     """The outputs of a scene and their derivatives, as atoms of the tape `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------

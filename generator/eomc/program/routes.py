@@ -60,7 +60,8 @@ class RouteInputs:
 class Functions:
     """Functions of the equations of motion by one route, as atoms of `tape`.
 
-    An atom is a number, the name of a definition on the tape, or a number times a name.
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
 
     Attributes
     ----------
