@@ -30,10 +30,11 @@ ZERO_GRADIENT_TOLERANCE = {"double": 1e-22, "float": 1e-12}
 
 @dataclass(frozen=True)
 class Constraints:
-    """The m constraint equations of a system on a tape, holonomic equations first.
+    """The m constraint equations of a system, holonomic equations first, as symbolic expressions.
 
-    Each quantity is an atom of the tape of the equations of motion: a number, the name of a
-    definition on the tape, or a number times a name.
+    Expressions are atoms of the tape of the equations of motion. A tape is a list of elementary
+    operations, each with a named result. An atom is a number, a name on the tape, or a number times
+    a name.
 
     Attributes
     ----------
@@ -42,22 +43,24 @@ class Constraints:
     jacobian : (m, nq)
         A: d phi/d q of holonomic and d psi/d qd of nonholonomic constraints.
     rates : (m,)
-        A qd + phi_t for holonomic constraints, psi for nonholonomic ones.
+        Rate of each constraint: d(phi)/dt = A qd + phi_t for holonomic constraints, psi for
+        nonholonomic ones.
     rest : (m,)
-        d(rates)/dt - A qdd.
+        The part of d(rates)/dt that does not depend on qdd: d(rates)/dt - A qdd.
     drift : (m,)
-        The value of A qd for which `rates` is 0: rates = A qd - drift.
+        The value that A qd has where the constraints hold: rates = A qd - drift.
     holonomic : int
         The number of holonomic constraints.
     solved : tuple of Sum
         The independent equations from which accelerations are computed, each a weighted sum of
         constraint equations. Most consist of a single one; redundant ones are left out.
     drop : (Expr, Expr)
-        Relative pivot tolerances for accelerations and for the projection. An equation whose pivot
-        is below the tolerance depends on others in this configuration; its multiplier is set to 0.
+        Relative pivot tolerances: the first for accelerations, the second for the projection of q
+        and qd onto the constraints. An equation whose pivot is below the tolerance depends on
+        others in this configuration; it is dropped, and its multiplier is set to 0.
     weights : tuple of Expr
-        Where D alone is singular, the weight w of each equation with which D + A^T w A is regular.
-        Empty otherwise.
+        If D alone is singular: the weight of each equation in `solved`. With the diagonal matrix W
+        of the weights, D + A^T W A is regular. Empty if D is regular.
     pivot_limits : tuple of Expr
         For each equation in `solved`, the pivot below which its gradient counts as zero.
     switched : frozenset of int
@@ -82,10 +85,10 @@ class Constraints:
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
-    """Return the constraint equations of a system, or None if it has none.
+    """Return the constraint equations of a system with their derivatives, or None without any.
 
-    `e` contains the system's energies and the residuals of its constraints on a tape; the
-    derivatives of the residuals are defined on the same tape.
+    `e` contains the residuals of the constraints, defined on a tape (list of elementary
+    operations). The derivatives are added to the same tape.
     """
     if not system.constraints:
         return None
@@ -136,11 +139,12 @@ def _pivot_limit(gradient: Sequence[Expr], limit: float) -> Expr:
 
 
 def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vector:
-    """Return the rate of each unswitched equation, followed by the magnitude of each rate's terms.
+    """Return the rates of independent constraint equations, followed by the scales of the rates.
 
-    The rate is A qd + phi_t, the magnitude is the sum of the absolute values of its terms. Where an
-    equation depends on others, its multiplier cannot enforce it. A rate that is large relative to
-    its terms then shows that the motion violates the equation.
+    The rate of an equation is A qd + phi_t; its scale is the sum of the absolute values of the
+    terms. A rate that is large relative to its scale shows that the motion violates the equation,
+    as where the equation depends on others and its multiplier was set to 0. Equations that are
+    active in some contact or friction modes only are left out.
     """
     indices = [k for k, row in enumerate(rows.solved) if row[0][0] not in rows.switched]
     A = jacobian(tape, rows)
@@ -153,16 +157,20 @@ def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vec
 
 
 def jacobian(tape: Tape, rows: Constraints) -> Rows:
-    """Return the Jacobian A of the independent constraint equations `rows.solved`, by rows."""
+    """Return the Jacobian A of the independent constraint equations, by rows.
+
+    `rows` contains all constraint equations. Those in `rows.solved` are independent.
+    """
     columns = [select_rows(tape, column, rows) for column in zip(*rows.jacobian, strict=True)]
     return tuple(zip(*columns, strict=True))
 
 
 def select_rows(tape: Tape, numbers: Sequence[Expr], rows: Constraints) -> list[Expr]:
-    """Return one value for each independent equation from one number for each constraint equation.
+    """Return the values of the independent equations, from `numbers` for all constraint equations.
 
-    An equation in `rows.solved` is a weighted sum of constraint equations; its value is the sum of
-    their `numbers` with the same weights.
+    `numbers` contains one quantity for each constraint equation, such as its rate. An independent
+    equation, listed in `rows.solved`, is a weighted sum of constraint equations. Its value is the
+    sum of their numbers with the same weights.
     """
     return [
         numbers[row[0][0]] if len(row) == 1

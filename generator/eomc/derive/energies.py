@@ -14,7 +14,7 @@ from eomc.model.system import System, dot, symbol, t
 
 @dataclass
 class Energies:
-    """Energies, forces and constraint residuals of a system, as atoms of `tape`.
+    """Energies, forces and constraint residuals of a system, as atoms of the attribute `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
@@ -24,17 +24,18 @@ class Energies:
     kinetic, potential : Expr
         Energies K and P (J).
     linear_potential : Expr
-        The potential a(q, t) . qd that is linear in the velocities.
+        The velocity-dependent potential a(q, t) . qd (J).
     dissipation : Expr
         Rayleigh's dissipation function R (W).
     forces : list of Expr
         Generalized force Q on each coordinate.
     signals : list of Expr
-        Value of each input.
+        Value of each input, by its formula in the scene.
     points : dict
-        The position y_k of each point whose velocity w_k = dot(y_k) occurs in a formula, by w_k.
+        For each velocity w_k = dot(y_k) in a formula, the position y_k. The keys are the symbols
+        w_k.
     applied : list of (Expr, Expr)
-        For each force at a point: the point's velocity, and the force.
+        For each force at a point: the velocity of the point, and the force.
     rows : list of Expr
         Residual of each constraint equation.
     rotation_errors : list of (Expr, Expr)
@@ -56,19 +57,20 @@ class Energies:
 
 
 def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
-    """Return the symbols for the components of a direction in the space of q, qd and u.
+    """Return a symbol for the component of a direction along each coordinate, velocity and input.
 
-    The keys are the coordinates, velocities and inputs. Derivatives along a direction are expressed
-    with these symbols.
+    The keys are the symbols of q, qd and u. The values are symbols v_x with which a directional
+    derivative sum_x df/dx v_x is written.
     """
     return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
 
 
 def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
-    """Return the binding time (`Stage`) of each symbol of a tape that has no definition.
+    """Return the variables of the equations of motion, each with its binding time (`Stage`).
 
-    The symbols are t, the parameters, inputs, q and qd of the system, and further `velocities`,
-    which have the same stage as qd.
+    The binding time says when a value can be computed: once for each set of parameters, from the
+    time, from the positions, or from the velocities. The variables are t, the parameters, inputs,
+    q and qd. Further symbols `velocities` are added with the binding time of qd.
     """
     stages: dict[Symbol, Stage] = {t: Stage.TIME}
     stages |= {p.symbol: Stage.PARAMETER for p in system.parameters}
@@ -80,17 +82,18 @@ def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
 def energies_on_tape(
     system: System, kinetic: Expr, potential: Expr, accelerations: bool = False
 ) -> Energies:
-    """Define the energies and all other terms of a system's equations of motion on a new tape.
+    """Return the energies and other terms of the equations of motion, defined on a new tape.
 
-    The other terms are the system's dissipation, forces, input signals and constraint residuals.
+    The tape is a list of elementary operations. The other terms are the dissipation, forces, inputs
+    and constraint residuals of the system.
 
     Parameters
     ----------
     kinetic, potential
         Formulas of the energies to use in place of `system.kinetic` and `system.potential`.
     accelerations
-        Whether the tape has the accelerations `system.qdd` as symbols, in place of the components
-        of a direction (`tangent_symbols`).
+        If True, formulas on the tape may contain the accelerations `system.qdd`. If False, they may
+        contain the components of a direction, see `tangent_symbols`.
 
     Raises
     ------

@@ -31,8 +31,8 @@ class MotionTerms:
     Attributes
     ----------
     D : (nq, nq) or (1, nq)
-        Mass matrix by rows. Where the matrix would be long: the single row D v for the direction v
-        with the entries `tangent_symbols(system)`.
+        Mass matrix by rows. If its expressions would be too long: the single row D v, where the
+        entries of the vector v are symbols, see `tangent_symbols`.
     bias : (nq,)
         C qd + g.
     g : (nq,)
@@ -42,7 +42,7 @@ class MotionTerms:
     balance : (nq,)
         tau - bias, the right-hand side of D qdd = tau - bias.
     quadratic : bool
-        Whether K is a quadratic form of the velocities without explicit time.
+        Whether the kinetic energy K is a quadratic form of qd and does not depend on t explicitly.
     notes : tuple of str
         Sentences that say where the parts of K that are not quadratic appear in the equations.
     """
@@ -58,7 +58,7 @@ class MotionTerms:
 
 @dataclass(frozen=True)
 class Equations(MotionTerms):
-    """The equations of motion of a system, as atoms of `tape`.
+    """The equations of motion of a system, as atoms of the attribute `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
@@ -68,18 +68,19 @@ class Equations(MotionTerms):
     tape : Tape
         The definitions of all names that the attributes contain.
     C : (nq, nq) or (1, nq)
-        Coriolis matrix, in the same form as D.
+        Coriolis matrix by rows, or the single row C v if D is given as D v.
     signals : (nu,)
-        Values of the inputs.
+        Values of the inputs, by their formulas in the scene.
     kinetic, potential : Expr
         Energies K and P (J).
     jacobi : Expr or None
         Jacobi's integral p . qd - K + P, with p = dK/dqd. It is conserved without forces and
         explicit time. None where it equals K + P.
     power : Expr
-        d(jacobi)/dt without the power of constraint forces (W); 0 for a conservative system.
+        Time derivative of Jacobi's integral (of K + P if `jacobi` is None), without the power of
+        constraint forces (W). It is 0 for a conservative system.
     rows : Constraints or None
-        The constraint equations.
+        The constraint equations; None without constraints.
     """
 
     tape: Tape
@@ -93,10 +94,10 @@ class Equations(MotionTerms):
 
 
 def equations(system: System, e: Energies, motion: MotionTerms) -> Equations:
-    """Return the equations of motion of a system, from its energies and its terms D, bias and tau.
+    """Return the equations of motion of a system, completed from `motion` (D, bias and tau).
 
-    Derives what `motion` does not contain: the Coriolis matrix, Jacobi's integral with its time
-    derivative, and the constraint equations.
+    The Coriolis matrix, Jacobi's integral with its time derivative, and the constraint equations
+    are derived and added. `e` contains the energies and the residuals of the constraints.
     """
     tape, qd = e.tape, system.qd
 
@@ -154,10 +155,10 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
 
 
 def raise_no_inertia(system: System, name: str) -> NoReturn:
-    """Raise a SceneError for the coordinate `name`, which has no inertia.
+    """Raise a SceneError which says that the coordinate `name` has no inertia.
 
-    The message suggests a remedy, which depends on whether bodies on joints, or a formula of the
-    kinetic energy, should give the coordinate its inertia.
+    The message suggests a remedy. It depends on whether the inertia of the coordinate should come
+    from bodies on joints or from a formula of the kinetic energy.
     """
     links = system.tree.links if system.tree else ()
     body = next((link.name for link in links if symbol(name) in link.q.free_symbols), "")

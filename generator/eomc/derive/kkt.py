@@ -32,27 +32,31 @@ DROPPED_PIVOT = sympy.Float("1e-9")  # replaces a dropped pivot, relative to its
 
 @dataclass(frozen=True)
 class KktFactors:
-    """Factors L diag(d) L^T of a KKT matrix [D A^T; A 0], as atoms of `tape`.
+    """Factors L diag(d) L^T of the KKT matrix [D A^T; A 0], as atoms of the attribute `tape`.
+
+    D is the mass matrix and A the Jacobian of the constraint equations. Rows of the matrix with an
+    index below `count` belong to coordinates, all others to constraint equations.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
 
-    Indices below `count` are coordinates, all others are constraint equations.
-
     Attributes
     ----------
     steps
-        In order of elimination: the index, the inverse of its pivot, and the column of L below it.
+        For each elimination step, in order: the index of the row, the inverse of its pivot, and the
+        column of L below the pivot.
     pivots
-        Pivots of coordinates, all positive, each with the matrix entry that it started from.
+        For each coordinate: its pivot, which must be positive, and the diagonal entry of the matrix
+        from which the elimination computes the pivot.
     inverses
         Inverse pivots of the constraint equations; 0 for an equation that is dropped because its
         pivot is too small.
     switched
-        For each constraint equation that modes switch, by index: its pivot (a small fraction of
-        its initial value where it is dropped), and the entries below it before they are divided.
+        For each switched constraint (active in some contact or friction modes only), by index: its
+        pivot, and the entries below the pivot before their division by it. The pivot of a dropped
+        constraint is replaced by a small fraction of its initial value.
     slides
-        For each coordinate that a switched constraint fixes, by index: 0 where that constraint is
+        For each coordinate that a switched constraint fixes, by index: 0 while that constraint is
         active, else 1.
     """
 
@@ -67,11 +71,19 @@ class KktFactors:
     def solve(
         self, b: Sequence[Expr], c: Sequence[Expr], short: Callable[[Expr], Expr]
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the solution of D a - A^T lambda = b, A a = c.
+        """Return the solution (a, lambda, residuals) of D a - A^T lambda = b, A a = c.
 
-        `short` is applied to intermediate results and may replace them by shorter ones. A
-        coordinate that an active switched constraint fixes gets an acceleration of exactly 0, so
-        that rounding errors do not move it.
+        A switched constraint is active in some contact or friction modes only. While it is active
+        and fixes a coordinate, the acceleration of the coordinate is exactly 0, so that rounding
+        errors do not move it.
+
+        Parameters
+        ----------
+        b, c
+            Right-hand sides, (nq,) and (m,).
+        short
+            Function that is applied to intermediate results. It may return a shorter expression
+            with the same value.
 
         Returns
         -------
@@ -80,7 +92,8 @@ class KktFactors:
         lambda : (m,)
             The multipliers; 0 for dropped equations.
         residuals
-            For each switched constraint, lambda times pivot, whether or not the pivot is dropped.
+            For each switched constraint, the product of its lambda and its pivot. It is also
+            computed for a constraint that is dropped.
         """
         tape, y = self.tape, [*b, *c]
         for k, _, factors in self.steps:
@@ -116,20 +129,22 @@ def factors(
     Parameters
     ----------
     tape : Tape
-        Receives the definitions of the factors.
+        List of elementary operations, to which those of the factorization are added.
     D, A : Rows
         Mass matrix and Jacobian of the constraint equations.
     drop : Expr
-        Pivot tolerance of a constraint equation, relative to the pivot's initial value.
+        Pivot tolerance of a constraint equation, relative to the initial value of the pivot. An
+        equation with a smaller pivot is dropped: it depends on the equations before it.
     faded : sequence of Expr
         Absolute pivot tolerance of each constraint equation.
     short
-        Applied to intermediate results, which it may replace by shorter ones.
+        Function that is applied to intermediate results. It may return a shorter expression with
+        the same value.
     switched
-        Indices of constraint equations that modes switch, see `KktFactors.switched`.
+        Indices of constraint equations that are active in some contact or friction modes only.
     last
-        Indices of constraint equations that are eliminated after all others, and are dropped
-        where the others already determine them.
+        Indices of constraint equations that are eliminated after all others. They are dropped if
+        they depend on the others.
     """
     n = len(D)
     M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -230,10 +245,21 @@ def accelerations(
     rows: Constraints,
     short: Callable[[Expr], Expr] = lambda atom: atom,
 ) -> Solution:
-    """Return the solution of the constrained equations of motion: qdd and all multipliers.
+    """Return the accelerations qdd and Lagrange multipliers of a system with constraints.
 
-    `b` is tau - bias. The multipliers of redundant constraints are 0. `short` is applied to
-    intermediate results, which it may replace by shorter ones.
+    The result has one multiplier for each constraint; those of redundant constraints are 0.
+
+    Parameters
+    ----------
+    tape : Tape
+        List of elementary operations, to which those of the solution are added.
+    D, b
+        Mass matrix by rows, and tau - bias.
+    rows : Constraints
+        The constraint equations.
+    short
+        Function that is applied to intermediate results. It may return a shorter expression with
+        the same value.
     """
     A = jacobian(tape, rows)
     c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
@@ -265,10 +291,12 @@ def _switched(rows: Constraints) -> list[int]:
 def with_mass(
     tape: Tape, D: Rows, b: Sequence[Expr], A: Rows, c: Sequence[Expr], weights: Vector = ()
 ) -> tuple[Rows, Sequence[Expr]]:
-    """Return D + A^T W A and b + A^T W c where D alone is singular, else D and b.
+    """Return a regular mass matrix and its right-hand side for constrained equations of motion.
 
-    Since A a = c, accelerations and multipliers are unchanged. W is diagonal with the entries
-    `weights`; if there are none and a coordinate has no inertia, W is the identity.
+    They are (D + A^T W A, b + A^T W c) if D is singular, else (D, b). The accelerations a, with
+    D a - A^T lambda = b and A a = c, and the multipliers lambda are the same in both cases. W is
+    the diagonal matrix of `weights`, which are given only if D is singular. Without them, D counts
+    as singular if a diagonal entry is 0, and W is then the identity.
     """
     n = range(len(D))
     if not weights and all(D[i][i] != 0 for i in n):
@@ -287,17 +315,20 @@ def with_mass(
 def projection(
     tape: Tape, D: Rows, rows: Constraints, q: Sequence[sympy.Symbol]
 ) -> tuple[Vector, Pairs]:
-    """Return the corrections that move q and qd onto the constraints, and the inverse pivots.
+    """Return the corrections of q and qd that project them onto the constraints.
 
-    One Newton step in the metric of D: the smallest dq (in the norm of D) with A dq = -phi, then
-    the smallest correction of qd, with the velocity constraints taken at q + dq to first order.
+    They are one Newton step. The correction dq of q is the smallest in the norm of D that satisfies
+    A dq = -phi. The correction dqd of qd is the smallest with which the velocity constraints hold
+    at q + dq, to first order in dq.
 
     Returns
     -------
     values : tuple of Expr
-        dq (nq), dqd (nq), and the inverse pivot of each constraint that modes do not switch.
+        dq (nq), dqd (nq), and the inverse pivot of each constraint equation that is active in all
+        contact and friction modes.
     pivots : Pairs
-        Pivots of coordinates, each with the matrix entry that it started from.
+        For each coordinate: its pivot in the factorization, and the diagonal entry of the matrix
+        from which the pivot is computed.
     """
     n, A = len(D), jacobian(tape, rows)
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)

@@ -49,14 +49,16 @@ MASSLESS = "a motion that nothing resists"
 
 @dataclass(frozen=True)
 class Derivation:
-    """The equations of motion of `system`, by each method that may lead to the fastest code.
+    """The equations of motion of a system, derived by several methods.
+
+    The compiler later selects the method whose code is fastest.
 
     Attributes
     ----------
     lagrange : Equations or None
         By differentiation of K and P; None where that method was not used.
     newton_euler : Equations or None
-        By the recursive Newton-Euler algorithm; None without bodies on joints.
+        By the recursive Newton-Euler algorithm; None for a system without bodies on joints.
     ldl : SolveResult
         Accelerations by L D L^T factorization of the mass matrix that Lagrange's method gives.
     composite : SolveResult
@@ -64,10 +66,10 @@ class Derivation:
     articulated : SolveResult
         Accelerations by the articulated-body algorithm.
     multipliers : SolveResult
-        Accelerations by link multipliers (link_multipliers.py).
+        Accelerations by link multipliers, the tensions of massless links between point masses.
 
-    A SolveResult is the solution, or a str with the reason why the method was not used. It is None
-    where the method does not apply, as with constraints (see kkt.py).
+    A SolveResult is a solution D qdd = tau - bias, or a str with the reason why the method was not
+    used. It is None if the method does not apply, as for a system with constraints.
     """
 
     system: System
@@ -248,10 +250,10 @@ def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
 def inertial_forces(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> list[Expr]:
-    """Return D qdd + bias, one force for each coordinate, of the energies on a tape.
+    """Return the generalized force D qdd + bias of each coordinate, derived from the energies `e`.
 
-    They are derived by Lagrange's operator. `accelerations` maps each velocity symbol to its time
-    derivative.
+    It is computed by Lagrange's operator. `accelerations` maps each velocity symbol to the
+    expression of its time derivative.
     """
     tape, q = e.tape, system.q
     momentum_rates = _momenta(system, e, accelerations)[1]

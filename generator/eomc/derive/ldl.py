@@ -19,7 +19,7 @@ MAX_PIVOTS_PER_PRODUCT = 8  # products of 8 pivots from 1e-38 to 1e38 stay in a 
 
 @dataclass(frozen=True)
 class Solution:
-    """The solution of D qdd = tau - bias by one method, as atoms of `tape`.
+    """The solution of D qdd = tau - bias by one method, as atoms of the attribute `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
@@ -29,17 +29,18 @@ class Solution:
     acceleration : (nq,)
         qdd.
     order : tuple of int
-        Coordinates in order of elimination.
+        Indices of the coordinates in order of elimination.
     pivots : Pairs
-        Pivots of L diag(pivots) L^T, all positive where D is positive definite, each with the
-        magnitude of the terms that it was computed from.
+        For each pivot of the factorization L diag(pivots) L^T: the pivot, and the magnitude of the
+        terms that it was computed from. All pivots are positive if D is positive definite.
     matrix : str
-        The matrix that is factored: "D", or "S" for link multipliers (see link_multipliers.py).
+        The matrix that is factored: "D" for the mass matrix, or "S" for the matrix of the equations
+        for link multipliers (tensions of massless links).
     multipliers : Vector
         Lagrange multipliers of the constraints; empty without constraints.
     parts : mapping
-        For constraints that modes switch, by index: the two quantities whose ratio is the
-        multiplier, see `Constraint.parts`.
+        For each constraint that is active in some contact or friction modes only, by index: the
+        numerator and the denominator of its multiplier, see `Constraint.parts`.
     """
 
     tape: Tape
@@ -63,13 +64,15 @@ def solve(
     opaque: Callable[[Expr], Expr] = lambda atom: atom,
     short_chains: bool = False,
 ) -> Solution:
-    """Return the solution x of D x = b by L diag(d) L^T, each operation a definition on the tape.
+    """Return the solution x of D x = b by L diag(d) L^T factorization, as symbolic expressions.
 
-    Zeros are neither stored nor computed with.
+    Each operation is added to `tape`, a list of elementary operations with named results. Entries
+    that are zero are neither stored nor computed with.
 
-    The next pivot is the one with the fewest entries left in its row (minimum degree). Among equals
-    it is the one known earliest, then the one with the shortest chain of divisions before it. A
-    chain is thus eliminated from both of its ends, which a processor computes in parallel.
+    The next pivot is the one with the fewest entries left in its row (minimum degree). Among
+    several of these it is the one that can be computed earliest, then the one with the shortest
+    chain of divisions before it. If D is the matrix of a chain of bodies, the chain is thus
+    eliminated from both of its ends, which a processor computes in parallel.
 
     With `short_chains`, dependency chains are shorter at the price of more operations. A pivot that
     depends on parameters only is ranked as if its row had one entry less, so that every other pivot
@@ -84,14 +87,15 @@ def solve(
     Parameters
     ----------
     tape : Tape
-        Receives the definitions of the solution.
+        Receives the operations of the solution.
     D, b
         Symmetric matrix by rows, and right-hand side.
     short
-        Applied to intermediate results, so that terms that cancel are removed.
+        Function that is applied to intermediate results. It may return a shorter expression with
+        the same value, in which terms that cancel are removed.
     opaque
-        Applied to the entries of L. With `Tape.opaque`, each x depends on the one before through
-        one operation rather than two.
+        Function that is applied to the entries of L. With `Tape.opaque`, later products do not
+        expand them. Each x then depends on the one before through one operation, not two.
     short_chains
         Prefer short dependency chains to few operations.
 
@@ -149,7 +153,10 @@ def solve(
 
 
 def count_operations(D: Rows) -> int:
-    """Return the number of arithmetic operations that `solve` needs for D, including fill-in."""
+    """Return the number of arithmetic operations with which `solve` factors D and solves D x = b.
+
+    Entries that become nonzero during the elimination (fill-in) are included.
+    """
     neighbours = {i: {j for j, x in enumerate(row) if x != 0 and j != i} for i, row in enumerate(D)}
     total = 0
     while neighbours:

@@ -37,22 +37,24 @@ Row = dict[int, Expr]  # nonzero entries of a sparse row, by column
 
 
 class UnsuitedError(Exception):
-    """Raised with the reason why link multipliers do not apply to a system.
+    """Raised if the method of link multipliers does not apply to a system.
 
-    Link multipliers (tensions of massless links) require point masses on links.
+    The text of the exception is the reason. The method computes the tensions of massless links
+    between point masses.
     """
 
 
 @dataclass(frozen=True)
 class PointMass:
-    """A point mass: a coordinate or position with the kinetic energy mass speed^2/2.
+    """A point mass along one axis, with the kinetic energy mass speed^2/2.
 
     Attributes
     ----------
     place : Expr
-        The position, as an atom of the tape.
+        The position along the axis (m), or a coordinate. It is an atom of a tape: a number, a name
+        on the tape, or a number times a name.
     speed : Symbol
-        Its time derivative.
+        The time derivative of `place`.
     mass : Expr
         The mass.
     """
@@ -64,21 +66,23 @@ class PointMass:
 
 @dataclass(frozen=True)
 class LinkGroup:
-    """The increments of positions that depend on the same angle phi = sum_i direction_i q_i.
+    """The increments e of positions that depend on the same angle phi = sum_i direction_i q_i.
 
-    Positions are sums of increments e, each a function of one angle, such as l sin(phi). Their
-    second time derivatives are slopes phidd + beta.
+    The position of each point mass is a sum of increments. An increment is a function of one angle,
+    such as l sin(phi). Its second time derivative is slope phidd + beta.
 
     Attributes
     ----------
     direction : (nq,)
-        Weights of the coordinates in the angle.
+        Coefficients of the coordinates in the angle.
     members : tuple of int
         Indices of the increments.
-    slopes, beta : tuple of Expr
-        For each increment, de/dphi and its second time derivative at qdd = 0.
+    slopes : tuple of Expr
+        For each increment, its derivative de/dphi.
+    beta : tuple of Expr
+        For each increment, its second time derivative at qdd = 0.
     perpendicular : tuple of rows
-        A basis of the rows n with n . slopes = 0.
+        A basis of the vectors n with n . slopes = 0.
     """
 
     direction: tuple[Expr, ...]
@@ -91,8 +95,9 @@ class LinkGroup:
 def prefer_short_chains(system: System) -> bool:
     """Return True if `ldl.solve` should prefer short dependency chains to few operations.
 
-    This is not worthwhile in batches, where several states are computed in parallel and hide
-    latencies. In single precision, products of pivots would exceed the range of a float.
+    The result is False for batches: several states are computed in parallel, so that the processor
+    is busy even with long chains. It is also False in single precision, since products of pivots
+    could exceed the range of a float.
     """
     return system.run.real == "double" and not system.run.batch
 

@@ -15,10 +15,11 @@ from eomc.model.tree import Tree
 
 
 class Links(Vectors):
-    """The links of a kinematic tree on a tape, parents before children.
+    """The links of a kinematic tree, parents before children, with symbolic expressions.
 
-    Link k moves relative to its parent by the displacement s_k(q) of its joint: an angle (rad)
-    about the joint's axis where `links[k].turns`, else a length (m) along it.
+    Expressions are defined on a tape, a list of elementary operations with named results. Link k
+    moves relative to its parent by the displacement s_k(q) of its joint. This is an angle (rad)
+    about the joint's axis if `links[k].turns`, else a length (m) along the axis.
 
     Attributes
     ----------
@@ -27,7 +28,7 @@ class Links(Vectors):
     slopes
         For each link, the derivatives ds_k/dq by coordinate.
     cosine, sine
-        For each link, those of the joint's angle; 1 and 0 where the joint does not turn.
+        For each link, the cosine and sine of the joint's angle; 1 and 0 for a prismatic joint.
     rotation
         For each link, the rotation matrix from its frame at s_k = 0 to its parent's frame.
     arm
@@ -90,9 +91,10 @@ class Links(Vectors):
     # --- frames ----------------------------------------------------------------------------------
 
     def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
-        """Return a vector of link k's frame, rotated by the angle of its joint.
+        """Return the vector `v`, given in link k's frame, rotated by the angle of the link's joint.
 
-        With `back`, it is rotated by the negative angle. A prismatic joint leaves it unchanged.
+        With `back`, the vector is rotated by the negative angle. If the joint is prismatic, the
+        vector is returned unchanged.
         """
         if not self.links[k].turns:
             return v

@@ -18,7 +18,7 @@ from eomc.model.system import System, t
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of a scene and their derivatives, as atoms of the tape `tape`.
+    """The outputs of a scene and their derivatives, as atoms of the attribute `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
@@ -28,10 +28,11 @@ class Outputs:
     values : (ny,)
         The outputs.
     slopes : (ny, 3 nq + nu)
-        Derivatives with respect to q, qd, u and qdd. Rows are empty where none were requested.
+        Derivatives with respect to q, qd, u and qdd. The rows are empty if no derivatives were
+        requested.
     sensitivity : (ny, np)
-        Derivatives with respect to the parameters at constant q, qd, u and qdd. Rows are empty
-        where none were requested.
+        Derivatives with respect to the parameters at constant q, qd, u and qdd. The rows are empty
+        if no derivatives were requested.
     """
 
     tape: Tape
@@ -46,20 +47,22 @@ def outputs(
     extra_symbols: Sequence[Symbol] = (),
     base: tuple[Tape, Mapping[Symbol, Expr]] | None = None,
 ) -> Outputs:
-    """Return the system's outputs, with their derivatives if `with_derivatives`.
+    """Return the outputs of a system, defined on a tape (list of elementary operations).
 
     Parameters
     ----------
+    with_derivatives
+        Whether the derivatives of the outputs are computed, too.
     extra_symbols
         Symbols that outputs may contain in addition to those of the system.
     base
-        A tape to continue, and the atoms on it of symbols that outputs may contain. A new tape by
-        default.
+        The pair (tape, values): the tape to which the outputs are added, and the expression on it
+        of each further symbol in the outputs. By default the tape is new.
 
     Raises
     ------
     SceneError
-        If a derivative is needed that does not exist, since a function jumps.
+        If the derivative of a discontinuous function is needed.
     """
     stages = leaves(system, *system.qdd, *extra_symbols)
     tape, known = base or (Tape(stages), {})
@@ -76,9 +79,9 @@ def outputs(
 
 
 def signal_slopes(system: System) -> Outputs:
-    """Return the signals of the inputs, with their derivatives with respect to q, qd and qdd.
+    """Return the formulas of the inputs (signals) and their derivatives by q, qd and qdd.
 
-    A signal is the formula of an input. The result has the form of outputs of the scene.
+    They are returned in the form of outputs of a scene: the signals are the `values`.
     """
     signals = tuple(Output(i.name, i.signal) for i in system.inputs)
     return outputs(replace(system, outputs=signals, inputs=()), with_derivatives=True)
