@@ -34,8 +34,8 @@ UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 def expression(formula: Formula, known: Mapping[str, Expr]) -> Expr:
     """Convert a parsed formula to a SymPy expression and return it.
 
-    known: expression of each name that the formula may use. Raises FormulaError unless the value
-    is real and finite.
+    known: dict from each name that the formula may use to its SymPy expression. Raises
+    FormulaError if the value is not real or not finite.
     """
     try:
         value = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))

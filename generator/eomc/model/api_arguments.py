@@ -53,10 +53,10 @@ def fault(role: str, message: str) -> EomcError:
 
 
 def called(name: object, role: str) -> str:
-    """Return a name, given as text or a Symbol, as text.
+    """Return the name of a quantity as text, from the name itself or from a SymPy Symbol.
 
-    role: description of the argument for the message. Raises EomcError if the name is not valid in
-    C and Python.
+    name: the text or Symbol that the user passed to System.make. role: description of the argument
+    for the message. Raises EomcError if the name is not valid in C and Python.
     """
     if not isinstance(name, (str, Symbol)):
         raise fault(role, f"{name!r} is not a name")
@@ -80,10 +80,10 @@ LAGRANGIAN = (
 
 
 def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
-    """Raise TypeError if `unknown` has a name; the message suggests the closest name in `known`.
+    """Raise TypeError if a user passed keyword arguments that System.make does not have.
 
-    unknown: names of keyword arguments that System.make does not have. known: names of its
-    arguments.
+    unknown: the names of these keyword arguments; nothing is raised if there are none. known: names
+    of the valid arguments, of which the message suggests the most similar one.
     """
     for name in unknown:
         known = [*known]
@@ -96,10 +96,11 @@ def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collection[str]) -> None:
-    """Check the units of quantities, given by the names of the quantities.
+    """Raise EomcError if a unit is given for an unknown quantity, or is wrong for the quantity.
 
-    Raises EomcError for a name that is not in `known`, and for a unit in degrees except for
-    `outputs` (their names), since all other angles are in radians.
+    units: dict from the name of a quantity to its unit. known: names of all quantities. outputs:
+    names of the outputs, the only quantities whose unit may contain degrees, since all other angles
+    are in radians.
     """
     known = [*known]
     for name, unit in units.items():
@@ -241,10 +242,11 @@ def check_smooth(
 
 
 def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
-    """Convert a value, also a formula or expression without symbols, to a finite float.
+    """Convert a value that a user passed to System.make to a finite float and return it.
 
-    role: description of the argument for messages. rule: text of the message about a value with
-    symbols. Raises EomcError for other values.
+    value: a number, the text of a formula, or a SymPy expression; it must not contain names of
+    quantities. role: description of the argument for messages. rule: the rule that the message
+    states if the value does contain names. Raises EomcError if the value is not a finite number.
     """
     if isinstance(value, str):
         value = from_text(value, role, {}, rule)
@@ -260,10 +262,11 @@ def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
 
 
 def start(value: Any, role: str) -> tuple[Any, Any]:
-    """Split the entry of a coordinate in System.make into (initial value, initial velocity).
+    """Return the pair (initial value, initial velocity) that a user gave for one coordinate.
 
-    value: the initial value alone, or the pair; parts that are not given are None. role:
-    description of the argument for the message.
+    value: the value of the coordinate in the mapping `coordinates` of System.make: an initial
+    value, a pair, or None. In the result, a part that is not given is None. role: description of
+    the argument for the message.
     """
     pair = value if isinstance(value, (tuple, list)) else (value, None)
     if len(pair) != 2:
@@ -272,10 +275,10 @@ def start(value: Any, role: str) -> tuple[Any, Any]:
 
 
 def mapping(value: Any, role: str, example: str) -> Mapping[Any, Any]:
-    """Return the mapping `value` with keys that are names converted to symbols.
+    """Return a copy of the mapping `value` in which all keys are symbols.
 
-    role, example: description of the argument and a valid value for messages. Raises EomcError if
-    `value` is not a mapping or a key is not a symbol.
+    Keys that are names (text) are converted. role, example: description of the argument and a valid
+    value, for messages. Raises EomcError if `value` is not a mapping or a key can't be converted.
     """
     if not isinstance(value, Mapping):
         raise fault(role, f"give a dict, such as {example}, here {value!r}")
@@ -283,10 +286,10 @@ def mapping(value: Any, role: str, example: str) -> Mapping[Any, Any]:
 
 
 def by_name(value: Any, role: str, example: str) -> dict[str, Any]:
-    """Return the mapping `value` with keys that are symbols converted to their names.
+    """Return a copy of the mapping `value` in which all keys are names (text).
 
-    role, example: description of the argument and a valid value for messages. Raises EomcError if
-    `value` is not a mapping or a key is not a symbol.
+    Keys that are symbols are converted. role, example: description of the argument and a valid
+    value, for messages. Raises EomcError if `value` is not a mapping or a key can't be converted.
     """
     return {name_of(one): entry for one, entry in mapping(value, role, example).items()}
 
@@ -302,10 +305,11 @@ def or_empty(value: Any) -> Any:
 
 
 def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
-    """Convert a mapping or a collection of symbols or names to a dict from symbols to values.
+    """Return a dict from symbols to values, from a mapping or from a collection without values.
 
-    role: description of the argument for messages. default: value of each symbol of a collection.
-    Raises EomcError for other types.
+    value: a mapping from symbols or names to values, or a collection of symbols or names. role:
+    description of the argument for messages. default: the value of each symbol in the result if
+    `value` is a collection. Raises EomcError for other types.
     """
     if isinstance(value, Mapping):
         return dict(mapping(value, role, ""))
@@ -315,9 +319,10 @@ def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
 
 
 def symbol_of(value: Any, role: str) -> Any:
-    """Convert a name to a symbol; return a Symbol or function of time (dynamicsymbols) unchanged.
+    """Return the symbol that `value` stands for: a name is converted to a Symbol.
 
-    role: description of the argument for the message. Raises EomcError for other types.
+    A Symbol, or a function of time made by SymPy's `dynamicsymbols`, is returned unchanged. role:
+    description of the argument for the message. Raises EomcError for other types.
     """
     if not isinstance(value, (str, Symbol, AppliedUndef)):
         raise fault(role, f"{value!r} is not a symbol")
@@ -330,9 +335,10 @@ def run(
 ) -> Run:  # fmt: skip
     """Return the settings of simulations and generated code from the arguments of System.make.
 
-    h, duration: step size and length of a run in s. methods: names of fixed-step methods, or
-    "auto" for adaptive steps. real: C type of numbers. events: whether the system has events or
-    friction, for which steps are adaptive too. Raises EomcError for invalid settings.
+    All arguments but `events` are the arguments of System.make with these names. h, duration: step
+    size and length of a run in s. methods: names of fixed-step methods, or "auto" for adaptive
+    steps. real: C type of numbers. events: whether the system has events or friction; its steps are
+    then adaptive too. Raises EomcError for invalid settings.
     """
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:

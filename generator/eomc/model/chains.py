@@ -74,9 +74,10 @@ class Chains:
     def relative_pose(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
         """Return the position (m) and rotation matrix of a body in the frame of an ancestor.
 
-        name, base: names of the body and the ancestor. named: function that is called with the
-        name, position and rotation of each body on the path and returns the pose with which to
-        continue, such as one in symbols that are defined for long expressions.
+        name, base: names of the body and the ancestor. named: function that is called for each body
+        on the path with the name, position and rotation of the body. It returns the position and
+        rotation from which the next body's are computed. It may replace long expressions by symbols
+        that it defines.
         """
         at, R, angle, path = ZERO, ONE, S.Zero, self.path(name)
         for body in reversed(path[: path.index(base)]):
@@ -101,6 +102,6 @@ class Chains:
 def rotation_about(axis: int, angle: Expr) -> Matrix:
     """Return the matrix of a rotation by `angle` (rad) about the coordinate axis 0, 1 or 2.
 
-    It takes vectors from the rotated frame to the original one.
+    The matrix transforms the components of a vector from the rotated frame to the original one.
     """
     return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))

@@ -12,7 +12,8 @@ from eomc.base.texts import listed, plural
 class Move:
     """A coordinate or velocity whose initial value was changed to satisfy the constraints.
 
-    guess, value: before and after, in `unit`.
+    guess: the initial value that the user gave. value: the value that satisfies the constraints.
+    Both are in `unit`.
     """
 
     name: str
@@ -44,8 +45,9 @@ class ConstraintSummary:
     shared
         Names of the equations whose Lagrange multipliers are not unique.
     start_sigma, least_sigma
-        Ratio of the smallest nonzero singular value of the scaled Jacobian to the largest, at the
-        start and at the worst of the sampled configurations; 0 at a singular configuration.
+        Ratio s_rank / s_1 of the singular values s_1 >= s_2 >= ... of the scaled Jacobian.
+        start_sigma is the ratio at the start, least_sigma the smallest ratio at the sampled
+        configurations. The ratio is 0 at a singular configuration.
     positions
         Number of sampled configurations.
     weights
@@ -60,7 +62,7 @@ class ConstraintSummary:
     remarks
         Messages for the user.
     computed_from
-        The data of the system on which all this depends.
+        The data of the system from which the summary was computed; other data make it invalid.
     """
 
     rows: tuple[str, ...]
@@ -86,7 +88,7 @@ class ConstraintSummary:
 
     @property
     def ranks(self) -> str:
-        """Text that states the rank, the redundant equations and the multipliers not unique."""
+        """Text that states the rank, the redundant equations and the non-unique multipliers."""
         text = f"rank {self.rank} of {len(self.rows)}"
         if self.redundant:
             text += (

@@ -61,7 +61,8 @@ _NONLINEAR = Degree(2, 2)
 class VelocityDegree:
     """Classifier of expressions by their dependence on the velocities (see `Degree`).
 
-    definitions: (symbol, expression) pairs in order; their symbols count as their expressions.
+    definitions: pairs (symbol, expression), each over the symbols before it. Where such a symbol
+    occurs in an expression, its definition is classified in its place.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class VelocityDegree:
             self.known[name] = self.degree(e)
 
     def degree(self, e: Expr) -> Degree:
-        """Return the dependence of an expression in symbols of the system on the velocities."""
+        """Return how the expression `e` depends on velocities, coordinates and time."""
         degree = self.known.get(e)
         if degree is None:
             degree = self._combine(e, [self.degree(part) for part in e.args])
@@ -109,12 +110,16 @@ class Rows:
 
     Parameters
     ----------
-    coordinates, definitions
-        Those of the system; definitions are (symbol, expression) pairs in order.
+    coordinates
+        Coordinates of the system.
+    definitions
+        Definitions of the system: pairs (symbol, expression), each over the symbols before it.
     values
         Values of the parameters.
-    fault, doubt
-        Functions that are called with a constraint and a message for each error and each warning.
+    fault
+        Function that reports an error; it is called with the constraint and a message.
+    doubt
+        Function that reports a warning; it is called with the constraint and a message.
     """
 
     def __init__(
@@ -133,9 +138,11 @@ class Rows:
         self.velocity_degree = VelocityDegree(coordinates, definitions)
 
     def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
-        """Return the valid constraints with their attribute `holonomic` set, holonomic ones first.
+        """Return the valid constraints, holonomic ones first, with the attribute `holonomic` set.
 
-        Invalid constraints are reported by `fault` and doubtful ones by `doubt`.
+        rows: the constraint equations to check. An invalid constraint is left out and reported as
+        an error. A constraint that could be written for positions instead of velocities is returned
+        and reported as a warning.
         """
         holonomic, others = [], []
         for row in rows:
@@ -153,10 +160,11 @@ class Rows:
         return (*holonomic, *others)
 
     def without_constant_rows(self, closed: Closed) -> Closed:
-        """Return a loop without the constraint equations that are constant.
+        """Return a copy of a loop from which constant constraint equations are removed.
 
-        A constant equation that is zero is reported by `doubt`; it is reported by `fault` if it is
-        not zero or if no equation is left.
+        The left-hand side of such an equation does not depend on the coordinates. If it is zero, a
+        warning is reported. If it is not zero, so that the loop can't close, or if no equation is
+        left, an error is reported.
         """
         fixed = [self._fixed(row.formula) for row in closed.rows]
         if closed.points and None in fixed:

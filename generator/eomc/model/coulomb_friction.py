@@ -28,8 +28,9 @@ NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
 class Friction:
     """Coulomb friction that opposes the motion of a coordinate.
 
-    coordinate: name of the coordinate. force: size of the friction, >= 0, in N or N m. key: place
-    of the friction in the scene, for messages.
+    coordinate: name of the coordinate. force: magnitude of the friction while it slides, an
+    expression >= 0 in N or N m. key: key of the friction in the scene, such as
+    "coordinates.x.friction", for messages.
     """
 
     coordinate: str
@@ -38,11 +39,12 @@ class Friction:
 
 
 def add_stick_slip(system: AnySystem, frictions: Sequence[Friction]) -> AnySystem:
-    """Return the system with friction that switches between sticking and sliding.
+    """Return a copy of a system with added friction that switches between sticking and sliding.
 
-    For each coordinate with friction, a discrete coordinate (its friction mode), a constraint and
-    two events are added; frictions along the same coordinate are summed. Raises SceneError if the
-    name of an added quantity is already in use.
+    frictions: the friction to add; frictions along the same coordinate are summed. For each
+    coordinate with friction, the copy has a further discrete coordinate (the friction mode: stick
+    or slide), a constraint (the coordinate is at rest while it sticks) and two events (start and
+    end of sticking). Raises SceneError if the name of an added quantity is already in use.
     """
     if not frictions:
         return system
@@ -132,10 +134,11 @@ def _set_modes(event: Event, sliding: Mapping[str, str]) -> Event:
 
 
 def without_modes(system: AnySystem) -> AnySystem:
-    """Return the system without stick-slip friction: without its modes, constraints and events.
+    """Return a copy of a system without stick-slip friction and without any events.
 
-    All other events are removed too. Inverse of `add_stick_slip` for the assembly of initial
-    values, which then uses `with_modes`.
+    The coordinates and constraints that `add_stick_slip` added are removed. With this copy,
+    initial values are computed that satisfy all other constraints; `with_modes` then transfers
+    them to the original system.
     """
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
@@ -155,10 +158,11 @@ def without_modes(system: AnySystem) -> AnySystem:
 
 
 def with_modes(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return the system, which has friction modes, with the initial values and constraints of
-    `core`.
+    """Return a copy of a system with stick-slip friction that has the initial values of `core`.
 
-    core: result of `without_modes` for the system, with consistent initial values.
+    core: the result of `without_modes` for the system, after its initial values were adjusted to
+    its constraints. The copy also has the constraints of `core` and their summary. The initial
+    friction modes are computed from the initial velocities.
     """
     modes = [
         replace(system.coordinates[m.at], start=_side(core.coordinates[m.of].rate))

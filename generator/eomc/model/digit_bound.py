@@ -29,8 +29,8 @@ _RANGE = f"is not between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size, as numbers m
 class Bound:
     """An upper bound on the number of decimal digits of an exact number.
 
-    Arithmetic on bounds gives the bound of the result and raises FormulaError if that has too many
-    digits, overflows or is not real.
+    Arithmetic operations on bounds return the bound of the result. They raise FormulaError if the
+    result has too many digits, overflows or is not real.
 
     Attributes
     ----------
@@ -132,8 +132,9 @@ _ALGEBRA: Mapping[str, Any] = {
 def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
     """Return an upper bound on the digits of the value of a formula, without computing it exactly.
 
-    known: bounds of names in the formula; all other names stand for variables. Raises FormulaError
-    if the value is out of the range of doubles, is not real or has too many digits.
+    known: dict from a name in the formula to the bound of its value; names that are not in it stand
+    for variables. Raises FormulaError if the value is out of the range of doubles, is not real or
+    has too many digits.
     """
     result = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
     assert isinstance(result, Bound)

@@ -15,11 +15,11 @@ from eomc.model.symbols import Coordinate, Parameter
 
 
 def add_discrete_coordinates(system: AnySystem) -> AnySystem:
-    """Convert parameters that events change into discrete coordinates; return the new system.
+    """Return a copy of a system in which parameters that events change are discrete coordinates.
 
-    A discrete coordinate is constant between events. Raises SceneError if the name of its velocity
-    or acceleration is already in use, if the limit of an input depends on such a parameter, or if
-    an event function depends on such parameters and constant ones only.
+    A discrete coordinate is a coordinate that is constant between events. Raises SceneError in
+    three cases: the name of its velocity or acceleration is already in use; the limit of an input
+    depends on such a parameter; an event function depends on nothing but parameters.
     """
     jumped = {name for event in system.events for name, _ in event.jump}
     jumped_parameters = [p for p in system.parameters if p.name in jumped]
@@ -92,10 +92,11 @@ def _idle(system: Mechanics, jumped_parameters: list[Parameter]) -> list[Problem
 
 
 def with_constant_parameters(system: AnySystem) -> AnySystem:
-    """Return the system without events, with its discrete coordinates converted to parameters.
+    """Return a copy of a system in which discrete coordinates are parameters again.
 
-    The value of each parameter is the initial value of the discrete coordinate. A system without
-    discrete coordinates is returned unchanged.
+    A discrete coordinate stands for a parameter that events change. The copy has no events, and the
+    value of each such parameter is the initial value of the discrete coordinate. A system without
+    discrete coordinates is returned unchanged, with its events.
     """
     if not system.discrete:
         return system
@@ -120,10 +121,10 @@ def with_constant_parameters(system: AnySystem) -> AnySystem:
 
 
 def with_parameters_as_states(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return the system, which has discrete coordinates, with the initial values and constraints
-    of `core`.
+    """Return a copy of a system with discrete coordinates that has the initial values of `core`.
 
-    core: result of `with_constant_parameters` for the system, with consistent initial values.
+    core: the result of `with_constant_parameters` for the system, after its initial values were
+    adjusted to its constraints. The copy also has the constraints of `core` and their summary.
     """
     variables = [c for c in system.coordinates if c.name in system.discrete]
     return replace(

@@ -10,10 +10,10 @@ from eomc.model.mechanics import AnySystem
 
 
 def check_event_functions(system: AnySystem) -> AnySystem:
-    """Return the system unchanged if all its event functions can cross zero continuously.
+    """Check that the event functions of a system can cross zero continuously; return the system.
 
-    Raises SceneError for an event function that is piecewise constant, such as sign(x), whose
-    jump over zero is no root.
+    The system is returned unchanged. Raises SceneError if an event function is piecewise constant,
+    such as sign(x): it jumps over zero and has no root there.
     """
     if not system.events:
         return system

@@ -49,9 +49,10 @@ class _Formulas:
         self.sizes: dict[str, digit_bound.Bound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
-        """Return a formula as a SymPy expression; record a problem and return 0 if it is invalid.
+        """Convert a formula to a SymPy expression and return it.
 
-        key: place of the formula in the scene, such as "energy.kinetic".
+        If the formula has no valid value, append an error to `problems` and return 0. key: key of
+        the formula in the scene, such as "energy.kinetic".
         """
         name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
@@ -64,9 +65,10 @@ class _Formulas:
             return sympy.S.Zero
 
     def definitions(self) -> tuple[list[tuple[Symbol, Expr]], Terms]:
-        """Return all definitions, in order, and the terms that bodies add to the system.
+        """Return the definitions of the system and the terms that bodies add to the system.
 
-        Constants of the scene are evaluated on the way.
+        The definitions are pairs (symbol, expression), each over the symbols before it: those of
+        the scene and those that the bodies need. The constants of the scene are evaluated too.
         """
         scene, known = self.scene, self.known
         for constant in scene.constants:
@@ -91,7 +93,11 @@ class _Formulas:
         return made, builder.terms if builder else Terms()
 
     def potential(self, definitions: Sequence[tuple[Symbol, Expr]]) -> tuple[Expr, Expr]:
-        """Return the potential of [energy] as (part without velocities, part linear in them)."""
+        """Return the potential of the table [energy] as a pair of expressions.
+
+        The first is the part without velocities, the second the part that is linear in the
+        velocities. definitions: pairs (symbol, expression), each over the symbols before it.
+        """
         key, formula = "energy.potential", self.scene.potential
         whole = self.value(key, formula)
         if self.problems:  # a formula without a value is 0
@@ -111,9 +117,12 @@ class _Formulas:
             yield Input(i.name, i.unit, signal, i.note, tuple(ends))
 
     def frictions(self, more: Terms) -> tuple[dict[str, Expr], list[Friction]]:
-        """Return the smooth friction force of each coordinate by name, and all stick-slip friction.
+        """Return the Coulomb friction of the scene as a pair (smooth, sticking).
 
-        more: terms that the bodies add, with the friction in joints.
+        smooth: dict from the name of a coordinate to its smooth friction force, without friction
+        that is declared at joints. sticking: list of all friction that switches between sticking
+        and sliding. more: the terms that the bodies add, which contain the sticking friction of
+        joints.
         """
         smooth, sticks = dict[str, Expr](), list[Friction]()
         for c in self.scene.coordinates:
@@ -149,9 +158,10 @@ class _Formulas:
         definitions: Sequence[tuple[Symbol, Expr]],
         closed: Iterable[Closed],
     ) -> tuple[tuple[Constraint, ...], tuple[Reaction, ...]]:
-        """Return all constraints, holonomic ones first, and the reactions of the loops.
+        """Return the constraint equations of the scene, holonomic ones first, and loop reactions.
 
-        closed: constraints and reaction of each loop.
+        closed: constraint equations and reaction of each loop. The reactions are the forces and
+        moments that the loop joints exert.
         """
         written = {c.name: c.formula for c in self.scene.constraints}
 
@@ -184,9 +194,11 @@ class _Formulas:
     def outputs(
         self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
     ) -> Iterator[Output]:
-        """Yield the outputs of the scene; they may use accelerations, energies and `forces`.
+        """Yield the outputs of the scene with their formulas as SymPy expressions.
 
-        forces: expressions of the multipliers and the reactions, by their names in outputs.
+        The formulas may use accelerations, the energies `kinetic` and `potential`, and constraint
+        forces. forces: dict from the name of each Lagrange multiplier and each component of a
+        reaction, as outputs call them, to its expression.
         """
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
         energies = (kinetic, potential, kinetic + potential)

@@ -54,8 +54,8 @@ def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: It
 class Maker:
     """Converter of the arguments of System.make to a system with symbols of its own.
 
-    Symbols of the user may have any assumptions and names; the symbols of the system are real and
-    have names that are valid in C. name: name of the system.
+    The user's symbols may have any assumptions and names. Symbols of the system, which replace
+    them, are real and have names that are valid in C. name: name of the system.
     """
 
     def __init__(self, name: str) -> None:
@@ -141,10 +141,11 @@ class Maker:
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
     ) -> AnySystem:  # fmt: skip
-        """Return the system as an instance of the class `of`.
+        """Make a mechanical system from the arguments of System.make and return it.
 
-        The other arguments are those of System.make, but for `rows` (constraints) and `run`
-        (settings of runs and generated code). Raises EomcError for invalid arguments.
+        of: class of the result, System or a subclass of Mechanics. rows: the argument `constraints`
+        of System.make. run: settings of simulations and generated code. All other arguments are
+        those of System.make with the same names. Raises EomcError for invalid arguments.
         """
         declarations = (coordinates, parameters, inputs, definitions)
         starts = api_arguments.symbols(coordinates, "coordinates", None)

@@ -30,11 +30,12 @@ SAMPLES = 3  # random states; the largest rank holds almost everywhere
 
 @dataclass(frozen=True)
 class Jacobian:
-    """Jacobians of the motion of all bodies, with one column for each coordinate.
+    """Jacobians of the motion of all bodies, as matrices with one column for each coordinate.
 
-    moves: derivatives of the velocities (m/s) and angular velocities (rad/s) of all bodies with
-    respect to the generalized velocities. weighs: the same multiplied by the square roots of
-    masses and inertias, so that the mass matrix is weighs^T weighs.
+    moves: derivatives of the velocities (m/s) of the bodies' centres of mass and of their angular
+    velocities (rad/s) with respect to the generalized velocities; six rows for each body. weighs:
+    these rows multiplied by the square roots of masses and inertias, and rows for the armatures
+    (rotor inertias of joints), so that the mass matrix is weighs^T weighs.
     """
 
     moves: Array
@@ -45,8 +46,8 @@ class Jacobian:
 class Null:
     """Null spaces of a `Jacobian`, as arrays whose rows are generalized velocities (n, nq).
 
-    moves: basis of the motions that move no body. weighs: basis of the motions without kinetic
-    energy.
+    moves: basis of the generalized velocities at which no body moves. weighs: basis of the
+    generalized velocities at which the kinetic energy is zero.
     """
 
     moves: Array
@@ -54,7 +55,7 @@ class Null:
 
 
 class Kinematics:
-    """Numerical kinematics of the bodies of a scene, at the values of parameters in the scene."""
+    """Numerical kinematics of the bodies of a scene, for the parameter values in the scene."""
 
     def __init__(self, scene: Scene, assembly: Assembly) -> None:
         self.coordinates = [c.name for c in scene.coordinates]
@@ -70,10 +71,11 @@ class Kinematics:
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
 
     def states(self) -> Iterator[Null]:
-        """Yield the null spaces at random configurations near the initial one.
+        """Yield the null spaces of the Jacobians at up to three random configurations.
 
-        Configurations where a formula has no value are left out. The iteration ends after three
-        configurations, or at the first one without a motion that has no kinetic energy.
+        The configurations are near the initial one. A configuration is skipped if a formula of the
+        scene can't be evaluated there. The iteration ends early after a configuration at which the
+        mass matrix is regular, so that every motion has kinetic energy.
         """
         random = np.random.default_rng(0)
         for _ in range(SAMPLES):
@@ -84,19 +86,23 @@ class Kinematics:
                     return
 
     def null(self, q: Array, t: float) -> Null | None:
-        """Return the null spaces at coordinates q and time t, or None if a formula has no value."""
+        """Return the null spaces of the Jacobians at coordinates q (nq,) and time t (s).
+
+        Returns None if a formula of the scene can't be evaluated there.
+        """
         if self.is_regular(q):
             return Null(*np.zeros((2, 0, len(q))))
         jacobian = self.jacobian(q, t)
         return Null(_null(jacobian.moves), _null(jacobian.weighs)) if jacobian else None
 
     def is_regular(self, q: Array) -> bool:
-        """Return True if the mass matrix at `q` is certainly regular without the armatures.
+        """Return True if the mass matrix at the coordinates `q` (nq,) is certainly regular.
 
-        The joints of the tree are eliminated from the last one inwards in linear time (articulated
-        bodies; Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7). The result is False if a
-        pivot may be rounding error, if a body is placed by formulas, or if the joints do not have
-        one coordinate of the scene for each of their motions.
+        Rotor inertias of joints (armatures) are not counted. The joints of the tree are eliminated
+        from the last one inwards in linear time (articulated bodies; Featherstone, *Rigid Body
+        Dynamics Algorithms*, ch. 7). The result is False if a pivot may be rounding error, if a
+        body is placed by formulas, or if the joints do not have one coordinate of the scene for
+        each of their motions.
         """
         by = [formula.text for body in self.tree for formula in body.coordinates]
         if self.placed or sorted(by) != sorted(self.coordinates):
@@ -125,10 +131,11 @@ class Kinematics:
         return True
 
     def poses(self, q: Array) -> dict[str, Pose] | None:
-        """Return the position (3,) and rotation (3, 3) of each body in the world, by name.
+        """Return a dict from the name of each body to its pose in the world.
 
-        The position is that of the body's frame, or that of the centre of mass (at time 0) if the
-        body is placed by formulas. The result is None if a formula has no value.
+        A pose is a pair (position (3,) in m, rotation matrix (3, 3)). The position is that of the
+        body's frame; for a body placed by formulas it is that of the centre of mass at time 0. q:
+        coordinates (nq,). Returns None if a formula of the scene can't be evaluated at `q`.
         """
         try:
             by_name = {name: pose for name, (pose, _) in self._frames(q).items()}
@@ -176,7 +183,10 @@ class Kinematics:
         return slopes
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
-        """Return the Jacobians at coordinates q and time t, or None if a formula has no value."""
+        """Return the Jacobians of the motion of all bodies at coordinates q (nq,) and time t (s).
+
+        Returns None if a formula of the scene can't be evaluated there.
+        """
         try:
             velocities = [*self._tree_rates(q), *self._placed_rates(q, t)]
             rotors = [*self._armatures(q)]
@@ -246,14 +256,18 @@ class Kinematics:
         }
 
     def joint_frame(self, body: Body) -> Pose:
-        """Return position and rotation of the frame of a body's joint in the parent's frame."""
+        """Return the pose of a joint's frame in the frame of the parent body.
+
+        body: the body that the joint attaches to its parent. The pose is a pair (position (3,) in
+        m, rotation matrix (3, 3)).
+        """
         offset = self.vector(body.offset, self.values) if body.offset else np.zeros(3)
         return offset, self._rotation(body.rotation, self.values)
 
     def axes(self, body: Body) -> list[Array]:
         """Return a unit vector for each motion of a body's joint.
 
-        Each is given in the joint's frame as moved by the motions before it.
+        The components of each vector are in the joint's frame after the motions before it.
         """
         axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
@@ -275,7 +289,10 @@ class Kinematics:
                 yield math.sqrt(max(self._number(armature, self.values), 0)) * row
 
     def vector(self, formulas_: Iterable[Formula], known: dict[str, float]) -> Array:
-        """Return the values of formulas as an array, given the values of names in `known`."""
+        """Return the values of formulas as an array.
+
+        known: dict from each name that the formulas use to its value.
+        """
         return np.array([self._number(formula, known) for formula in formulas_])
 
     def _rotation(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:
