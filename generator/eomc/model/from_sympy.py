@@ -143,9 +143,9 @@ class Maker:
     ) -> AnySystem:  # fmt: skip
         """Make a mechanical system from the arguments of System.make and return it.
 
-        of: class of the result, System or a subclass of Mechanics. rows: the argument `constraints`
-        of System.make. run: settings of simulations and generated code. All other arguments are
-        those of System.make with the same names. Raises EomcError for invalid arguments.
+        of: class of the result, such as System. rows: the argument `constraints` of System.make.
+        run: settings of simulations and generated code. All other arguments are those of
+        System.make with the same names. Raises EomcError for invalid arguments.
         """
         declarations = (coordinates, parameters, inputs, definitions)
         starts = api_arguments.symbols(coordinates, "coordinates", None)

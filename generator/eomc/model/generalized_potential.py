@@ -29,8 +29,9 @@ def split(
 ) -> tuple[Expr, Expr]:
     """Split a generalized potential U = P(q, t) + a(q, t).qd and return the pair (P, a.qd).
 
-    Derivatives dot(y) count as velocities and are not expanded; a term with dot(y) belongs to a.qd
-    even if y depends on t explicitly. Definitions that contain velocities are substituted.
+    A time derivative dot(y) in U counts as a velocity and is not expanded. A term with dot(y)
+    therefore belongs to a.qd even if y depends on t explicitly. Symbols whose definitions contain
+    velocities are replaced by their expressions.
 
     Parameters
     ----------

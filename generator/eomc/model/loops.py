@@ -36,10 +36,11 @@ from eomc.scene.assembly import Loop
 
 @dataclass(frozen=True)
 class End:
-    """One of the two bodies of a loop joint: its joint point and its rotation.
+    """One of the two bodies of a joint that closes a loop: the joint's point and the rotation.
 
-    point: position of the joint on the body, in m. R: rotation matrix of the body's frame. Both
-    are in the frame of the common ancestor of the two bodies, or in the world.
+    point: position in m of the point of the body at which the joint is attached. R: rotation matrix
+    of the body's frame. Both are in the frame of the closest common ancestor of the two bodies,
+    which may be the world.
     """
 
     point: Vector
@@ -61,10 +62,11 @@ class _Pull:
 
 @dataclass
 class Closed:
-    """The constraint equations of a loop joint and what belongs to them.
+    """The constraint equations, reaction and points of a joint that closes a loop.
 
-    rows: constraint equations. reactions: the reaction on the second body; empty for a gear.
-    points: joint points of the two bodies; empty for a gear.
+    rows: the constraint equations. reactions: the force and moment on the second body, as a
+    sequence of one Reaction; empty for a gear. points: position of the joint's point on each of the
+    two bodies, in m; empty for a gear.
     """
 
     rows: list[Constraint]
@@ -75,7 +77,7 @@ class Closed:
 def close(
     loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, to_world: Matrix
 ) -> Closed:
-    """Return the constraint equations of a loop joint between two bodies, and its reaction.
+    """Return the constraint equations and the reaction of a joint that closes a loop.
 
     Parameters
     ----------
@@ -177,7 +179,7 @@ def _unit(axis: Sequence[float]) -> Vector:
 def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
     """Return a right-handed triad of unit vectors (u, v, axis) for a given axis.
 
-    plane: whether the scene is planar; the axis and u then lie in the plane.
+    plane: whether the scene is planar; if so, `axis` and u lie in the plane and v is normal to it.
     """
     along = _unit(axis)
     if plane:
@@ -188,9 +190,10 @@ def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vect
 
 
 def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
-    """Return the constraint equation of a gear between two coordinates, without a reaction.
+    """Return the constraint equation of a gear between two coordinates.
 
-    The equation is second coordinate - ratio * first coordinate - offset = 0.
+    The equation is second coordinate - ratio * first coordinate - offset = 0. loop: the gear in the
+    scene, which names the coordinates. The result has no reaction and no points.
     """
     first, second = (symbol(name) for name in loop.coordinates)
     row = second - ratio * first - offset
@@ -200,11 +203,12 @@ def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
 def find_wrong_rotations(
     system: Mechanics,
 ) -> Callable[[Sequence[float], float, Mapping[str, float]], list[str]]:
-    """Return a function that lists the loops whose bodies have a wrong relative rotation.
+    """Return a function that finds the loops whose bodies have a wrong relative rotation.
 
-    The function takes coordinates q, time t and a dict of parameter values by name (defaults for
-    the others), and returns names of loops. The axis equations of these may be satisfied, since
-    they have more than one solution.
+    The constraint equations that align axes have several solutions, of which one closes the joint.
+    The returned function tells them apart. Its arguments are the coordinates q, the time t in s and
+    a dict of parameter values by name; parameters that are not in the dict have their defaults. It
+    returns the names of the loops that are in a wrong solution.
     """
     cosines = [(r.name, branch) for r in system.reactions for branch in r.branches]
     if not cosines:
@@ -226,11 +230,11 @@ def find_wrong_rotations(
 def without_constant_rows(
     closed: Closed, values: Sequence[float | None]
 ) -> tuple[Closed, list[tuple[Constraint, float]]]:
-    """Remove constant constraint equations of a loop; return the loop and the removed equations.
+    """Return a copy of a loop without its constant constraint equations, and these equations.
 
-    The multipliers of the removed equations are replaced by zero in the reaction. values: for each
-    equation of the loop its constant value, or None if it is not constant. The removed equations
-    are returned as pairs (constraint, value).
+    values: for each equation of the loop, the value of its left-hand side if that is constant, else
+    None. The removed equations are returned as pairs (constraint, value). The Lagrange multipliers
+    of the removed equations are zero in the reaction of the copy.
     """
     rows, constant = [], []
     for row, fixed in zip(closed.rows, values, strict=True):

@@ -108,7 +108,7 @@ class Mechanics:
         Names of the discrete coordinates for variables that jumps set. They are placed before the
         modes; no derivative with respect to them is taken.
     again
-        `System.make` with the arguments of the system, any of which can be replaced.
+        Function that makes the system again; keyword arguments replace arguments of `System.make`.
     own_symbols
         Symbols, functions of time and derivatives of these that the user passed to `System.make`,
         by their names in the system.
@@ -171,16 +171,17 @@ class Mechanics:
     def rates(self) -> dict[Symbol, Symbol]:
         """A dict from the symbol of each coordinate to that of its velocity.
 
-        The coordinates in `discrete` are left out.
+        Discrete coordinates for parameters that events change (see `discrete`) are left out.
         """
         return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
 
     @property
     def solved(self) -> tuple[tuple[tuple[int, float], ...], ...]:
-        """The constraint equations that are solved for, as weighted sums of `constraints`.
+        """The independent constraint equations, as weighted sums of `constraints`.
 
-        Each is a tuple of pairs (index of the constraint, weight). The sums of `closure.sums` come
-        first, then the single constraints that are neither redundant nor part of a sum.
+        The Lagrange multipliers of these equations are computed. Each equation is a tuple of pairs
+        (index of the constraint, weight). The sums of `closure.sums` come first, then the single
+        constraints that are neither redundant nor part of a sum.
         """
         sums = self.closure.sums if self.closure else ()
         mixed = {k for row in sums for k, w in enumerate(row) if w}
@@ -197,10 +198,10 @@ class Mechanics:
         return tuple(tuple(k for k, _ in some) for _, some in groupby(rows, key=lambda row: row[1]))
 
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
-        """Return the Problem with a message on the entry `key`, such as "energy.kinetic".
+        """Return a Problem (error, warning or note) about one entry of the system.
 
-        It contains file and line if the system was read from a scene. severity: "error", "warning"
-        or "note".
+        key: key of the entry in a scene, such as "energy.kinetic". severity: "error", "warning" or
+        "note". The result contains file and line if the system was read from a scene.
         """
         if self.place is None:
             message, key = in_words_of_python(message), argument_of(key)
@@ -208,7 +209,10 @@ class Mechanics:
         return self.place(key, message, severity=severity)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
-        """Return the system with other values of the parameters that are named in `parameters`."""
+        """Return a copy of the system with other values of some parameters.
+
+        parameters: dict from the name of a parameter to its new value.
+        """
         changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
         return replace(self, parameters=changed)
 
@@ -216,7 +220,7 @@ class Mechanics:
     def output_frames(self) -> tuple[Frame, ...]:
         """The frames of bodies and points for which the C code computes poses and Jacobians.
 
-        They are in the order of the setting `frames` in the table [run] of the scene.
+        Their order is that of the setting `frames` in the table [run] of the scene.
         """
         names, known = self.run.frames, {f.name: f for f in self.frames}
         return self.frames if names is True else tuple(known[name] for name in names or ())
@@ -236,7 +240,7 @@ class Mechanics:
 
     @property
     def names(self) -> frozenset[str]:
-        """The names that no other quantity may have.
+        """The names that are in use, so that no definition or output may have them.
 
         They are the names of coordinates, velocities, inputs and parameters, and of accelerations
         if `reads_qdd`.

@@ -46,10 +46,11 @@ class Mobility:
     bodies
         Number of bodies, without the world.
     joints, loops
-        Number of joints of each kind in the tree, and of those that close loops. Bodies placed by
-        formulas count as joints of a kind of their own.
+        Numbers of the joints in the tree and of the joints that close loops, by kind of joint. A
+        body that is placed by formulas counts as a joint of a further kind.
     M
-        Degrees of freedom by the mobility formula M = d(N - 1 - j) + sum f.
+        Degrees of freedom by the mobility formula M = d(N - 1 - j) + sum f, with N bodies including
+        the world and j joints that have f degrees of freedom each.
     coordinates
         Number of coordinates in the scene.
     rank
@@ -110,7 +111,8 @@ class Mobility:
 def count(scene: Scene) -> Mobility:
     """Compute the degrees of freedom of a scene and compare them with its coordinates.
 
-    Raises EomcError if the scene has no bodies, or if their positions have no value.
+    Raises EomcError if the scene has no bodies, or if the formulas of their positions can't be
+    evaluated at any sampled configuration.
     """
     assembly = scene.assembly
     if not assembly or not assembly.bodies:
@@ -149,10 +151,10 @@ def count(scene: Scene) -> Mobility:
 
 
 def meeting(scene: Scene) -> list[Problem]:
-    """Return a warning for each spring and damper whose ends coincide at the start.
+    """Return a warning for each spring and damper whose two ends coincide at the start.
 
-    Its force has no direction there. Springs of rest length zero, whose force needs no direction,
-    are left out.
+    The direction of its force, along the line between the ends, is then undefined. Springs of rest
+    length zero are left out, since their force does not depend on this direction.
     """
     assembly = scene.assembly
     if not assembly:

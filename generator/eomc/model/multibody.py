@@ -36,9 +36,9 @@ class Terms:
     Attributes
     ----------
     definitions
-        (symbol, expression) pairs that the user's formulas may use.
+        Definitions (symbol, expression) that the user's formulas may use.
     later
-        (symbol, expression) pairs that may use the user's definitions.
+        Definitions (symbol, expression) that may use the user's definitions.
     tree_kinetic, tree_potential
         Energies of bodies with joints, as terms of sums.
     kinetic, potential
@@ -56,7 +56,7 @@ class Terms:
     frictions
         Stick-slip friction in joints, as pairs (joint position, friction).
     rates
-        Velocity of each coordinate that moves a joint.
+        Dict from the symbol of each coordinate that moves a joint to the symbol of its velocity.
     fixed_moment
         First moment of the masses that are fixed in the world, in kg m.
     gravity
@@ -85,8 +85,9 @@ class Terms:
     def tree(self, kinetic: Expr, potential: Expr) -> Tree | None:
         """Return the tree of bodies with joints, or None if there are none.
 
-        kinetic, potential: energies that the scene adds as formulas. They become the tree's other
-        energies, with those of springs and bodies placed by formulas.
+        kinetic, potential: energies that the scene gives as formulas. They are stored in the tree's
+        `other_kinetic` and `other_potential`, together with the energies of springs and of bodies
+        placed by formulas.
         """
         if not self.links:
             return None
@@ -113,21 +114,21 @@ class _Place:
 
 
 class Builder:
-    """Converter of the bodies, joints, springs and forces of a scene to `terms` of a system.
+    """Converter of the bodies, joints, springs and forces of a scene to terms of a system.
 
-    Call `build_tree` first, then `build_rest` and `add_forces` once the user's definitions can be
-    evaluated.
+    The result is collected in the attribute `terms`. Call `build_tree` first. Call `build_rest` and
+    `add_forces` after the user's definitions have been evaluated.
 
     Parameters
     ----------
     assembly
         Bodies, joints, springs, dampers and forces of the scene.
     value
-        Function that converts a formula to an expression, given its key in the scene.
+        Function that converts a formula to an expression; called with (key in the scene, formula).
     coordinates
-        Symbol of the velocity of each coordinate.
+        Dict from the symbol of each coordinate to the symbol of its velocity.
     taken
-        Names that definitions cannot have.
+        Names that are in use, so that new definitions cannot have them.
     sticks
         Whether friction in joints is stick-slip friction rather than smooth.
     """
@@ -284,9 +285,9 @@ class Builder:
     # --- bodies placed by formulas, springs and dampers ------------------------------------------
 
     def build_rest(self) -> None:
-        """Add to `terms` the elements that may use the user's definitions.
+        """Add to `terms` the elements of the scene whose formulas may use the user's definitions.
 
-        They are bodies placed by formulas, frames, springs, dampers, forces and loops.
+        These elements are bodies placed by formulas, frames, springs, dampers, forces and loops.
         """
         for body in self.assembly.bodies:
             if not body.joint:

@@ -14,9 +14,10 @@ STEEP = (*KINDS, sympy.tanh, sympy.atan)  # tanh and atan act as jumps if they a
 
 
 def nonsmooth_functions(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
-    """Return the names of the non-smooth functions in a system, separated by commas.
+    """Return text that lists the non-smooth functions, such as abs, in a system's expressions.
 
-    The result is "" if there are none. kinds: SymPy classes of the functions to look for.
+    The names are separated by commas; the text is "" if there are none. kinds: SymPy classes of the
+    functions to look for.
     """
     s = system
     exprs = (

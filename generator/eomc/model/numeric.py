@@ -17,8 +17,8 @@ def compiled(
 ) -> Callable[..., Any]:
     """Return a Python function of numbers that evaluates an expression or a list of expressions.
 
-    It works for symbols of any name: dummy symbols replace the arguments and definitions, so that
-    a parameter may have the name of something in Python or in `modules`, such as `size` or `e`.
+    Symbols may have any names: they are replaced by dummy symbols, so that a parameter may have the
+    name of an object in Python or in `modules`, such as `size` or `e`.
 
     Parameters
     ----------

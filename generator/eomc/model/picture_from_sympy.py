@@ -51,10 +51,12 @@ def picture_scene(
     picture
         The argument `picture` of System.make.
     expression
-        Function that converts a user's expression, given a description for messages.
-    coordinates, parameters, inputs, definitions
-        Names that the picture may use; they become those of the scene. definitions: pairs (symbol,
-        expression), of which the scene contains those that the picture needs.
+        Function that converts a user's expression; called with (expression, description of it for
+        messages).
+    coordinates, parameters, inputs
+        Quantities that the picture may use; the scene declares all of them.
+    definitions
+        Pairs (symbol, expression) that the picture may use; the scene contains those that it needs.
 
     Raises
     ------
@@ -84,7 +86,7 @@ def picture_scene(
 
 
 def in_python(message: str) -> str:
-    """Replace TOML syntax by Python syntax in a message about [picture]; return the message."""
+    """Return a message about the table [picture] with Python syntax in place of TOML syntax."""
     for toml, python in _WORDS:
         message = message.replace(toml, python)
     return message

@@ -22,9 +22,10 @@ ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero
 
 
 def numeric_entry(e: Expr) -> Expr:
-    """Round a number to 50 digits and return it as a fraction; other expressions are unchanged.
+    """Return a number as a fraction that is rounded to 50 digits.
 
-    Numbers within 1e-40 of an integer become that integer.
+    A number within 1e-40 of an integer is rounded to that integer. An expression that is not a
+    number is returned unchanged.
     """
     if not e.is_number:
         return e
@@ -40,13 +41,19 @@ def numeric_entry(e: Expr) -> Expr:
 
 
 def numeric(v: Vector) -> Vector:
-    """Return a vector whose entries that are numbers are rounded to fractions of 50 digits."""
+    """Return a copy of a vector with its numbers rounded to fractions of 50 digits.
+
+    Entries that are not numbers are unchanged.
+    """
     x, y, z = map(numeric_entry, v)
     return (x, y, z)
 
 
 def clean(matrix: Matrix) -> Matrix:
-    """Return a matrix whose entries that are numbers are rounded to fractions of 50 digits."""
+    """Return a copy of a matrix with its numbers rounded to fractions of 50 digits.
+
+    Entries that are not numbers are unchanged.
+    """
     one, two, three = map(numeric, matrix)
     return (one, two, three)
 
@@ -61,9 +68,10 @@ def unit(axis: Sequence[float]) -> list[Expr]:
 
 
 def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
-    """Return (k, R): a coordinate axis k (0, 1 or 2) and a rotation R with R e_k along `axis`.
+    """Return (k, R): a coordinate axis k (0, 1 or 2) and a rotation matrix R with R e_k = `axis`.
 
-    R is exact to 50 digits. In a frame rotated by R, a joint axis is a coordinate axis.
+    e_k is the unit vector along the coordinate axis k, and `axis` is normalised. R is exact to 50
+    digits. In the frame rotated by R, the direction `axis` is therefore the coordinate axis k.
     """
     along = unit(axis)
     for k, x in enumerate(along):

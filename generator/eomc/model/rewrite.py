@@ -30,9 +30,9 @@ class JumpError(ValueError):
 def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
     """Return an equal expression without Piecewise and without functions such as sec and coth.
 
-    The result uses functions that formulas of scenes have. fixed: constant symbols, and whether
-    each is known to be nonnegative. Raises JumpError for a Piecewise that is discontinuous, or
-    whose continuity cannot be decided.
+    The result uses only functions that formulas of scenes can use. fixed: dict from each constant
+    symbol to True if it is known to be nonnegative, else False. Raises JumpError for a Piecewise
+    that is discontinuous, or whose continuity cannot be decided.
     """
     expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
     return expr.replace(lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, fixed))

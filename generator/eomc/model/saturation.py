@@ -11,10 +11,10 @@ from eomc.model.symbols import symbol
 
 
 def saturate_inputs(system: AnySystem) -> AnySystem:
-    """Return the system with each input that has limits replaced by its saturated value.
+    """Return a copy of a system in which inputs with limits are saturated at their limits.
 
-    The value of an input `force` is a new definition, named `force_limited`, that replaces the
-    input in definitions, forces, events and outputs.
+    For an input such as `force`, the copy has a new definition `force_limited`, the saturated
+    value. It replaces the input in all definitions, forces, events and outputs.
     """
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
     limited_symbols: dict[Symbol, Symbol] = {}

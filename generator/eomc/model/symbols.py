@@ -26,7 +26,7 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
 
     @classmethod
     def eval(cls, inner: Any) -> Any:
-        """Return zero if `inner` is a number, else None (no simplification)."""
+        """Return 0 if `inner` is a number, else None, so that SymPy keeps dot(inner) as it is."""
         return sympy.S.Zero if inner.is_number else None
 
     def _latex(self, printer: Any, exp: str = "") -> str:
@@ -42,7 +42,7 @@ class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as th
 
     @classmethod
     def eval(cls, pivot: Expr, limit: Expr) -> Expr | None:
-        """Return the value if both arguments are numbers, else None (no simplification)."""
+        """Return the value if both arguments are numbers, else None (SymPy keeps the call)."""
         if not (pivot.is_number and limit.is_number):
             return None
         return 1 / pivot if pivot > limit else sympy.S.Zero
@@ -50,14 +50,15 @@ class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as th
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return the derivative with respect to the pivot (argument 1) or the limit (argument 2).
 
-        They are -1/pivot^2 (0 if pivot <= limit) and 0.
+        argindex: 1 for the derivative with respect to the pivot, -1/pivot^2 or 0 if pivot <= limit;
+        2 for the derivative with respect to the limit, which is 0.
         """
         return -(self**2) if argindex == 1 else sympy.S.Zero
 
 
 @lru_cache(maxsize=10_000)  # SymPy takes ten times as long for a symbol that exists
 def symbol(name: str) -> Symbol:
-    """Return the real SymPy symbol with a name; all symbols of a system are real."""
+    """Return the SymPy symbol `name` with the assumption real, as all symbols of a system have."""
     return Symbol(name, real=True)
 
 
@@ -72,7 +73,7 @@ class Coordinate:
     start, rate
         Initial value in `unit` and initial velocity in `unit`/s.
     start_fixed, rate_fixed
-        Whether these values are kept when initial values are adjusted to the constraints.
+        Whether start and rate are kept when initial values are adjusted to the constraints.
     follows, rate_follows
         Formulas of start and rate if these depend on parameters, else "".
     """
@@ -173,10 +174,11 @@ class Event(_Named):
     jump
         Pairs (name, new value) of coordinates, velocities and parameters that a jump sets.
     begins
-        Expression that triggers the event if it is positive at the start of a run or after a jump.
+        Expression that triggers the event if it is positive at the start of a run or after a jump;
+        None for none.
     above
-        Whether `when` cannot become negative immediately after it was zero; a sign change there
-        means that it was positive for a short time.
+        True if `when` cannot become negative immediately after it was zero. If it is negative
+        later, it was positive for a short time in between.
     """
 
     when: Expr
@@ -198,7 +200,7 @@ class Constraint(_Named):
     formula
         Expression over t, coordinates, velocities, parameters and definitions.
     holonomic
-        Whether it depends on positions and t only; else it is linear in the velocities.
+        True if the formula depends on coordinates and t only, False if it is linear in velocities.
     loop
         Name of the [[loop]] to which it belongs, or "".
     redundant
@@ -228,9 +230,10 @@ class Constraint(_Named):
 
     @property
     def parts(self) -> tuple[Symbol, ...]:
-        """Two symbols in events of a switched constraint: multiplier times pivot, and the pivot.
+        """Two symbols (multiplier times pivot, pivot) for events of a switched constraint.
 
-        The pivot is >= 0; the multiplier of the constraint is their quotient.
+        The pivot is that of the constraint equation in the elimination for the multipliers, >= 0.
+        The Lagrange multiplier of the constraint is the quotient of the two.
         """
         return tuple(symbol(f"{self.name}{part}") for part in PARTS)
 
@@ -272,9 +275,10 @@ def multiplier_of(row: str) -> Symbol:
 
 
 def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
-    """Return a dict from the symbol of each definition to its expression without other definitions.
+    """Return a dict from the symbol of each definition to its fully substituted expression.
 
-    definitions: pairs (symbol, expression), each over the symbols before it.
+    definitions: pairs (symbol, expression), each over the symbols before it. In the result, these
+    symbols are replaced by their expressions.
     """
     known: dict[Expr, Expr] = {}
     for name, e in definitions:

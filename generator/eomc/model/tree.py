@@ -26,8 +26,8 @@ class Link:
     q
         Angle (rad) or displacement (m): a coordinate or an expression in coordinates.
     offset, rotation
-        Position of the frame in the parent's frame if q is zero, and the rotation that takes
-        vectors from the frame to the parent's frame then.
+        Position (m) and rotation matrix of the frame in the parent's frame for q = 0. The matrix
+        transforms components of vectors from the frame to the parent's frame.
     mass, moment, inertia
         Mass, mass times centre of mass, and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) about the
         frame's origin, in the axes of the frame.
@@ -89,7 +89,7 @@ class Frame:
         Position and rotation matrix in the frame of the link. For a body placed by formulas they
         are expressions in the coordinates, in the world.
     angle
-        Rotation angle in rad in a planar scene, over definitions.
+        Rotation angle in rad in a planar scene, an expression that may use definitions.
     mass, inertia
         Mass, and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) about the centre of mass, of a body placed
         by formulas; its frame is at its centre of mass. Zero for other bodies.
