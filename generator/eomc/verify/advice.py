@@ -40,8 +40,8 @@ MAX_PREDICTION_STEPS = 2000  # steps of the scene's h in which these lie
 class Advice:
     """Checks of the step sizes h that a compiled module advises, by runs with other step sizes.
 
-    runs: the runs of the module and its scene's data. holonomic: for each constraint equation,
-    whether it is holonomic (one of positions).
+    runs: the runs of the module with several step sizes, and the data of its scene. holonomic: for
+    each constraint equation, whether it restricts positions (holonomic) rather than velocities.
     """
 
     def __init__(self, runs: Convergence, holonomic: Sequence[bool] = ()) -> None:
@@ -50,18 +50,18 @@ class Advice:
         self.duration = runs.duration
 
     def failing_fraction(self, method: str) -> Measurement:
-        """Return the least fraction of the advised h, one of PARTS, with which a run is unstable.
+        """Return the least multiple of the advised h, one of PARTS, with which a run is unstable.
 
-        The run starts at `stiffest_state`. It is unstable if it stops early, if a small difference
-        of the initial state grows UNSTABLE_GROWTH times as much as with fine steps, or if it has
-        steps longer than advised and its final state is wrong by MAX_END_ERROR of the motion. The
-        value is nan if no fraction is unstable, and inf, with a reason, if there is nothing to
-        test.
+        The runs start at `stiffest_state`. A run is unstable in three cases: it stops early; a
+        small difference of the initial state grows UNSTABLE_GROWTH times as much as with fine
+        steps; or its steps are longer than advised and its final state is wrong by MAX_END_ERROR of
+        the motion. The value is nan if no run is unstable, and inf, with a reason, if there is
+        nothing to test.
 
-        If the runs contradict the advice, or the advised h is longer than the motion, but the
-        advice agrees with the eigenvalues of the linearised motion, the motion leaves the region
-        where the advice holds. The result is then the ratio of the two step sizes, with its own
-        limit.
+        In two cases the result is another quantity with its own limit: the ratio of the advised h
+        to the h that follows from the eigenvalues of the linearised motion. They are: the runs
+        contradict the advice, or the advised h is longer than the motion. In both cases the two
+        step sizes must agree; the motion then leaves the region where the advice holds.
         """
         if method == "euler" and self._velocities_matter():
             return Measurement(math.inf, "for forces of positions alone")

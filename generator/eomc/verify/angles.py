@@ -16,11 +16,11 @@ PERIODIC = (sympy.sin, sympy.cos, sympy.tan)
 
 
 def largest_angle(system: System) -> Callable[[State], float]:
-    """Return a function of a state: the largest angle in the system's formulas there, in rad.
+    """Return a function that computes the largest angle in the system's formulas at a state, rad.
 
-    An angle is an argument of a sine, cosine or tangent; its rounding error, relative to its size,
-    limits the precision of all results. Angles that contain dot(...) are ignored; the result is 0
-    if there are none.
+    An angle is an argument of a sine, cosine or tangent. Its rounding error, relative to its size,
+    limits the precision of all results. The function ignores angles that contain a rate dot(...),
+    and returns 0 if there are no angles.
     """
     formulas = [
         system.kinetic, system.potential, system.linear_potential, system.dissipation,

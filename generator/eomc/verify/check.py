@@ -46,16 +46,20 @@ SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wron
 def check(
     system: System, module: Any, *, plain: Any = None, seed: int = 0, states: int | None = None
 ) -> Report:
-    """Compare the compiled `module` of `system` with the reference, and return the report.
+    """Compare a compiled module with the independent reference in Python; return the report.
 
     Parameters
     ----------
+    system : System
+        The system from which the module was generated.
+    module : module
+        The compiled module.
     plain : module, optional
         The module of the portable form of the C code, compared with the reference and `module`.
     seed : int
         Seed of the random states and parameters; the same seed gives the same states.
     states : int, optional
-        Number of states; by default as many as take seconds.
+        Number of states; the default is a number whose evaluation takes seconds.
 
     Returns
     -------
@@ -65,7 +69,7 @@ def check(
     Raises
     ------
     EomcError
-        If `symbolic.reference_for` raises it: there is no reference for the system.
+        If there is no reference for the system; see `symbolic.reference_for`.
     """
     comparison = Comparison(system, module, np.random.default_rng(seed), states, plain)
     models = [form._model for form, _ in comparison.forms if hasattr(form, "_model")]
@@ -118,7 +122,7 @@ def _report(comparison: Comparison, module: Any) -> Report:
 def value_rows(comparison: Comparison) -> None:
     """Append checks of values, single steps and short runs to the report of `eomc check`.
 
-    They compare the module with the reference.
+    They compare the compiled module with the reference, the independent evaluation in Python.
     """
     row, rounding = comparison.row, "units of rounding"
     for name in (*VALUES, "acceleration"):
@@ -134,7 +138,7 @@ def value_rows(comparison: Comparison) -> None:
 def property_rows(comparison: Comparison) -> None:
     """Append checks of laws that the module's values must obey to the report of `eomc check`.
 
-    Such laws are D = Dᵀ, and that derivatives agree with differences.
+    Examples: D is symmetric, and derivatives agree with difference quotients.
     """
     row, rounding = comparison.row, "units of rounding"
     row("D = D^T", LIMIT, rounding, comparison.symmetry)
@@ -152,7 +156,7 @@ def property_rows(comparison: Comparison) -> None:
 def compiled_rows(comparison: Comparison) -> None:
     """Append checks of runs, refusals and batches to the report of `eomc check`.
 
-    They need a module compiled from C; batches are checked if the module has them.
+    They need a module compiled from C. Batches are checked if the module has functions for them.
     """
     runs, refusals = Runs(comparison), Refusals(comparison)
     runs.report()

@@ -47,7 +47,10 @@ def _corrected(e: Expected) -> Vector | float:
 
 
 class Comparison:
-    """The checks of one module: its states, the reference's values at them, and the report's rows.
+    """Comparison of one module with the reference: states, expected values and the report's rows.
+
+    The reference is the independent evaluation of the equations in Python. A row is one line of the
+    report of `eomc check`.
 
     Parameters
     ----------
@@ -80,9 +83,9 @@ class Comparison:
         self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
-        """Append checks of orders, advised step sizes and power balance to the report.
+        """Append checks of convergence orders, advised step sizes and power balance to the report.
 
-        See `convergence.Convergence`.
+        `convergence.Convergence` and `advice.Advice` measure them.
         """
         runs, methods = self.convergence, self.methods
         for method in methods:
@@ -104,12 +107,14 @@ class Comparison:
         self, name: str, limit: float, unit: str, measure: Callable[[], float | Measurement],
         minimum: bool = False,
     ) -> None:  # fmt: skip
-        """Append a row, one line of the report, with the number that `measure` returns.
+        """Measure a number and append a row, one line of the report, with the result.
 
-        It passes if the number is at most `limit` or, with `minimum`, greater than `limit`. It
-        fails if `measure` raises an exception. `name` says what is checked, `unit` describes the
-        number. A Measurement may replace unit and limit, or give a reason why nothing is judged:
-        the row then passes.
+        name: what is checked. limit: largest permitted number; with `minimum`, the number must
+        exceed it. unit: description of the number. measure: function that returns the number.
+
+        The row fails if `measure` raises an exception. If `measure` returns a Measurement, this may
+        replace unit and limit, or give a reason why nothing is judged; in the latter case the row
+        passes.
         """
         try:
             result = measure()
@@ -133,10 +138,10 @@ class Comparison:
     def smooth_row(
         self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
-        """Append a row to the report for an order of convergence, which must exceed `limit`.
+        """Append a row for a measured order of convergence, which must exceed `limit`.
 
-        Arguments are as in `row`. If the row fails and the scene has discontinuities or kinks, it
-        is not judged.
+        The arguments are those of `row`. If the order is too low and the scene has discontinuities
+        or kinks, which reduce it, the row is not judged.
         """
         self.row(name, limit, unit, measure, minimum=True)
         row = self.rows[-1]
@@ -147,10 +152,10 @@ class Comparison:
             self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
 
     def advice_row(self, method: str) -> None:
-        """Append a row to the report for the step size h that the module advises for `method`.
+        """Append a row for the step size h that the module advises for `method`.
 
         It passes if runs with an eighth of the advised h are stable and runs with twice that h are
-        not.
+        unstable.
         """
         unit = "of the advised h, where runs are lost"
         find = partial(self.advice.failing_fraction, method)
@@ -185,7 +190,10 @@ class Comparison:
 
     @cached_property
     def unusual_states(self) -> list[Expected]:
-        """Reference values at states that runs hardly reach; values must be correct there, too."""
+        """Reference values at states that runs hardly reach.
+
+        The module must give correct values at these states as well.
+        """
         return self.sampler.unusual_states(1 if self.large else 2)
 
     @cached_property
@@ -195,25 +203,26 @@ class Comparison:
 
     @property
     def forms(self) -> list[tuple[Any, str]]:
-        """Pairs of a module and the prefix of its checks' names.
+        """Pairs of a module and a prefix of the names of its checks.
 
-        The prefix is "" for the optimised form of the C code and "plain C: " for the portable form,
-        which may be missing.
+        The first pair is the module of the optimised C code with the prefix "". The second is that
+        of the portable C code, if there is one, with the prefix "plain C: ".
         """
         plain = [] if self.plain is None else [(self.plain, "plain C: ")]
         return [(self.module, ""), *plain]
 
     def largest(self, error: Callable[[Expected], float], few: int | None = None) -> float:
-        """Return the largest value of the function `error` over all states; nan if one is nan.
+        """Return the largest error over all states; nan if one of the errors is nan.
 
-        few: the number of states to use, the first and the last ones; all by default.
+        error: function of a state with its reference values. few: number of states to use, the
+        first and the last ones; None for all.
         """
         return float(np.max([error(e) for e in (self.few(few) if few else self.expected)]))
 
     # against the reference
 
     def metadata_differences(self) -> float:
-        """Return how many of names, defaults and initial values differ from the system's."""
+        """Return how many names, defaults and initial values of the module differ from the system's."""
         s, m, start = self.system, self.module, self.sampler.start
         pairs = [
             (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),
@@ -228,7 +237,7 @@ class Comparison:
         return float(sum(theirs != ours for theirs, ours in pairs))
 
     def value(self, name: str) -> float:
-        """Return the largest error of the value `name` over all states, in units of rounding.
+        """Return the largest error of one of the module's values over all states, in roundings.
 
         name: "acceleration" or a key of VALUES, such as "D" or "energy".
         """
@@ -244,7 +253,7 @@ class Comparison:
     def steps(self) -> float | Measurement:
         """Return the largest error of one RK4 step with the scene's h, in units of rounding.
 
-        The step starts at a few of the states and is compared with the reference's step.
+        Steps from a few of the states are compared with the reference's steps.
         """
         h, far = self.system.run.h, MAX_DISTANCE * self.sampler.scale
 
@@ -267,9 +276,10 @@ class Comparison:
     def step_by(self, method: str) -> float | Measurement:
         """Return the largest error of one step of `method` over a few states, in units of rounding.
 
-        It is compared with a step by the method's tableau on the reference's accelerations, for the
-        scene's h and for LONG_STEP times that h, at which terms of high order in h exceed rounding.
-        Both are shortened if the iteration for the stages of an implicit method does not converge.
+        The expected step applies the method's Runge-Kutta tableau to the reference's accelerations.
+        Two step sizes are used: the scene's h, and LONG_STEP times that h, with which terms of high
+        order in h exceed rounding. A step is shortened if the iteration for the stages of an
+        implicit method does not converge.
         """
         errors = (
             self.one_step_error(method, e, h)
@@ -279,9 +289,10 @@ class Comparison:
         return largest(errors, "no step from any state is finite")
 
     def accelerations(self, s: State) -> one_step.Acceleration:
-        """Return the reference's accelerations as a function of q, qd and t, for the inputs of `s`.
+        """Return a function of q, qd and t that computes the reference's accelerations.
 
-        q, qd and the result have the shape (nq,) or (n, nq). The parameters are those of `s`, too.
+        Inputs and parameters are those of `s`. q, qd and the result have the shape (nq,), or (n,
+        nq) for n states.
         """
 
         def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
@@ -291,12 +302,14 @@ class Comparison:
         return acceleration
 
     def one_step_error(self, method: str, e: Expected, longest: float) -> float | None:
-        """Return the error of one step of at most `longest` seconds, in units of rounding.
+        """Return the error of one step of the module by `method`, in units of rounding.
 
-        STEP_FRACTIONS of `longest` are tried in turn until the reference finds a step that stays
-        near the state and the module makes it, too. The result is None if there is none. It is inf
-        if the stages of the module's steps do not converge for two of them, or if it refuses the
-        shortest.
+        e: the state at which the step begins. longest: the largest step size to be tried, s. Its
+        multiples STEP_FRACTIONS are tried in turn until the reference's step stays near the state
+        and the module's step succeeds.
+
+        The result is None if there is no such step. It is inf if the module's stages do not
+        converge for two step sizes, or if the module refuses the shortest step.
         """
         s, gain, failures, refused = e.state, e.size["acceleration"], 0, False
         for h in (part * longest for part in STEP_FRACTIONS):
@@ -342,10 +355,10 @@ class Comparison:
     def run(self, e: Expected, h: float = 0.0, steps: int = 0) -> float | None:
         """Return the error of a run from the state of `e`, in units of rounding.
 
-        The run has `steps` steps of `h` seconds; 0 stands for the scene's h and a default number.
-        It is compared with the reference's run as long as a small difference of the initial state
-        grows by less than GROWTH_LIMIT; None if that is less than one step. Units take that growth
-        and the number of steps into account.
+        The run has `steps` steps of `h` seconds; 0 stands for a default number and for the scene's
+        h. The run is compared with the reference's run as long as a small difference of the initial
+        state grows by less than GROWTH_LIMIT. The result is None if that is less than one step. The
+        unit of rounding grows with this growth and with the number of steps.
         """
         s, h = e.state, h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
@@ -394,9 +407,10 @@ class Comparison:
         return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
     def start_time(self, s: State) -> float:
-        """Return the start time of runs from a state, s: its own with constraints, else 0.
+        """Return the time at which runs from the state `s` start, in s.
 
-        Constraints may depend on time, so that they hold at the state's own time only.
+        It is the state's own time if there are constraints, which may hold at that time only.
+        Otherwise it is 0.
         """
         return s.t if self.system.constraints else 0.0
 
@@ -442,7 +456,7 @@ class Comparison:
         return True
 
     def few(self, count: int) -> list[Expected]:
-        """Return the first and last states with their reference values, `count` in all."""
+        """Return `count` states with their reference values: the first and the last ones."""
         half = count // 2
         return self.expected[:half] + self.expected[half:][-half:]
 
@@ -482,8 +496,9 @@ class Comparison:
     def skewness(self) -> float:
         """Return the largest entry of N + Nᵀ over all states, N = Ḋ - 2C + ∂D/∂t, relative to Ḋ.
 
-        Ḋ and ∂D/∂t are differences of order 8 of the module's D, with steps of several widths. The
-        width with the smallest result counts: if C is wrong, no width makes N + Nᵀ vanish.
+        N must be skew-symmetric. Ḋ and ∂D/∂t are difference quotients of order 8 of the module's D,
+        with steps of several widths. The width with the smallest result counts: if C is wrong, no
+        width makes N + Nᵀ vanish.
         """
         stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 

@@ -58,9 +58,9 @@ class _End(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """An initial state for runs, and the size of its energy, J.
+    """An initial state for runs, with the size of its energy.
 
-    A rounding error of the energy is eps times that size.
+    energy: that size, in J. A rounding error of the energy is eps times it.
     """
 
     state: State
@@ -143,7 +143,7 @@ class Convergence:
     def run(self, s: State, method: str, **how: Any) -> Any:
         """Return the module's run by `method` from the state `s`, even if the run stops early.
 
-        `how` are further arguments of the module's `simulate`.
+        how: further arguments of the module's `simulate`, such as h and steps.
         """
         if method != self.methods[0]:
             how["method"] = method
@@ -153,9 +153,10 @@ class Convergence:
         return simulate(self.module, s, **how)
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
-        """Return the scaled final state of a run of `steps` steps over `span` seconds.
+        """Return the final state of a run by `method` from `s`, divided by the scale, (2, nq).
 
-        The shape is (2, nq), in units of the scale; None if the run stops early.
+        The run has `steps` steps over `span` seconds. The scale consists of typical sizes of q and
+        q̇. The result is None if the run stops early.
         """
         run = self.run(s, method, h=span / steps, steps=steps, every=steps)
         if str(run.status) != "ok":
@@ -191,10 +192,11 @@ class Convergence:
     # --- orders -----------------------------------------------------------------------------------
 
     def order(self, method: str) -> Measurement:
-        """Return the order of convergence of `method`: the best over the initial states.
+        """Return the observed order of convergence of `method`: the best over the initial states.
 
-        It is inf if all differences are rounding errors, and nan, with a reason, if it can't be
-        judged. Raises RuntimeError if no run from one of the initial states reaches its end.
+        The value is inf if all differences are rounding errors, and nan, with a reason, if the
+        order can't be judged. Raises RuntimeError if from one of the initial states no run reaches
+        its end.
         """
         least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
         orders = []
@@ -278,11 +280,12 @@ class Convergence:
     # --- two methods ------------------------------------------------------------------------------
 
     def compare_methods(self, method: str) -> Measurement:
-        """Return how far `method` and the module's first method differ at the ends of runs.
+        """Return how far final states by `method` differ from those by the module's first method.
 
-        The unit is the sum of the changes of both final states as h is halved. For each initial
-        state the smaller result of two spans counts, since at one of them these changes may vanish
-        by chance; the result is the median over the initial states.
+        The unit is the sum of the changes of both final states when h is halved. For each initial
+        state, runs of two durations are compared and the smaller result counts, since for one
+        duration these changes may vanish by chance. The result is the median over the initial
+        states.
         """
         ratios = [self._method_difference(at, method) for at in self.places]
         known = [x for x in ratios if not math.isnan(x)]
@@ -323,13 +326,15 @@ class Convergence:
 
     @property
     def closing_limit(self) -> float:
-        """Least accepted order of the power balance: half that of its method, at most 2."""
+        """Least accepted order of the power balance: half the order of the method, at most 2."""
         return min(METHODS[self._best_method].order, 4) / 2
 
     def closing(self) -> Measurement:
-        """Return the order in h at which jacobi(T) - jacobi(0) - ∫ power dt vanishes.
+        """Return the order in h at which the error of the power balance vanishes.
 
-        The smallest order over the initial states counts; inf if the balance is closed to rounding.
+        The error is jacobi(T) - jacobi(0) - ∫ power dt over a run; jacobi is the Jacobi energy
+        function. The smallest order over the initial states counts. It is inf if the error is
+        rounding only.
         """
         orders = [self._closing(at) for at in self.places]
         return _pick_order(orders, min, "the balance is neither closed nor left open")

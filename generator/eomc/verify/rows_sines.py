@@ -41,11 +41,12 @@ def report(check: Comparison) -> None:
 
 
 def vanishing(check: Comparison) -> float | Measurement:
-    """Return the largest relative error of entries of D and g that are proportional to one sine.
+    """Return the largest relative error of entries of D and g near zeros of a sine, in roundings.
 
-    It is in roundings, at angles near zeros of the sine. An entry counts if it is proportional at
-    all quarter turns at which that sine vanishes: if it is so at some only, it may be a sum that
-    cancels there, as 1 - tanh(x)**2 does far out.
+    The entries are those that are proportional to one sine, so that they vanish with it. An entry
+    counts if it vanishes at all multiples of a quarter turn at which the sine does. One that
+    vanishes at some of them only may be a sum that cancels there, such as 1 - tanh(x)**2 for large
+    x.
     """
     e, errors = check.few(2)[-1], list[float]()
     for i in map(int, np.flatnonzero(check.sampler.angles)):
