@@ -62,12 +62,12 @@ def differentiate(
 
 
 def relative_differences(values: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
-    """Return |values - exact|, (nq, k), relative to the largest scaled entry in the matrix row.
+    """Return |values - exact|, (nq, k), relative to the largest scaled entry in each matrix row.
 
-    Column j of both matrices is multiplied by scales[j]. `size` (nq,) is the size of the terms
-    summed up in each acceleration: 1e-4 of it is added to the divisor, since difference quotients
-    lose digits of it. An entry is nan if `exact` is not finite there, and inf if only `values` is
-    not.
+    Scaled means that column j of both matrices is multiplied by scales[j]. `size` (nq,) is the size
+    of the terms that add up to each acceleration: 1e-4 of it is added to the divisor, since
+    difference quotients lose digits. An entry is nan if `exact` is not finite there, and inf if
+    only `values` is not.
     """
     largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
     with np.errstate(all="ignore"):

@@ -19,10 +19,11 @@ KINETIC = ("kinetic", "energy", "jacobi")
 
 
 class DiscreteReference(Reference):
-    """Reference of a system in which jumps set some parameters, called discrete variables.
+    """Reference of a system with discrete variables: parameters that jumps at events set.
 
-    system: the system with the discrete variables as additional coordinates. core: the reference of
-    the same system in which they are parameters.
+    A reference is the independent evaluation of the equations in Python. system: the system, with
+    the discrete variables as additional coordinates. core: the reference of the same system with
+    the discrete variables as parameters.
     """
 
     def __init__(self, system: System, core: Reference) -> None:
@@ -32,7 +33,10 @@ class DiscreteReference(Reference):
         self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the sizes of all terms of "energy" or "power", as `Reference.terms`."""
+        """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
+
+        s: the arguments of `evaluate` by name. See `Reference.terms`.
+        """
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
         values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
         params = {**(s.get("params") or {}), **values}

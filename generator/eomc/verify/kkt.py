@@ -68,7 +68,10 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
 
 
 def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Return copies of D and A with which the coordinates of indices `fixed` do not change."""
+    """Return copies of D and A for which the coordinates with indices `fixed` do not move.
+
+    D is the mass matrix (n, n) and A the constraint Jacobian (m, n).
+    """
     D, A = D.copy(), A.copy()
     for i in fixed:
         D[i] = D[:, i] = A[:, i] = 0
@@ -79,8 +82,9 @@ def with_fixed_coordinates(D: Vector, A: Vector, fixed: tuple[int, ...]) -> tupl
 def absolute_inverse(D: Vector, A: Vector) -> Vector:
     """Return the absolute values of the inverse of the KKT matrix of D and A, (n + m, n + m).
 
-    They bound how rounding errors of the right-hand side spread. For a zero row of A the equation
-    of the multiplier is λ = 0.
+    The KKT matrix belongs to the equations D x - Aᵀλ = force, A x = level. The result bounds the
+    effect of rounding errors of the right-hand side. For a row of A that is zero, the equation of
+    the multiplier is replaced by λ = 0.
     """
     scale, none = scales(D, A), np.diag((~A.any(axis=1)).astype(float))
     matrix = _scaled(D, A, none, scale)
@@ -88,7 +92,7 @@ def absolute_inverse(D: Vector, A: Vector) -> Vector:
 
 
 def is_regular(D: Vector, A: Vector, least: float) -> bool:
-    """Return whether the scaled KKT matrix of D and A is regular.
+    """Return whether the KKT matrix of D and A is regular after scaling.
 
     Its least singular value must exceed `least` times the largest one. Singular values that belong
     to A grow with the square of those of A.
@@ -105,10 +109,10 @@ def _scaled(D: Vector, A: Vector, corner: Vector, scale: Vector) -> Vector:
 
 
 def scales(D: Vector, A: Vector) -> Vector:
-    """Return factors for rows and columns of the KKT matrix of D and A, (n + m,).
+    """Return factors for the rows and columns of the KKT matrix of D and A, (n + m,).
 
-    They scale the diagonal of D and the norms of the rows of A to 1. For a coordinate without
-    inertia, an inertia is estimated from its entries in A.
+    With them the diagonal of D and the norms of the rows of A become 1. For a coordinate without
+    inertia, an inertia is estimated from the coordinate's entries in A.
     """
     inertia = np.abs(np.diag(D))
     known = inertia > 0
@@ -122,9 +126,11 @@ def scales(D: Vector, A: Vector) -> Vector:
 
 
 def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
-    """Return the least eigenvalue of D (n, n), scaled to a unit diagonal, on the null space of A.
+    """Return the least eigenvalue of D on the null space of A, after scaling D to a unit diagonal.
 
-    nan if it can't be judged: a value is not finite, or rows of A are zero or linearly dependent.
+    D (n, n) is the mass matrix, and the null space of A contains the velocities that the
+    constraints permit. The result is nan if a value is not finite, or if rows of A are zero or
+    linearly dependent.
     """
     size = np.sqrt(np.abs(np.diag(D)))
     size = np.where(size > 0, size, 1.0)
@@ -139,18 +145,18 @@ def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
 
 
 def is_nonnegative(D: Vector, A: Vector) -> bool:
-    """Return whether D is nonnegative on the null space of A; True if that can't be decided."""
+    """Return whether vᵀ D v >= 0 for all v with A v = 0; True if that can't be decided."""
     return not least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE
 
 
 def project_to_nearest(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
-    """Return the x nearest to q, in the metric of D, on the constraints, and its last correction.
+    """Return the x nearest to q that satisfies the constraints, and the size of the last correction.
 
-    rows: a function of x that returns D, A and the residual of the constraint equations. The second
-    result is the size of the last correction, relative to x. It is rounding if the iteration has
-    converged, and inf otherwise.
+    Distances are in the metric of D. rows: a function of x that returns D, A and the residual of
+    the constraint equations. The size is relative to x. It is of the order of rounding if the
+    iteration has converged, and inf otherwise.
     """
     x, last = project(q, rows)
     part, before = 1.0, np.inf

@@ -12,10 +12,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Measurement:
-    """A measured value, or the reason `why` it proves nothing: the row of the report then passes.
+    """A measured value, or the reason `why` nothing can be judged.
 
-    With a reason, inf means that there is nothing to test; any other value is not judged. unit,
-    limit: replace those of the row if another quantity was measured.
+    With a reason, the report's row passes; the value inf then means that there is nothing to test.
+    unit, limit: replace those of the row if the value is of another quantity than the row's.
     """
 
     value: float
@@ -34,11 +34,11 @@ def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
 
 
 def units(values: Any, expected: Any, size: Any, eps: float) -> float:
-    """Return the largest error of some values, |values - expected| / (eps size).
+    """Return the largest error of some values in units of rounding, |values - expected| / (eps size).
 
-    eps is the relative rounding error of a number and `size` the size of the terms that make up a
-    value, so that the result is in units of rounding. It is 0 without values and nan if one is nan.
-    Raises ValueError if the shapes differ.
+    eps is the relative rounding error of a number. size: the size of the terms that make up each
+    value. The result is 0 if there are no values and nan if one is nan. Raises ValueError if the
+    shapes differ.
     """
     difference = np.abs(np.asarray(values, float) - expected)
     if difference.shape != np.shape(expected):

@@ -76,9 +76,10 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
 
 
 def contraction_factor(m: Method, slopes: Vector, h: float) -> float:
-    """Return the contraction factor of fixed-point iteration for the stages of an implicit method.
+    """Return the factor by which one fixed-point iteration for implicit stages reduces their error.
 
-    slopes: the derivatives of the accelerations with respect to q and q̇, (nq, 2 nq). h in s.
+    m: the implicit method. slopes: the derivatives of the accelerations with respect to q and q̇,
+    (nq, 2 nq). h: step size, s. The iteration converges if the factor is below 1.
     """
     return float(np.max(np.abs(np.linalg.eigvals(_sweep(m, slopes, h)))))
 
@@ -95,9 +96,9 @@ def step_by_newton(
 ) -> tuple[Vector, int]:
     """Return q and q̇ at t + h by one implicit step, (2, nq), and the number of Newton iterations.
 
-    The stages are found by Newton's method with the derivatives at the start of the step; the first
-    guess is the acceleration there. The state is nan if that has not converged in MAX_SWEEPS
-    iterations.
+    m: the implicit method. acceleration: a function of q, q̇ and t that returns q̈. Newton's method
+    for the stages uses the derivatives at the start of the step, and the acceleration there as
+    first guess. The state is nan if the method has not converged after MAX_SWEEPS iterations.
     """
     n, S = len(q), m.stages
     A, AA = (_square(rows, S) for rows in (m.a, m.a_squared))

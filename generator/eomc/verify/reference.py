@@ -37,20 +37,20 @@ SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", 
 
 
 class Reference(ABC):
-    """Equations of motion D q̈ + bias = τ of a system and related quantities, evaluated at states.
+    """Independent evaluation in Python of a system's equations of motion D q̈ + bias = τ.
 
-    All methods take one state or b states at once. For one state, q and qd are (nq,) and u is
-    (nu,). For b states, q and qd are (b, nq), u is (b, nu), t and each value in params are one
-    number or (b,), and each result has a leading dimension b.
+    Checks compare compiled modules with it. All methods take one state or b states at once. For one
+    state, q and qd are (nq,) and u is (nu,). For b states, q and qd are (b, nq), u is (b, nu), t
+    and each value in params are one number or (b,), and each result has a leading dimension b.
     """
 
     system: System
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the sizes of all terms of "energy" or "power", multiplied out.
+        """Return the sum of the absolute values of all terms of "energy" or "power", multiplied out.
 
-        s: the arguments of `evaluate` by name. The result is 0 if the expressions are not written
-        out.
+        name: which of the two. s: the arguments of `evaluate` by name. The result is 0 if this
+        reference does not have the expressions as formulas.
         """
         return 0.0
 
@@ -116,9 +116,9 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Vector:
-        """Return the Lagrange multipliers of the m constraint equations, (m,).
+        """Return the Lagrange multipliers λ of the m constraint equations, (m,), in D q̈ = τ - bias + Aᵀλ.
 
-        Those of redundant equations are 0. Arguments are as in `evaluate`.
+        The multipliers of redundant equations are 0. Arguments are as in `evaluate`.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         _, solved = self._constrained(q, qd, t, u, self._values(params))
@@ -135,9 +135,10 @@ class Reference(ABC):
     ) -> tuple[Vector, Vector]:
         """Return q and qd projected onto the constraints, by Newton's method in the metric of D.
 
-        fixed: indices of coordinates that keep position and velocity. nearest: return the nearest q
-        in that metric; otherwise only each Newton correction is minimal. The results are nan if the
-        iteration does not converge.
+        fixed: indices of coordinates whose position and velocity do not change. nearest: whether
+        the resulting q must be the nearest one in that metric; otherwise each single Newton
+        correction is the shortest, but not their sum. The results are nan if the iteration does not
+        converge.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         project_one = partial(self._project_state, fixed=fixed, nearest=nearest)
@@ -146,7 +147,7 @@ class Reference(ABC):
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
-        """Return q and qd after a step, corrected onto the constraints as generated steppers do it.
+        """Return q and qd after a step, moved onto the constraints with the method of generated code.
 
         q, qd: (nq,), or (b, nq) for b states.
         """
@@ -182,9 +183,9 @@ class Reference(ABC):
     ) -> tuple[Vector, Vector, Vector]:
         """Return a run by RK4 steps: times t (n,), and q and qd, both (n, nq).
 
-        The initial state, every `every`-th state and the last one are stored. Arguments that are
-        None have the scene's values: initial state, step size h (s), and number of steps for its
-        duration. For b initial states q and qd are (n, b, nq). t0: initial time, s.
+        q0, qd0, h (s) and steps default to the scene's initial state, step size and duration.
+        every: the initial state, every `every`-th state and the last one are stored. t0: initial
+        time, s. For b initial states (b, nq), the results q and qd are (n, b, nq).
         """
         start = self.system.coordinates
         q = np.array([c.start for c in start] if q0 is None else q0, float)
@@ -216,9 +217,10 @@ class Reference(ABC):
 
     @cached_property
     def solved(self) -> Vector:
-        """Weights (r, m) of the r sums of the m constraint equations that are solved for.
+        """Weights (r, m) of r independent sums of the m constraint equations.
 
-        The r sums are independent. In most systems each is one of the constraint equations.
+        The equations of motion are solved with these r sums, which leave out redundant equations.
+        In most systems each sum is just one of the constraint equations.
         """
         rows = self.system.solved
         sums = np.zeros((len(rows), len(self.system.constraints)))
@@ -229,7 +231,7 @@ class Reference(ABC):
 
     @cached_property
     def switched(self) -> Vector:
-        """For each of the r sums in `solved`, whether it applies in some modes (sticking) only."""
+        """For each of the r sums in `solved`, whether it applies only while some coordinate sticks."""
         rows = self.system.constraints
         return np.array([any(rows[k].switched for k, _ in row) for row in self.system.solved])
 
@@ -382,6 +384,6 @@ class Reference(ABC):
 
 
 def by_rows(x: ArrayLike, rows: int) -> list[Any]:
-    """Return a list of `rows` values: x repeated if it is one number, else its entries."""
+    """Return a list of `rows` values: the entries of x, or x repeated if it is a single number."""
     each: list[Any] = [np.asarray(x).tolist()] * rows
     return each if np.ndim(x) == 0 else np.broadcast_to(x, rows).tolist()

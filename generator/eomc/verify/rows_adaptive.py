@@ -44,9 +44,9 @@ def report(check: Comparison) -> None:
 
 
 def resolves_steps(check: Comparison, s: State, h: float) -> bool:
-    """Return whether times near that of the state are precise enough for steps of h seconds.
+    """Return whether times near s.t are precise enough for steps of h seconds.
 
-    In single precision times have 7 digits.
+    In single precision, for instance, times have only 7 digits.
     """
     return h > MIN_STEP_ROUNDINGS * check.eps * (abs(s.t) + h)
 

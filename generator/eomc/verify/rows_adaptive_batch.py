@@ -34,11 +34,20 @@ ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 @dataclass
 class BatchResult:
-    """Results of the C function `adaptive_batch` for n instances.
+    """Results of the C function `adaptive_batch` for n instances of the system.
 
-    x: final states (n, 2 nq). t: their times (n,), s. rows: q and q̇ at two times, (n, 4, nq).
-    counts: numbers of steps, rejected steps, evaluations, stiff steps and events, and a checksum of
-    the events, (n, 6). status: (n,).
+    Attributes
+    ----------
+    x : (n, 2 nq) array
+        Final states.
+    t : (n,) array
+        Their times, s.
+    rows : (n, 4, nq) array
+        q at two times, then q̇ at these times.
+    counts : (n, 6) array
+        Numbers of steps, rejected steps, evaluations, stiff steps and events, and a checksum of the events.
+    status : (n,) array
+        Error codes; 0 if there is no error.
     """
 
     x: Vector
@@ -54,8 +63,8 @@ class BatchResult:
 def report(check: Comparison, singular: list[State]) -> None:
     """Append checks of batches with adaptive steps to the report of `eomc check`.
 
-    There are none if the scene has no tolerance or no batches. singular: states at which D is
-    singular, which must be refused.
+    There are none if the scene has no tolerance or no batches. singular: states at which the mass
+    matrix D is singular; a batch must refuse them.
     """
     if check.system.run.tolerance is None or not check.system.run.batch:
         return
@@ -68,7 +77,7 @@ def report(check: Comparison, singular: list[State]) -> None:
 
 
 class EventRecorder:
-    """Buffers for the events of `count` instances, and the number and checksum of the events.
+    """Buffers for the events of `count` instances in a batch, and a digest of the events so far.
 
     digests: for each instance, the number of its events and a checksum of them. room: the buffers
     as arguments of the C function.
@@ -87,7 +96,7 @@ class EventRecorder:
         self.room = (each, *places, model._pointer(self.rows))
 
     def record(self) -> None:
-        """Add the events of the last call to the numbers and checksums of the instances."""
+        """Add the events that the last call of the C function stored to the digests."""
         for k, n in enumerate(self.counts if self.room else ()):
             number, digest = self.digests[k]
             for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
@@ -96,10 +105,10 @@ class EventRecorder:
 
 
 class BatchRows:
-    """Checks of adaptive runs of COUNT instances that start near one state, at its time.
+    """Checks of adaptive runs of a batch of COUNT instances, all of which start near one state.
 
-    singular: states at which D is singular. module: that of one form of the C code; by default the
-    optimised form.
+    singular: states at which D is singular. module: the module of the optimised (default) or the
+    portable C code.
     """
 
     def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
@@ -118,28 +127,28 @@ class BatchRows:
         ]  # fmt: skip
 
     def single_run(self, s: State, **span: Any) -> Any:
-        """Return the adaptive run of one instance from the state `s`.
+        """Return the adaptive run of a single instance from the state `s`.
 
-        span: its `duration` or `times`, as arguments of the module's `simulate`.
+        span: the `duration` or the `times` of the run, as arguments of the module's `simulate`.
         """
         return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
     def span(self, s: State) -> float:
-        """Return the duration of the first STEPS adaptive steps from a state, s.
+        """Return the duration of the first STEPS adaptive steps from the state `s`, in s.
 
-        0 if there is no step.
+        The result is 0 if the run makes no step.
         """
         run = self.single_run(s, duration=self.check.system.run.duration)
         return float(run.t[min(STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
 
     def resolves_steps(self, s: State) -> bool:
-        """Return whether times near that of the state are precise enough for its adaptive steps."""
+        """Return whether times near s.t are precise enough for the adaptive steps from `s`."""
         return resolves_steps(self.check, s, self.span(s) / STEPS)
 
     def compare_with_single_runs(self) -> float | Measurement:
-        """Return the largest difference of the batch's states from those of single runs.
+        """Return the largest difference between states of the batch and those of single runs.
 
-        The states are those at two times. The unit is the tolerance, times the number of steps.
+        States at two times are compared. The unit is the tolerance, times the number of steps.
         """
         s, T = self.state, self.span(self.state)
         if not self.resolves_steps(s):
@@ -156,10 +165,11 @@ class BatchRows:
         )
 
     def end_error(self, many: Any, k: int, times: Vector) -> float | None:
-        """Return the difference of instance k of a batch run from its single run.
+        """Return the largest difference between instance k of a batch run and its single run.
 
-        many: the batch run, which has stored the states at `times`, as the single run does. The
-        unit is the tolerance, times the number of steps. None if the single run stops early.
+        many: the batch run, which has stored the states at `times`; the single run stores them too.
+        The unit is the tolerance, times the number of steps. The result is None if the single run
+        stops early.
         """
         one = self.single_run(self.starts[k], times=times)
         if one.status != "ok" or len(one) < len(times):
@@ -215,8 +225,8 @@ class BatchRows:
     def differing_instances(self) -> float:
         """Return the number of instances whose bits depend on the other instances or on the calls.
 
-        Each is compared with itself at another place in the batch, in calls of fewer steps and, for
-        some, alone.
+        Each instance is run several times: at another place in the batch, in calls of fewer steps
+        and, for some instances, without others. All of these runs must give the same bits.
         """
         wrong, T = 0, self.span(self.state)
         for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
@@ -232,8 +242,8 @@ class BatchRows:
     def wrong_refusals(self) -> float:
         """Return the number of errors in a batch of which some instances must be refused.
 
-        These start with nan or at a singular D. It is an error if one is not refused, or if it
-        changes the result of another instance.
+        These instances start at nan or where D is singular. It is an error if such an instance is
+        not refused, and if the result of another instance changes because of it.
         """
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]

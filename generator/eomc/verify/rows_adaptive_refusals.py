@@ -89,10 +89,11 @@ class _Adaptive:
         return _RunResult(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
 
     def wrong_refusals(self) -> float:
-        """Return the number of runs that are not refused correctly, or store nan or inf.
+        """Return the number of adaptive runs that are not refused correctly, or store nan or inf.
 
-        They start where D is singular, with nan or inf, or with numbers so large that a step
-        overflows.
+        Some runs start where the mass matrix D is singular or at nan or inf; they must return an
+        error and make no step. Others start with numbers so large that a step overflows; they must
+        store finite states only.
         """
         h, tol = self.check.system.run.h, COARSE_TOLERANCE
         wrong = 0
@@ -123,18 +124,18 @@ class _Adaptive:
         return wrong
 
     def longest(self) -> float | Measurement:
-        """Return the number of errors in runs with a limit of the step size.
+        """Return the number of errors in adaptive runs with a limit of the step size.
 
-        No step may exceed the limit, the last one must end at the given time, and a run in several
-        calls must equal that in one call.
+        No step may exceed the limit, the last step must end at the given time, and a run in several
+        calls must equal the run in one call.
         """
         errors = (self.step_limit_errors(e.state) for e in self.check.few(2))
         return largest(errors, "time tells no parts of a first step")
 
     def step_limit_errors(self, s: State) -> float | None:
-        """Return the number of errors in a run from `s` with a limit of the step size.
+        """Return the number of errors in one adaptive run from `s` with a limit of the step size.
 
-        None if times are not precise enough for such steps.
+        The result is None if times are not precise enough for such steps.
         """
         first = self.drive(s, self.check.system.run.duration, COARSE_TOLERANCE)
         later = first.times[first.times > s.t]  # the state may jump at once
