@@ -222,7 +222,7 @@ class Comparison:
     # against the reference
 
     def metadata_differences(self) -> float:
-        """Return how many names, defaults and initial values of the module differ from the system."""
+        """Return how many names, defaults and initial values differ between module and system."""
         s, m, start = self.system, self.module, self.sampler.start
         pairs = [
             (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),

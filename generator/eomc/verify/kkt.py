@@ -152,7 +152,7 @@ def is_nonnegative(D: Vector, A: Vector) -> bool:
 def project_to_nearest(
     q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
 ) -> tuple[Vector, float]:
-    """Return the x nearest to q that satisfies the constraints, and the size of the last correction.
+    """Return the x nearest to q on the constraints, and the size of the last correction.
 
     Distances are in the metric of D. rows: a function of x that returns D, A and the residual of
     the constraint equations. The size is relative to x. It is of the order of rounding if the

@@ -34,7 +34,7 @@ def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
 
 
 def units(values: Any, expected: Any, size: Any, eps: float) -> float:
-    """Return the largest error of some values in units of rounding, |values - expected| / (eps size).
+    """Return the largest error of some values, |values - expected| / (eps size), in roundings.
 
     eps is the relative rounding error of a number. size: the size of the terms that make up each
     value. The result is 0 if there are no values and nan if one is nan. Raises ValueError if the

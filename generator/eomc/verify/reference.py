@@ -47,10 +47,10 @@ class Reference(ABC):
     system: System
 
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the absolute values of all terms of "energy" or "power", multiplied out.
+        """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
 
-        name: which of the two. s: the arguments of `evaluate` by name. The result is 0 if this
-        reference does not have the expressions as formulas.
+        name: which of the two; products are multiplied out. s: the arguments of `evaluate` by name.
+        The result is 0 if this reference does not have the expressions as formulas.
         """
         return 0.0
 
@@ -116,9 +116,10 @@ class Reference(ABC):
         u: ArrayLike | None = None,
         params: Params = None,
     ) -> Vector:
-        """Return the Lagrange multipliers λ of the m constraint equations, (m,), in D q̈ = τ - bias + Aᵀλ.
+        """Return the Lagrange multipliers of the m constraint equations, (m,).
 
-        The multipliers of redundant equations are 0. Arguments are as in `evaluate`.
+        They are the λ of D q̈ = τ - bias + Aᵀλ. The multipliers of redundant equations are 0.
+        Arguments are as in `evaluate`.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         _, solved = self._constrained(q, qd, t, u, self._values(params))
@@ -147,7 +148,7 @@ class Reference(ABC):
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
-        """Return q and qd after a step, moved onto the constraints with the method of generated code.
+        """Return q and qd after a step, moved onto the constraints as by generated code.
 
         q, qd: (nq,), or (b, nq) for b states.
         """
@@ -231,7 +232,7 @@ class Reference(ABC):
 
     @cached_property
     def switched(self) -> Vector:
-        """For each of the r sums in `solved`, whether it applies only while some coordinate sticks."""
+        """For each of the r sums in `solved`, whether it applies only while a coordinate sticks."""
         rows = self.system.constraints
         return np.array([any(rows[k].switched for k, _ in row) for row in self.system.solved])
 

@@ -45,7 +45,8 @@ class BatchResult:
     rows : (n, 4, nq) array
         q at two times, then q̇ at these times.
     counts : (n, 6) array
-        Numbers of steps, rejected steps, evaluations, stiff steps and events, and a checksum of the events.
+        Numbers of steps, rejected steps, evaluations, stiff steps and events; a checksum of the
+        events.
     status : (n,) array
         Error codes; 0 if there is no error.
     """
