@@ -13,11 +13,16 @@ from eomc.emit.plain.views import AnySource
 
 @dataclass(frozen=True)
 class Library:
-    """A function of the C mathematics library, to be wrapped for a lane.
+    """A function of the C mathematics library that is applied to each value of a vector register.
 
-    A *lane* is a vector register with one value of each of several instances. name: ending of the
-    wrapper's C name. c: name of the library function. two: whether it has two arguments. whole: the
-    single AVX-512 instruction for a whole register, as C text, or "".
+    Attributes
+    ----------
+    name
+        Ending of the C name of the generated function, which takes registers.
+    c, two
+        Name of the library function, and whether it has two arguments.
+    whole
+        C expression for a single AVX-512 instruction that computes the whole register; "" for none.
     """
 
     name: str
@@ -58,12 +63,19 @@ class Source(AnySource):
 
 @dataclass(frozen=True)
 class Laned:
-    """Fields that select the type of numbers for which a template is printed.
+    """Template fields for the C type that a template is printed for: the *lane* type.
 
-    The *lane* type is one number, or a vector register with one value of each of several instances.
+    It is one number, or a vector register with one value of each of several instances.
 
-    inline: macro before inlined functions. lane: C type of a value. mask: C type of failures. L:
-    suffix of C names, "" for one number.
+    Attributes
+    ----------
+    inline
+        C macro before inlined functions.
+    lane, mask
+        The C type itself, and the C type that records failures: int for one number, a mask of the
+        failed values for a register.
+    L
+        Suffix of C names; "" for one number.
     """
 
     inline: str
@@ -74,7 +86,10 @@ class Laned:
 
 @dataclass(frozen=True)
 class Driven:
-    """Whether steps read the time t, inputs u, and precomputed expressions of the parameters."""
+    """Template fields that state what steps of a scene read.
+
+    timed: the time t. inputs: the inputs u. constants: precomputed expressions of the parameters.
+    """
 
     timed: bool
     inputs: bool
@@ -106,9 +121,9 @@ class LaneText(Laned):
     angles, count
         Length of arrays of angles as C text ("" without angles), and the number of angles.
     across
-        Whether the sines of four angles are computed in one register.
+        Whether the sines of four angles are computed in one vector register.
     angles_at, changes
-        The functions for the angles at q, and for their change with a change of q.
+        The C functions for the angles at q, and for changes of these from a change of q.
     sincos
         Name of the C function for sine and cosine of one angle.
     signal, signal_call
@@ -118,12 +133,13 @@ class LaneText(Laned):
         C text of the accelerations from the state, its sines and the inputs, and the C call of that
         function.
     accelerations
-        Prototype of the function that computes signals and sines too, where they are not supplied.
+        Prototype of the C function for the accelerations that also computes inputs (by the scene's
+        signals) and sines if its arguments for these are NULL.
     two_point, takes_c
         Whether the accelerations are split into two parts, see `TwoPoints`, and whether these read
         precomputed expressions.
     alone
-        Whether some caller does not supply the sines.
+        Whether some callers do not pass the sines, so that the function must compute them.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/lane.c"
@@ -150,10 +166,13 @@ class LaneText(Laned):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Data for the template c/fast/blocks.c: a tile, the instances of a batch that step together.
+    """Data for the template c/fast/blocks.c: the C types of blocks and tiles.
 
-    lane: C type of a vector register. inputs: whether there are inputs. constants: C type of the
-    precomputed expressions, or "". blocks: number of vector registers in a tile.
+    A block is the group of instances of a batch that share a vector register. A tile is a group of
+    blocks that are stepped together.
+
+    lane: C type of a vector register. inputs: whether the scene has inputs. constants: C type of
+    the precomputed expressions of the parameters; "" for none. blocks: number of blocks in a tile.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/blocks.c"
@@ -167,10 +186,10 @@ class Blocks:
 
 @dataclass(frozen=True)
 class TwoPoints(Prefixed):
-    """Data for the template c/fast/two_point.c: accelerations in two parts, for long accelerations.
+    """Data for the template c/fast/two_point.c: accelerations that are split into two C functions.
 
-    The position-dependent part is computed at two configurations in one register, the
-    velocity-dependent part at one of them.
+    The first one computes the position-dependent part for two configurations q in one vector
+    register. The second one computes the accelerations from it, at one of the two configurations.
 
     Attributes
     ----------
@@ -222,7 +241,8 @@ class RungeKutta4(Named, Laned, Driven):
     shared_signals
         Whether the signals depend on time only, so that they are computed once for several stages.
     signal_call, signal_now
-        C calls of the signals at the three times of a step, and at one stage; "" for none.
+        C calls of the signals (formulas for the inputs) at the start, middle and end of a step, and
+        at one stage; "" for none.
     two_point, velocity_call
         Whether the accelerations are split into two parts, see `TwoPoints`, and the C call of the
         velocity-dependent part.
@@ -256,10 +276,11 @@ class RungeKutta4(Named, Laned, Driven):
 
 @dataclass(frozen=True)
 class Predictions(Prefixed):
-    """Data for the template c/fast/predictions.c: sines and cosines at predicted angles.
+    """Data for the template c/fast/predictions.c: sines and cosines of predicted angles.
 
-    The angles of the next step of RK4 are extrapolated, and their sines computed in advance.
-    angles: number of angles. unroll, inline: macros before loops and before inlined functions.
+    The C functions extrapolate the angles of the next RK4 step, and compute their sines and cosines
+    in advance. angles: number of angles. unroll, inline: C macros before loops and before inlined
+    functions.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/predictions.c"
@@ -270,7 +291,10 @@ class Predictions(Prefixed):
 
 @dataclass(frozen=True)
 class Predicted(Named, Driven):
-    """Data for the template c/fast/predicted.c: RK4 as long as predicted angles are accurate.
+    """Data for the template c/fast/predicted.c: a loop over steps of RK4 with predicted angles.
+
+    Predicted angles are extrapolated from the step before. The loop ends when they are not accurate
+    enough.
 
     Attributes
     ----------
@@ -300,8 +324,15 @@ class Predicted(Named, Driven):
 class Stage:
     """C text of one stage of an explicit Runge-Kutta method.
 
-    node: the fraction of the step at which the stage lies, or "" at its start. positions,
-    velocities: the sums over accelerations of earlier stages. call: the call of the accelerations.
+    Attributes
+    ----------
+    node
+        The time of the stage as a fraction of the step; "" at the start of the step.
+    positions, velocities
+        The weighted sums of accelerations of earlier stages in the position and the velocity of
+        this stage.
+    call
+        The call of the function for the accelerations.
     """
 
     node: str
@@ -348,7 +379,7 @@ class Explicit(Prefixed, Laned, Driven):
 
 @dataclass(frozen=True)
 class Factors(Prefixed):
-    """Data for the template c/fast/lu.c: LU factorisation, and solution with the factors.
+    """Data for the template c/fast/lu.c: LU factorisation of a matrix, and solution of A x = b.
 
     fabs: name of the C function for |x|. f: suffix of C literals.
     """
@@ -380,7 +411,8 @@ class Gauss(Tableau):
         Prototype of the function that computes the factors of Newton's matrix, and the names of its
         arguments that its body does not use.
     signal_call, follows
-        C calls of the scene's signals at the state, and at a perturbed state; "" for none.
+        C calls of the scene's signals (formulas for the inputs) at the state, and at a perturbed
+        state; "" for none.
     slopes_call
         C call of the derivatives of the accelerations.
     solve
@@ -418,21 +450,24 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Stages(Named):
-    """Data for the template c/fast/stages.c: one iteration over the stages of a Gauss method.
+    """Data for the template c/fast/stages.c: one fixed-point iteration over all stages of a step.
 
-    The stages are computed side by side in vector registers.
+    The method is an implicit Runge-Kutta method, such as a Gauss method. The stages are computed
+    side by side in vector registers.
 
     Attributes
     ----------
     members
         Names of the precomputed expressions.
     stages, padded, c
-        Number of stages, the same rounded up to whole registers, as C text, and the nodes.
+        Number of stages; length of arrays over the stages, at least a whole register, as C text;
+        and the nodes of the method.
     within
-        Rows of the transposes of A and A A, which weight the accelerations of the same step.
+        Rows of the transposes of A and A A, which weight the accelerations at the stages of this
+        step.
     extrapolated
-        The same for the accelerations of the step before, which are extrapolated as a polynomial;
-        None for methods of adaptive steps only.
+        Rows of the transposed matrices that weight the accelerations at the stages of the step
+        before, extrapolated as a polynomial; None for methods of adaptive steps only.
     sweep
         Prototype of the function for an iteration.
     together, alone
@@ -460,15 +495,18 @@ class Stages(Named):
 
 @dataclass(frozen=True)
 class Sweeps(Named):
-    """Data for the template c/fast/sweeps.c: a step of a method with a fixed number of iterations.
+    """Data for the template c/fast/sweeps.c: a step of an implicit method.
+
+    The step makes a fixed number of fixed-point iterations over its stages. If these do not
+    converge, the C function `settle` iterates until they do.
 
     Attributes
     ----------
     f, fabs, eps
         Suffix of C literals, name of the C function, and the rounding unit.
     enough
-        Relative error of velocities below which the iterations of `settle` have converged, unless
-        they start anew.
+        Relative error of velocities below which the iterations of `settle` have converged. If they
+        start from the accelerations at the start of the step, the limit is rounding error instead.
     tolerance
         Relative change of velocities in the last iteration above which the step is solved by
         `settle` instead.
@@ -479,8 +517,8 @@ class Sweeps(Named):
     settle, settle_call
         Prototype of the function that iterates until convergence, and its C call.
     sweep_settling, sweep_first, sweep_back, sweep_forth
-        C calls of one iteration: in `settle`, from the step before, and between two arrays in
-        either direction.
+        C calls of one iteration: in `settle`; the first one of a step, which extrapolates the
+        stages of the step before; and the later ones, from array a to b and from b to a.
     start
         C call of the accelerations at the start.
     solve
@@ -519,12 +557,21 @@ class Sweeps(Named):
 
 @dataclass(frozen=True)
 class State(Named):
-    """Data for the template c/fast/state.c: the struct with the state of a run by one method.
+    """Data for the template c/fast/state.c: the C struct with the state of a run by one method.
 
-    predicted, newton, sweeps: whether the run predicts angles, whether the method uses Newton's
-    method, and its fixed number of iterations (0 for none); they determine the members of the
-    struct. stages: number of stages. implicit, inputs, constrained: whether the method is implicit,
-    and whether the scene has inputs and constraints.
+    Attributes
+    ----------
+    extent
+        Length of vectors of coordinates as C text.
+    name, title, stages, implicit
+        The method: its name in C, its title in comments, its number of stages, and whether it is
+        implicit.
+    predicted
+        Whether the run extrapolates angles from one step to the next.
+    newton, sweeps
+        Whether the method uses Newton's method, and its fixed number of iterations (0 for none).
+    inputs, constrained
+        Whether the scene has inputs, and constraints.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/state.c"
@@ -559,10 +606,11 @@ class Loop(Named, Driven):
     padded
         Whether vectors of coordinates are padded with zeros to a multiple of four.
     start_call, predicted_call
-        C calls of the accelerations at the start, and of the steps with predicted angles.
+        C calls of the accelerations at the start of the run, and of the function for all steps that
+        can use predicted (extrapolated) angles.
     advance, otherwise
-        C calls of one step, and of the step with all sines computed anew, if the first one fails
-        ("" if there is no difference).
+        C calls of one step. `otherwise` repeats a step that failed by `advance`, and computes all
+        sines anew; "" if `advance` already does so.
     project, project_again
         C calls that project the end of the step onto the constraints, after `advance` and after
         `otherwise`; "" without constraints.
@@ -600,7 +648,7 @@ class Batch(Named, Driven):
     batch
         Prototype of the function.
     rk4, angles
-        Whether the method is RK4, and whether sines of angles are computed apart.
+        Whether the method is RK4, and whether the accelerations take sines of angles as arguments.
     shared_signals
         Whether the signals depend on time only, so that they are computed once for several stages.
     members
@@ -613,7 +661,8 @@ class Batch(Named, Driven):
         C calls that compute these expressions from the first parameters and from those of instance
         k.
     alone
-        C call of a step of one instance, for instances whose step fails in a register.
+        C call of a step of a single instance. It repeats a step that failed when it was computed in
+        a vector register together with other instances.
     project, project_alone
         C calls that project the end of a step onto the constraints, in a register and for one
         instance; "" without constraints.
@@ -642,7 +691,9 @@ class Batch(Named, Driven):
 
 @dataclass(frozen=True)
 class AdaptiveLanes(AdaptiveTableau):
-    """Data for the template c/fast/adaptive_lanes.c: adaptive steps of many instances side by side.
+    """Data for the template c/fast/adaptive_lanes.c: adaptive steps of many instances.
+
+    The instances are computed side by side in vector registers.
 
     Attributes
     ----------
@@ -656,12 +707,13 @@ class AdaptiveLanes(AdaptiveTableau):
     compute_constants, compute_own, own
         As in `Batch`.
     accelerate, forces
-        C calls of the accelerations of all instances in a register at a stage, and of one instance
-        at its start.
+        C calls of the accelerations: of all instances in a register at a stage, and of one instance
+        at its initial state.
     batch, alone
         Prototype of the function, and C call that steps one instance.
     store_row, look
-        C calls that store a row of the trajectory: at the end of a step, and within it.
+        C calls that store a state of the trajectory: the one at the end of a step, and one
+        interpolated within the step.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"
