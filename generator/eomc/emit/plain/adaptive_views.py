@@ -16,24 +16,25 @@ class AdaptiveTableau(Named):
     Attributes
     ----------
     method
-        Prefix of the C names.
+        Prefix of the C names of the integration method.
     extent
         Length of vectors of coordinates, as a C expression.
     stages, c
-        Number of stages, and the nodes.
+        Number of stages of the method, and the nodes: times of the stages as fractions of a step.
     f, sqrt
         Suffix of C literals of this precision, and the name of the C square root.
     eps, tiny
         The rounding unit, and a small positive number that avoids divisions by zero.
     powers
-        Matrix from accelerations at the stages (rows) to coefficients of their polynomial.
+        Matrix that multiplies the accelerations at the stages, to obtain the coefficients of the
+        polynomial of time through them.
     most
         Largest number of iterations over the stages.
     retry_after
         Number of steps by Newton's method before fixed-point iteration is tried again.
     of_most, of_most_coarse
-        Least scale of a coordinate or velocity, relative to the largest one: in general, and where
-        rounding errors are judged.
+        Least scale to which the error of a coordinate or velocity is related, as a fraction of the
+        largest coordinate or velocity: in general, and where rounding errors are estimated.
     unscaled
         Number of trailing coordinates that only jumps change; they have no scale.
     """
@@ -56,7 +57,9 @@ class AdaptiveTableau(Named):
 
 @dataclass(frozen=True)
 class Adaptive(AdaptiveTableau):
-    """Data for the template c/adaptive.c and the four that it includes: an adaptive step.
+    """Data for the template c/adaptive.c: one step with adaptive step-size control.
+
+    The four templates that it includes read the same data.
 
     Attributes
     ----------
@@ -65,32 +68,35 @@ class Adaptive(AdaptiveTableau):
     total
         C expression for the sum of half[0], half[1], ..., the sums of pairs of stages.
     top
-        Rows of the matrix from accelerations at the stages to the coefficients of the last four
-        Legendre polynomials, from which the error is estimated.
+        Rows of the matrix that multiplies the accelerations at the stages, to obtain the
+        coefficients of the last four Legendre polynomials. The error is estimated from these.
     weights
         Rows of weights of the stage accelerations in the increments of position and velocity.
     timed, events, begins
         Whether accelerations depend on time, whether there are events, and whether some events may
         trigger at the start of a motion.
     may_rest, capped, capped_now
-        Whether time-dependent forces may hold all bodies at rest, so that only rounding errors are
-        left; the function that then limits the scales of the error estimate; its call.
+        Whether all bodies may stay at rest under time-dependent forces, so that motions are
+        rounding errors; the function that then limits the scales of the error estimate; its call.
     project, whole
-        C call that projects the end of a step onto the constraints ("" for none), and whether it
-        takes the state rather than the increment.
+        C call that projects the end of a step onto the constraints ("" for none), and whether its
+        arguments are the state (q, q̇) itself rather than the increments in the step.
     solve_stages, sweep, solve, solve_within
-        The function that solves for the stages, the call of one iteration in it, and the calls of
-        the function for a step and for the state within a step.
+        The function `solve_stages`, which solves for the stages by iteration; the C call of one
+        iteration in it; and its C calls for a step and for the state within a step.
     step, start, within
         The function for the next step, the call of the accelerations at its start, and the function
         for the state within a step (dense output).
     corners, share
-        Whether forces jump or have kinks, and the fraction of the tolerance for steps with these.
+        Whether forces may jump or have kinks, and the fraction of the tolerance that applies to
+        steps in which they do.
     fabs, longest, close
-        Name of the C function; largest number of initial time scales to which the least step size
-        is relative; number of least step sizes within which kinks count as repeated.
+        Name of the C function for |x|; largest time span, in time scales of the initial motion, to
+        which the least step size is relative; number of least step sizes within which kinks count
+        as repeated.
     ends
-        Weights of the stage accelerations in the values of their polynomial at both ends of a step.
+        Weights of the stage accelerations that give the values of their polynomial at the start and
+        at the end of a step.
     forces, forces_there, forces_here, forces_near
         The function for the accelerations at a state, and its calls at the end of a step, at a
         state, and at a perturbed state.
@@ -146,15 +152,18 @@ class FixedSteps(Named):
 
     Attributes
     ----------
-    method, extent, stages, f, eps, fabs
-        As in `AdaptiveTableau`; fabs is the name of the C function.
+    method, extent, stages, f, eps
+        As in `AdaptiveTableau`.
+    fabs
+        Name of the C function for |x|.
     timed, jumps, above
         Whether accelerations depend on time, whether events make the state jump, and whether there
         are events of stick-slip friction.
     fixed, at
-        The functions for the next step and for the state within the last step.
+        Prototypes of the functions for the next step and for the state at a time within the last
+        step.
     inside
-        C call for the state within an adaptive step.
+        C call that interpolates the state within an adaptive step.
     step
         C call of the integration method through the function pointer memory->step.
     forces_before, forces_halfway, forces_after
@@ -184,15 +193,17 @@ class FixedSteps(Named):
 class Events(Named):
     """Data for the template c/events.c: event detection in a step, and state jumps.
 
+    An event triggers at a root of its event function, a function of time and state.
+
     Attributes
     ----------
     method, fabs, sqrt, eps, tiny, huge
         Prefix of C names, names of C functions, and constants.
     samples, nodes, slopes
-        Number and positions (fractions of the step) of the evaluations of an event function in a
-        step, and the matrix from these values to the derivatives at the same positions.
+        Number of evaluations of an event function in a step; their positions, as fractions of the
+        step; and the matrix that multiplies the values there to obtain the derivatives there.
     stages, once, twice
-        Number of stages; integrals of the powers of time up to each node, taken once and twice.
+        Number of stages; the first and the second integrals of the powers of time up to each node.
     directions, actions, above
         For each event: -1, 0 or 1 for falling, both or rising; 0, 1 or 2 for record, stop or jump;
         1 if its function cannot become negative immediately after it was zero.
@@ -204,7 +215,8 @@ class Events(Named):
         Tolerances as fractions of a step: for finite differences, for corrections of a root, and
         for an accurate root.
     chance
-        Fraction of the time between jumps below which the next jump counts as coincidental.
+        Fraction of the time between jumps. If the next jump follows within it, the two jumps are
+        taken as coincidental.
     halvings, recent_steps
         A step is halved at most `halvings` times to resolve event functions, not counting one
         halving in every `recent_steps` steps.
@@ -212,7 +224,8 @@ class Events(Named):
         Largest size of the last Chebyshev coefficients of a resolved event function, relative to
         its largest value, and the weights that compute these coefficients.
     rounding, rounded, values_near
-        The function for the rounding error of an event function, its call, and the call in it.
+        The function that estimates the rounding error of an event function, its C call, and the C
+        call of the event functions in its body.
     evaluate_events, refine_root, find_root, event_step, changed, restart
         The functions: event functions within a step, root between two times, first root in a step,
         all events of a step, changes by new inputs, and the start after an event.
@@ -223,8 +236,8 @@ class Events(Named):
         C calls of `evaluate_events` at a time and shortly before and after it, of `refine_root` up
         to a node and up to a minimum, of `find_root`, and of the state within a step.
     jump, project, project_all
-        C calls of the jump map, and of the projection onto the constraints with and without fixed
-        entries; "" for none.
+        C calls of the jump map (the new state after an event), and of the projection onto the
+        constraints with and without entries of the state that stay fixed; "" for none.
     set
         For each event of the scene, 1 for the entries of q and qd that its jump sets, else 0.
     modes
@@ -294,8 +307,16 @@ class Events(Named):
 class InitialEvents(Named):
     """Data for the template c/initial_events.c: events that trigger at the start of a motion.
 
-    function: prototype of the static function. values: C call of the functions that are positive
-    for events that trigger. restart: C call that makes the jump. method: prefix of C names.
+    Attributes
+    ----------
+    function
+        Prototype of the static C function that detects these events.
+    values
+        C call that computes one value for each event, which is positive if the event triggers.
+    restart
+        C call that makes the state jump.
+    method
+        Prefix of the C names of the integration method.
     """
 
     TEMPLATE: ClassVar[str] = "c/initial_events.c"
@@ -314,8 +335,8 @@ class AdaptiveRun(Named):
     Attributes
     ----------
     constants, compute_constants
-        Whether precomputed expressions of the parameters are a struct, and the C call that computes
-        it ("" for none).
+        Whether there is a C struct of precomputed expressions of the parameters, and the C call
+        that computes it ("" for none).
     unread_p
         Whether the parameters are an argument that the body does not use.
     loosest, tightest
@@ -325,8 +346,9 @@ class AdaptiveRun(Named):
     recent_steps, retry_after
         As in `Events` and `AdaptiveTableau`.
     initial_events, changed, happen, restart, values
-        C calls: jumps at the start, changes of event functions by new inputs, detection of events
-        in a step, the start after an event, and the event functions; "" for none.
+        C calls, "" for none: of the jumps at the start; of the function for changes of event
+        functions when inputs change; of the detection of events in a step; of the restart after an
+        event; and of the event functions.
     run, advance, fixed
         Prototype of the public function, and C calls of an adaptive step and of a fixed step.
     row, row_before, look
@@ -368,10 +390,10 @@ class AdaptiveRun(Named):
 
 @dataclass(frozen=True)
 class AdaptiveBatch:
-    """Data for the template c/adaptive_batch.c: many instances, stepped one after the other.
+    """Data for the template c/adaptive_batch.c: adaptive runs of many instances, in sequence.
 
-    batch: prototype of the public function. alone: the C call that steps instance k. events:
-    whether the scene has events.
+    prefix: the scene's name, with which C names begin. batch: prototype of the public function.
+    alone: C call of the run of one instance, with index k. events: whether the scene has events.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive_batch.c"

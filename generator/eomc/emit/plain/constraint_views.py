@@ -17,12 +17,13 @@ class Projection:
     ----------
     L, lane, mask
         The template is printed for one instance and for a lane, a vector register with one value of
-        each of several instances. L: suffix of C names ("" for one instance); lane: C type of a
-        value; mask: C type of failures.
+        each of several instances. L: suffix of C names ("" for one instance); lane: C type to
+        compute with; mask: C type that records failures.
     extent, size
         Length of vectors of coordinates, as a C expression, and number of results of `projection`.
     increments
-        Whether the arguments r and v are increments of a step rather than the state at its end.
+        Whether the arguments r and v of `function` are the increments of q and q̇ in a step rather
+        than the state at its end.
     projection, call
         The function that computes corrections of q and q̇ and the inverse pivots of the constraint
         equations, and its C call.
@@ -35,8 +36,8 @@ class Projection:
         Largest rate of a dropped constraint equation, relative to the largest terms of all
         equations and to its own terms.
     near, scale_floor
-        Square of the relative correction above which it counts as large, and square of the least
-        scale of a coordinate, relative to all.
+        Square of the relative correction above which a correction counts as large; square of the
+        least scale of a coordinate, relative to that of all coordinates.
     crossed
         Bound on the product of the squared relative corrections of q and q̇; above it, another
         correction is made.
@@ -47,7 +48,8 @@ class Projection:
         C type of the sines and cosines that a caller may supply ("" for none), and the C call that
         computes them.
     onto
-        The function that projects a stage of an iterated step to first order; None if not needed.
+        Prototype of the function that projects a stage of an implicit step onto the constraints, by
+        a single correction; None if not needed.
     """
 
     TEMPLATE: ClassVar[str] = "c/projection.c"
@@ -108,19 +110,20 @@ class Project(Named):
         C initialisers of the sums of constraint equations that replace dependent equations, and the
         indices of the equations that they replace.
     pinned
-        Whether coordinates may have neither inertia nor a holonomic constraint.
+        Whether there may be coordinates that have neither inertia nor a holonomic constraint.
     errors
         The function of the rotation errors of closed loops; None if there are no such loops.
     error_rows, error_ends
-        Indices of the constraint equations that have a rotation error, as a C initialiser, and
-        where the indices of each loop end in it.
+        Indices of the constraint equations that have a rotation error, as a C initialiser with the
+        loops in sequence; for each loop, the position in it at which its indices end.
     rotated, call_rotated, call_turn
         The function that replaces these residuals by rotation vectors, its C call, and its C call
         without gradients.
     searched, starts
         Whether random starts are tried if the search from a state fails, and their number.
     converged
-        Square of the last change towards the nearest state, relative to that of its distance.
+        Square of the last change in the search for the nearest state, relative to the square of the
+        distance to it, below which the search has converged.
     half_turn
         Squared cosine of half an angle below which a rotation counts as half a turn.
     """
