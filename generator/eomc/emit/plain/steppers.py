@@ -44,8 +44,8 @@ def files(
 ) -> dict[str, str]:
     """Return the header and the source of a program in portable C, as texts by file name.
 
-    show: renders template data ("views") as text. real: the C type of numbers; by default that of
-    the scene. rooms: see `header`.
+    show: function that renders template data as text. real: the C type of numbers; by default that
+    of the scene. rooms: lengths of the workspaces that optimised C needs, see `header`.
     """
     plain = portable_functions(program, real)
     name = plain.prefix
@@ -81,13 +81,22 @@ def header(
     rooms: Sequence[int],
     fast: bool = False,
 ) -> Header:
-    """Return the data for the template of the C header.
+    """Return the data for the template of the C header, of portable or of optimised C.
 
-    slopes: data of the derivatives of the accelerations; None if the scene does not need them.
-    stamp: number that the source compares with its own, to detect a header of another build. rooms:
-    the workspace size, in numbers, of each method in optimised C and then of adaptive steps (0: the
-    size that portable C needs). Portable C reserves the same space, so that a program compiled with
-    one header runs with both forms. fast: whether the header belongs to the optimised C.
+    Parameters
+    ----------
+    plain
+        The C functions of the scene.
+    slopes
+        Template data of the derivatives of the accelerations; None if the scene does not need them.
+    stamp
+        Number that the source compares with its own, to detect a header of another build.
+    rooms
+        Length of the workspace, as a count of numbers, for each integration method in optimised C,
+        and then for adaptive steps; 0 for the length that portable C needs. Headers of both forms
+        reserve the same length, so that a program compiled with one header runs with both.
+    fast
+        Whether the header belongs to the optimised C.
     """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
@@ -133,10 +142,10 @@ def header(
 
 
 def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) -> dict[str, Any]:
-    """Return the template fields that the C sources of both forms share, by name of the field.
+    """Return the template fields that the sources of portable and optimised C share, by name.
 
-    The forms are portable and optimised C. All fields of `AnySource` are included except
-    `steppers`. Arguments as in `header`; show renders template data as text.
+    These are all fields of `AnySource` except `steppers`. functions: the C functions of the scene.
+    stamp, slopes: as in `header`. show: function that renders template data as text.
     """
     target, s = functions.target, functions.target.system
     return {
@@ -159,9 +168,10 @@ def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) 
 
 
 def linearization(plain: Functions) -> Slopes | None:
-    """Return the template data for the derivatives of the accelerations: A_q, A_qd and B.
+    """Return the template data for the derivatives of the accelerations q̈.
 
-    These are ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂u. None if the program does not contain them.
+    The derivatives are A_q = ∂q̈/∂q, A_qd = ∂q̈/∂q̇ and B = ∂q̈/∂u. Return None if the program does
+    not contain them. plain: the C functions of the scene.
     """
     target = plain.target
     function = evaluations.source(target, "linearization")
@@ -225,7 +235,10 @@ def _about(m: Method) -> tuple[str, ...]:
 
 
 def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
-    """Return the template data for the C function that makes one step of the method `m`."""
+    """Return the template data for the C function that makes one step of the method `m`.
+
+    plain: the C functions of the scene.
+    """
     if m.implicit:
         return _gauss(plain, m)
     accelerate, step = plain.acceleration.function.call, plain.public.step(m.name)
@@ -271,7 +284,11 @@ def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
 
 
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
-    """Return the template data for the C functions that the implicit ones among `methods` share."""
+    """Return the template data for the C functions that implicit methods share.
+
+    methods: the integration methods of the scene, of which some may be implicit. plain: the C
+    functions of the scene.
+    """
     real, accelerate = plain.target.real, plain.acceleration.function.call
     newton = any(m.newton for m in methods)
     return Implicit(
@@ -372,7 +389,8 @@ def _adaptive(plain: Functions) -> list[View]:
 def loop(plain: Functions, m: Method) -> Loop:
     """Return the template data for the C functions that make many steps by the method `m`.
 
-    These are the run of one instance and the batch of many.
+    One function is for a run of one instance, the other for a batch of many instances. plain: the C
+    functions of the scene.
     """
     NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)

@@ -21,9 +21,10 @@ from eomc.emit.plain.parts import Computed, Named, Tableau
 
 @dataclass(frozen=True)
 class Indexed:
-    """A coordinate, input, output, constraint or event, as an enumerator in the C header.
+    """A C enumerator in the generated header: the index of a coordinate, input, output or the like.
 
-    enum: the name of the C enumerator. words: unit and note of the scene, for the comment.
+    Constraints and events have enumerators too. enum: name of the enumerator. words: unit and note
+    from the scene file, for the C comment.
     """
 
     enum: str
@@ -34,8 +35,8 @@ class Indexed:
 class Parameter:
     """A parameter of the scene, as a member of the parameter struct in the C header.
 
-    name: the C name. value: the scene's value as a C literal. words: unit and note of the scene,
-    for the comment.
+    name: name of the member. value: the parameter's value in the scene file, as a C literal. words:
+    unit and note from the scene file, for the C comment.
     """
 
     name: str
@@ -45,7 +46,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Declared:
-    """The functions of one integration method, as declared in the C header.
+    """The C functions of one integration method with fixed steps, as declared in the C header.
 
     Attributes
     ----------
@@ -54,13 +55,13 @@ class Declared:
     implicit
         Whether the method is implicit.
     workspace
-        Length of the workspace of a run, in numbers.
+        Length of the workspace of a run, as a count of numbers.
     step, run, batch
         Prototypes of the functions for one step, for many steps, and for many instances; `batch` is
         None if the scene does not request it.
     derivative
-        Prototype of the function for the derivatives of a step by the state and the inputs; None if
-        the scene does not request it.
+        Prototype of the function for the derivatives of the state at the end of a step with respect
+        to the state at its start and the inputs; None if the scene does not request it.
     """
 
     name: str
@@ -75,22 +76,22 @@ class Declared:
 
 @dataclass(frozen=True)
 class AdaptiveDeclared:
-    """The functions of adaptive step-size control, as declared in the C header.
+    """The C functions of runs with adaptive step-size control, as declared in the C header.
 
     Attributes
     ----------
     title
         The method's title in comments.
     memory, workspace
-        C type of the workspace of a run, and its length in numbers.
+        C type of the workspace of a run, and its length as a count of numbers.
     run, batch
         Prototypes of the functions for one instance and for many; `batch` is None if the scene does
         not request it.
     together
         Whether the optimised C steps many instances of a batch in parallel.
     fixed
-        C function type of a step of fixed size, which a run with event detection takes instead of
-        adaptive steps; None for scenes without events.
+        C function type for one step of fixed size. A run with event detection can make such steps
+        instead of adaptive ones. None for scenes without events.
     """
 
     title: str
@@ -154,7 +155,7 @@ class Header(Named):
 
 @dataclass(frozen=True)
 class AnySource(Named):
-    """Data that the C sources of both forms share, the portable and the optimised one.
+    """Data that the templates of the portable and of the optimised C source share.
 
     Attributes
     ----------
@@ -167,7 +168,7 @@ class AnySource(Named):
     evaluations, acceleration
         The functions of mechanics, and the function for the accelerations.
     solved
-        Lines of a comment on how D qÌ = Ï - bias is solved for the accelerations qÌ.
+        Lines of a comment on how D q̈ = τ - bias is solved for the accelerations q̈.
     slopes, steppers
         C text for the derivatives of the accelerations ("" for none), and for the steps and runs of
         each method: the rendered text of other templates.
@@ -237,12 +238,12 @@ class Derivative(Tableau):
     inputs, width
         Whether there are inputs u, and the number of variables in q, q̇ and u, as a C expression.
     rates, eliminate, projection
-        Functions that all methods share, so that only one method prints them: the derivatives of
-        the accelerations, Gaussian elimination, and the correction onto the constraints with its
-        directional derivative.
+        C functions that all methods share, so that only one method prints them: the derivatives of
+        the accelerations (None for the other methods), Gaussian elimination (whether it is
+        printed), and the correction onto the constraints with its directional derivative (or None).
     linearization, feedback
-        C calls of the derivatives of the accelerations, and of the derivatives of the signals (""
-        if the signals do not depend on the state).
+        C calls of the derivatives of the accelerations, and of the derivatives of the signals, the
+        scene's formulas for inputs ("" if the signals do not depend on the state).
     moved, projection_call, move
         For scenes with constraints: the function that projects the end of a step and its
         derivatives onto the constraints, the call of `projection` in it, and the call of `moved`.
@@ -302,9 +303,9 @@ class RungeKutta4(Named):
     step
         Prototype of the public function.
     advance, advance_call
-        The function that makes the step, and its C call. With constraints it is a static function
-        that also reports a constraint equation without multiplier (singular configuration); without
-        constraints it is `step`.
+        The function that makes the step, and its C call. Without constraints it is `step` itself.
+        With constraints it is a static function, which also reports singular configurations: those
+        in which a constraint equation has no multiplier.
     correct
         C call that projects the end of the step onto the constraints; "" without constraints.
     first, second, third, fourth
@@ -343,15 +344,18 @@ class Explicit(Tableau):
 
 @dataclass(frozen=True)
 class Implicit(Named):
-    """Data for the template c/plain/implicit.c: functions that all implicit methods share.
+    """Data for the template c/plain/implicit.c: C functions that all implicit methods share.
 
     Attributes
     ----------
+    fabs, fmax, tiny
+        Names of the C functions for |x| and max(x, y), and a small positive number that avoids
+        divisions by zero.
     nudge
         Relative step of finite differences.
     corrections, factors, newton
-        Which functions are needed: the size of corrections of the stages, LU factorisation, and
-        derivatives of the accelerations by finite differences.
+        Whether these functions are needed: for the size of corrections of the stages, for LU
+        factorisation, and for derivatives of the accelerations by finite differences.
     slopes
         Prototype of the function for these derivatives.
     here, near
@@ -386,8 +390,8 @@ class Gauss(Tableau):
     eps, tenth, half
         C literals: the rounding unit, 0.1 and 0.5.
     stages_function, matrix, solve, step
-        Functions for the accelerations at all stages, for the factors of Newton's matrix, for the
-        solution of the step, and the public function.
+        Prototypes of the C functions: for the accelerations at all stages, for the LU factors of
+        Newton's matrix, for the solution of a step by iteration, and the public one for a step.
     about
         Lines of the comment above the step.
     stage, slopes_call, start, sweep, matrix_start, matrix_mid, solve_call
@@ -425,11 +429,22 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Nodes(Named):
-    """Data for the template c/plain/nodes.c: one fixed-point iteration over the stages of a method.
+    """Data for the template c/plain/nodes.c: one fixed-point iteration over all stages of a step.
 
-    Adaptive steps in portable C call it. c, A, AA: nodes and coefficients as in `Tableau`. sweep:
-    prototype of the function. stage: C call of the accelerations at stage i. onto: C call that
-    projects that stage onto the constraints; "" without constraints.
+    Adaptive steps in portable C call the C function of this template.
+
+    Attributes
+    ----------
+    title, name, stages
+        The integration method: its title in comments, its name in C, and its number of stages.
+    c, A, AA
+        Nodes and coefficients of the method, as in `Tableau`.
+    sweep
+        Prototype of the C function.
+    stage
+        C call of the accelerations at stage i.
+    onto
+        C call that projects stage i onto the constraints; "" without constraints.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/nodes.c"
@@ -446,11 +461,17 @@ class Nodes(Named):
 
 @dataclass(frozen=True)
 class Loop(Named):
-    """Data for the template c/plain/run.c: the functions for many steps and for many instances.
+    """Data for the template c/plain/run.c: C functions for runs of one instance and of many.
 
-    run, batch: prototypes of the two functions; `batch` is None if the scene does not request it.
-    one_step, run_one: the C calls of one step in `run`, and of `run` in `batch`. implicit,
-    constrained: whether the method is implicit and whether the scene has constraints.
+    Attributes
+    ----------
+    implicit, constrained
+        Whether the integration method is implicit, and whether the scene has constraints.
+    run, batch
+        Prototypes of the functions for one instance and for many; `batch` is None if the scene does
+        not request it.
+    one_step, run_one
+        C call of one step in the body of `run`, and C call of `run` in the body of `batch`.
     """
 
     TEMPLATE: ClassVar[str] = "c/plain/run.c"
