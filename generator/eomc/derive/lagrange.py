@@ -68,8 +68,8 @@ class Derivation:
     multipliers : SolveResult
         Accelerations by link multipliers, the tensions of massless links between point masses.
 
-    A SolveResult is a solution D qdd = tau - bias, or a str with the reason why the method was not
-    used. It is None if the method does not apply, as for a system with constraints.
+    A SolveResult is a solution of D qdd = tau - bias, or a str with the reason why the method was
+    not used. It is None if the method does not apply, as for a system with constraints.
     """
 
     system: System

@@ -124,7 +124,7 @@ class Links(Vectors):
         return self.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
-        """Return the vector of length x along link k's joint axis, in link k's frame."""
+        """Return the vector x e in link k's frame, where e is the unit vector of its joint axis."""
         v = list(ZERO)
         v[self.links[k].axis] = x
         return (v[0], v[1], v[2])

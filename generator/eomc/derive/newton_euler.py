@@ -32,8 +32,8 @@ from eomc.model.tree import Link, Tree
 class Inertia:
     """Mass, first moment and inertia tensor of a link about the origin of a frame.
 
-    The parameters of links are grouped (Gautier and Khalil): those that have the same effect on the
-    motion as parameters of the parent are moved to the parent.
+    A parameter of a link that has the same effect on the motion as a parameter of the parent link
+    is added to the parent (grouping by Gautier and Khalil).
 
     Attributes
     ----------
@@ -72,19 +72,21 @@ class _Forces:
 
 
 class Recursion(Links):
-    """A kinematic tree on a tape, with the recursive algorithms of its dynamics.
+    """A kinematic tree of links, with methods that return its dynamics as symbolic expressions.
 
-    The algorithms are recursive Newton-Euler (bias, gravity forces, inverse dynamics) and composite
-    bodies (mass matrix). Forces "by link" are those along the joint of each link, in N or N m.
+    Expressions are defined on a tape, a list of elementary operations with named results. The
+    recursive Newton-Euler algorithm gives bias, gravity forces and inverse dynamics. The
+    composite-body algorithm gives the mass matrix. A force along a joint is in N, or in N m for a
+    revolute joint.
 
     Attributes
     ----------
     gravity : Vector
         Acceleration of gravity in the world's axes (m/s^2).
     armature
-        For each link, the inertia of its drive's rotor, added to that along the joint.
+        For each link, the inertia of its drive's rotor along the joint (kg m^2 or kg).
     inertia : list of Inertia
-        For each link, its inertial parameters after grouping.
+        For each link, its inertial parameters after grouping, see `Inertia`.
     fixed_moment : Vector
         First moment (kg m) of mass that is fixed in the world.
     """
@@ -203,16 +205,17 @@ class Recursion(Links):
         return self.tape.scaled(S(2), x)
 
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
-        """Return the terms by which a rotation about joint k's axis changes a 2 x 2 matrix.
+        """Return the two terms by which a rotation about joint k's axis changes a 2 x 2 matrix.
 
-        The matrix is [[first, b], [b', second]], and across = b + b'. With the cosine c and sine s
-        of the joint's angle, let e = s (first - second) + c across and t = s e. The rotated matrix
-        has the diagonal first - t, second + t; its off-diagonal entries change by c e - across.
+        The matrix is [[first, b], [b', second]], and across = b + b'. Let c and s be the cosine and
+        sine of the joint's angle, e = s (first - second) + c across, and t = s e. The rotated
+        matrix has the diagonal entries first - t and second + t. Its off-diagonal entries are those
+        of the matrix plus c e - across.
 
         Returns
         -------
         t, c e : Expr
-            Atoms of the tape.
+            The two terms, as atoms of the tape.
         """
         c, s = self.cosine[k], self.sine[k]
         e = self.add(self.times(s, self.add(first, self.minus(second))), self.times(c, across))
@@ -223,11 +226,11 @@ class Recursion(Links):
     def forces(
         self, rates: Sequence[Expr], joint_accelerations: Sequence[Expr], gravity: bool = True
     ) -> _Forces:
-        """Return the force (N) and moment (N m) on each link that given joint motions need.
+        """Return the force (N) and moment (N m) on each link that cause the given joint motions.
 
-        They are in the link's own frame, the moment about its origin. `rates` and
-        `joint_accelerations` are the first and second time derivatives of the joint displacements.
-        Without `gravity`, the forces do not support the links' weight.
+        Their components are in the link's own frame; the moment is about the origin of the frame.
+        `rates` and `joint_accelerations` are the first and second time derivatives of the joint
+        displacements. With `gravity`, the forces also support the weight of the links.
         """
         out = _Forces([], [])
         spin = self.angular_velocities(rates)
@@ -306,9 +309,10 @@ class Recursion(Links):
     # --- inwards: joint forces -------------------------------------------------------------------
 
     def joint_forces(self, forces: _Forces) -> list[Expr]:
-        """Return the force along each joint that gives the links the forces `forces`.
+        """Return the force along each joint that is equivalent to the forces on the links.
 
-        It is the sum of the forces on all links beyond the joint, projected onto its axis.
+        It is the sum of the `forces` on all links beyond the joint, projected onto the joint's
+        axis.
         """
         f, n = list(forces.force), list(forces.moment)
         out: list[Expr] = [S.Zero] * self.n
@@ -322,13 +326,14 @@ class Recursion(Links):
         return out
 
     def bias(self) -> list[Expr]:
-        """Return C qd + g as the force along each joint."""
+        """Return the bias C qd + g (Coriolis, centrifugal and gravity forces) along each joint."""
         return self._forces_for(self.drift)
 
     def inverse_dynamics(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
         """Return D qdd + C qd + g as the force along each joint.
 
-        `joint_accelerations` is qdd along the joints, as `by_link` returns it.
+        `joint_accelerations` is the second time derivative of each joint's displacement, without
+        the part that depends on velocities alone; `by_link` computes it from qdd.
         """
         return self._forces_for(
             [self.add(*pair) for pair in zip(joint_accelerations, self.drift, strict=True)]
@@ -340,9 +345,9 @@ class Recursion(Links):
         return self.joint_forces(self.forces(rest, rest))
 
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
-        """Return D v as the force along each joint, without forming D.
+        """Return the product D v as the force along each joint, without forming the mass matrix D.
 
-        `direction` is v along the joints, as `by_link` returns it.
+        `direction` contains v by joint; `by_link` computes it from one entry for each coordinate.
         """
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
@@ -361,7 +366,8 @@ class Recursion(Links):
     def mass_matrix(self) -> list[list[Expr]]:
         """Return the mass matrix by the composite-body algorithm, with one row and column per link.
 
-        It refers to the displacements of the joints. Entries between different branches are 0.
+        Its coordinates are the displacements of the joints. An entry of two links on different
+        branches of the tree is 0.
         """
         beyond = list(self.inertia)
         for k in reversed(range(self.n)):
@@ -387,9 +393,9 @@ class Recursion(Links):
         return D
 
     def count_elimination_operations(self) -> int:
-        """Return the number of operations to factor D and solve with it.
+        """Return the number of operations to factor the mass matrix D and solve D x = b.
 
-        Zeros between different branches of the tree are not computed with.
+        Operations on entries that are zero, those of two links on different branches, do not count.
         """
         depth = [0] * self.n
         for k, link in enumerate(self.links):

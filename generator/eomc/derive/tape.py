@@ -27,11 +27,10 @@ class NotDifferentiableError(EomcError):
 
 
 class Stage(IntEnum):
-    """The binding time of a value: when it can be computed.
+    """The binding time of a value: when, or from which variables, it can be computed.
 
-    It is the latest binding time of the symbols that the value depends on. NUMBER is known when
-    code is generated, PARAMETER once for each set of parameters, TIME from t and the inputs,
-    POSITION from q, VELOCITY from q and qd.
+    NUMBER: when code is generated. PARAMETER: once for each set of parameters. TIME: from t and the
+    inputs. POSITION: from q and the former. VELOCITY: from qd and all former variables.
     """
 
     NUMBER = 0
@@ -47,13 +46,14 @@ _Varying = tuple[tuple[Symbol, Expr], ...]  # powers of names that do not depend
 
 @dataclass(frozen=True)
 class RootSlope:
-    """The bounded derivative of a root s**p, 0 < p < 1, by which the derivative of s is multiplied.
+    """The derivative of a root s**p, 0 < p < 1, bounded so that it is finite where s is 0.
 
-    The derivative p s**(p - 1) is bounded by p/least where s is 0. Where s is 0 and smooth, or
-    constant nearby, the derivative of s is 0, and for p >= 1/2 so is the product, since s is of
-    second order. For p < 1/2 the derivative of the root is infinite, unless a factor of the root is
-    0. The derivative of a root of |x| is infinite too: it is taken along x, with the sign of one
-    side at 0. What is left of the bound in a result makes it infinite, see `Tape._overflowing`.
+    By the chain rule the derivative of s is multiplied by p s**(p - 1), which is bounded by
+    p/least. If s is 0 at a smooth minimum, the derivative of s is 0. For p >= 1/2 the product is
+    then 0, which is correct, since s is of second order. For p < 1/2 the derivative of the root is
+    infinite, unless a factor of the root is 0. The derivative of a root of |x| is infinite, too; it
+    is taken with respect to x, with the sign of one side at 0. If the bound remains in a result,
+    the result is made infinite, see `Tape._overflowing`.
 
     Attributes
     ----------
@@ -74,18 +74,19 @@ class RootSlope:
 
 
 class Tape:
-    """A list of named definitions, each a sum, a product or a function of earlier names.
+    """A list of elementary operations, each with a named result.
 
-    `define` takes any expression and returns its atom: a number, a name, or a number times a name.
-    Definitions are in a normal form: a sum of atoms, a product of powers of names, or one function
-    of atoms. Equal expressions have the same name.
+    The method `define` adds an expression to the list and returns its atom: a number, a name, or a
+    number times a name. Each name is defined as a sum of atoms, a product of powers of names, or
+    one function of atoms, in terms of earlier names. Equal expressions have the same name.
 
     Parameters
     ----------
     leaves : mapping of Symbol to Stage
-        The symbols that have no definition, such as coordinates and parameters, and their stages.
+        The symbols without definition, such as coordinates and parameters. The `Stage` of a symbol
+        says when its value is available.
     constant_leaves : set of Symbol
-        Leaves that count as constant: all gradients with respect to them are 0.
+        Leaves that count as constant: derivatives with respect to them are 0.
     """
 
     def __init__(
@@ -138,10 +139,11 @@ class Tape:
         return name
 
     def named(self, expr: Expr, name: str) -> Expr:
-        """Define `expr` under a name of its own, which products do not expand, and return the name.
+        """Add `expr` to the tape under a name of its own, and return the name.
 
-        `name` is a hint for the name of the variable in generated code. Numbers and leaves are
-        returned as they are.
+        A product that contains the name is not expanded by the name's definition. `name` is the
+        preferred name of the variable in generated code. An expression that is a number or a
+        symbol without definition is returned unchanged.
         """
         atom = self.define(expr)
         factor, symbol = split(atom)
@@ -154,7 +156,11 @@ class Tape:
         return symbol
 
     def opaque(self, atom: Expr) -> Expr:
-        """Return a name, or minus a name, for the atom; products do not expand its definition."""
+        """Return an atom with the same value that is not expanded in products.
+
+        `atom` is a number, a name, or a number times a name. The result is a number, a name, or
+        minus a name. If a product contains this name, the name's definition is not multiplied out.
+        """
         factor, symbol = split(atom)
         if symbol is None:
             return atom
@@ -164,7 +170,7 @@ class Tape:
         return self.scaled(factor, symbol)
 
     def stage_of(self, atom: Expr) -> Stage:
-        """Return the stage of an atom: when it can be computed."""
+        """Return the stage of a number, a name, or a number times a name: when it is available."""
         symbol = split(atom)[1]
         return Stage.NUMBER if symbol is None else self.stage[symbol]
 
@@ -175,7 +181,7 @@ class Tape:
     def rhs(self, symbol: Symbol) -> Expr:
         """Return the definition of a name as a SymPy expression of earlier names.
 
-        Raises KeyError if `symbol` is a leaf, which has no definition.
+        Raises KeyError if `symbol` has no definition, as a coordinate or a parameter.
         """
         if symbol not in self._rhs:
             if symbol in self.weights:
@@ -421,9 +427,10 @@ class Tape:
     # --- derivatives -----------------------------------------------------------------------------
 
     def live(self, atoms: Iterable[Expr], stop: Set[Symbol] = frozenset()) -> list[Symbol]:
-        """Return the defined names that `atoms` depend on, in the order of their definition.
+        """Return all names on the tape that `atoms` depend on, in the order of their definition.
 
-        Names in `stop` are returned, but not the names in their definitions.
+        Definitions of names in `stop` are not followed: such a name is returned, but not the names
+        that only its definition depends on.
         """
         names: set[Symbol] = set()
         queue = [s for atom in atoms for s in atom.free_symbols]
@@ -443,7 +450,11 @@ class Tape:
         return symbols & self.leaves.keys()
 
     def partial(self, symbol: Symbol, part: Symbol) -> Expr:
-        """Return the partial derivative of the definition of `symbol` by the name `part` in it."""
+        """Return the derivative of a definition with respect to a name that occurs in it.
+
+        `symbol` is the defined name. `part` is the name in its definition; all other names in the
+        definition are held constant.
+        """
         key = (symbol, part)
         if key not in self._partial:
             if symbol in self.weights:
@@ -465,11 +476,13 @@ class Tape:
         Parameters
         ----------
         outputs
-            Atoms of the tape.
+            The values to differentiate, as atoms of the tape: numbers, names, or numbers times
+            names.
         seeds
-            The direction: its component along each leaf; 0 along leaves that are absent.
+            The direction: its component along each leaf (symbol without definition). Components
+            along absent leaves are 0.
         least
-            Bound of the roots in derivatives of roots, see `RootSlope`. None for no bound.
+            Bound in derivatives of roots, see `RootSlope`. None for no bound.
 
         Returns
         -------
@@ -503,18 +516,18 @@ class Tape:
         Parameters
         ----------
         outputs
-            Pairs of an atom and its weight, the seed.
+            Pairs (value, seed) of atoms. The seed is the weight of the value in the sum.
         wrt
             The names with respect to which the derivatives are taken.
         stop
             Names that are independent variables: their definitions are not differentiated.
         least
-            Bound of the roots in derivatives of roots, see `RootSlope`. None for no bound.
+            Bound in derivatives of roots, see `RootSlope`. None for no bound.
 
         Returns
         -------
         list of Expr
-            sum_k seed_k d(output_k)/d(name) for each name in `wrt`.
+            sum_k seed_k d(value_k)/d(name) for each name in `wrt`.
         """
         terms: dict[Symbol, list[Expr]] = {}
         for output, seed in outputs:
@@ -656,7 +669,12 @@ class Tape:
         return self.times(atom, self.define(beyond**4))
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
-        """Return the atoms of the outputs with leaves replaced by the atoms `values`."""
+        """Return the given expressions on the tape with some symbols replaced by other values.
+
+        `outputs` are the expressions. `values` maps each symbol to its replacement. Both are atoms
+        of the tape: numbers, names, or numbers times names. Definitions that depend on the symbols
+        are added to the tape anew.
+        """
         new: dict[Symbol, Expr] = dict(values)
         for symbol in self.live(outputs):
             changed = {part: new[part] for part in self.parts[symbol] if part in new}

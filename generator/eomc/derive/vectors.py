@@ -15,16 +15,17 @@ AXES = ((1, 2), (2, 0), (0, 1))  # for each axis, the other two in cyclic order
 
 
 class Vectors:
-    """Operations on numbers and vectors on a tape, which leave out zeros.
+    """Sums and products of numbers and vectors on a tape; terms that are zero are left out.
 
-    The arguments and results are atoms of the tape: numbers, names, or numbers times a name.
+    A tape is a list of elementary operations, each with a named result. The arguments and results
+    of the methods are atoms of the tape: numbers, names, or numbers times a name.
     """
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
 
     def define(self, e: Expr) -> Expr:
-        """Return the atom of an expression: its value on the tape."""
+        """Add an expression to the tape and return it as a number, a name, or a number times it."""
         return self.tape.define(e)
 
     def add(self, *terms: Expr) -> Expr:
