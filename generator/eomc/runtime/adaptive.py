@@ -198,10 +198,15 @@ def simulate(
     Parameters
     ----------
     fixed : tuple
-        The caller's values of the arguments that are for fixed steps only, in the order of
-        `FIXED_STEP_DEFAULTS`. They must have their default values.
+        The values that the caller gave for the arguments that only fixed steps use, in the order of
+        `FIXED_STEP_DEFAULTS`. Each must have its default value.
 
-    The other arguments are those of `Model.simulate`. Raises ValueError if one is invalid.
+    The other arguments are those of `Model.simulate`.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
     """
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     q, qd = model._start
@@ -231,11 +236,12 @@ def simulate_short_run(
 ) -> AdaptiveRun | None:  # fmt: skip
     """Simulate a short run with adaptive steps by a single call of the C function.
 
-    Return the run, or None if it does not reach its end within `count` rows or fails, or if u is
-    neither None, a float nor an array (nu,) of the module's number type; `simulate` then has to
-    repeat it. This function is only for scenes without events and constraints. q0, qd0: initial
-    state (nq,), or None for that of the scene. tol: tolerance, or None for that of the scene.
-    duration in s.
+    Only for scenes without events and constraints. Return None in three cases, in which the caller
+    has to use `simulate` instead: the run does not reach its end within `count` rows; the run
+    fails; u is neither None, nor a float, nor an array (nu,) of the module's number type.
+
+    q0, qd0: initial state (nq,), or None for that of the scene. duration: in s. tol: tolerance, or
+    None for that of the scene.
     """
     (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
     inputs, at_u = None, null
@@ -279,7 +285,9 @@ def run(
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
     method: str = "",
 ) -> AdaptiveRun:  # fmt: skip
-    """Simulate from checked arguments and return the run, even if it failed (see its status).
+    """Simulate with adaptive steps, or with fixed steps and events, from checked arguments.
+
+    The run is returned even if it failed; its attribute `status` is then the reason.
 
     Parameters
     ----------

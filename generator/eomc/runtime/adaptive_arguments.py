@@ -25,8 +25,8 @@ def uses_adaptive_steps(
 ) -> bool:
     """Return True if a call of `simulate` with these arguments takes adaptive steps.
 
-    This is the case if tol, h_most, stiff or method="auto" is given, or if the scene has a
-    tolerance and none of h, steps and method is given.
+    Steps are adaptive if tol, h_most, stiff or method="auto" is given. They are also adaptive if
+    the scene has a tolerance and none of h, steps and method is given.
     """
     if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
@@ -36,7 +36,7 @@ def uses_adaptive_steps(
 def as_limits(
     model: ModelInfo, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
-    """Check arguments of adaptive steps; return the tolerance and the longest step.
+    """Check the arguments of adaptive steps; return the tolerance and the longest step.
 
     Parameters
     ----------
@@ -45,10 +45,10 @@ def as_limits(
     h_most : float or None
         Longest step, s; None: no limit.
     stiff : bool
-        Checked only.
+        Whether to begin with Newton's method; the type is checked.
     fixed : tuple
-        The caller's values of the arguments in `FIXED_STEP_DEFAULTS`, which are for fixed steps
-        and must have their default values.
+        The values that the caller gave for the arguments in `FIXED_STEP_DEFAULTS`, which only fixed
+        steps use. Each must have its default value.
 
     Returns
     -------
@@ -101,8 +101,8 @@ def as_progress(progress: Any) -> Any:
 def as_end(model: ModelInfo, t0: float, duration: float | None) -> float:
     """Return the end time t0 + duration of a run, s, rounded to the module's number type.
 
-    duration in s; None: that of the scene. Raises ValueError if it is negative, or if
-    floating-point numbers are too coarse for times within it.
+    duration: in s; None: that of the scene. Raises ValueError if the duration is negative, or if
+    the spacing of floating-point numbers near the end time is too large for the duration.
     """
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:

@@ -47,10 +47,11 @@ def error_by_tighter_tolerance(
     """Estimate the error of an adaptive run, or of a run with fixed steps and events.
 
     The error is the difference from a reference run with a hundredth of the tolerance and shorter
-    steps. Another run from a perturbed initial state shows how rounding errors grow. For runs with
-    events, or with large errors, the estimate is at least the propagated rounding error; if the
-    first perturbation grows too large for a linear estimate, a run from a start that is perturbed
-    by a few rounding units, with the smallest tolerance, provides it.
+    steps. A further run from a perturbed initial state shows how rounding errors grow. For runs
+    with events, or with large errors, the estimate is at least the propagated rounding error.
+
+    The perturbation may grow too large for a linear estimate. A run with the smallest tolerance,
+    from a start that is perturbed by a few rounding units, then shows the growth.
 
     Parameters
     ----------

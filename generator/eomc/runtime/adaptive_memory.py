@@ -18,16 +18,16 @@ class StepCounters:
         self.rows, self.most = 0, room_for(model)
 
     def add(self, work: Any, events: bool) -> None:
-        """Add the numbers of rows, and if `events` also of events, that the last C call stored.
+        """Add the number of rows, and if `events` is True the number of events, of the last C call.
 
         work: the C struct of the run, of type adaptive_work.
         """
         self.rows += work.rows + (work.events if events else 0)
 
     def limit_steps(self, steps: int, each: int) -> int:
-        """Return how many steps the next call may make: at most `steps`, and as fit in memory.
+        """Return how many steps the next call of C may make so that its rows fit in memory.
 
-        each: maximum number of rows that a step stores.
+        steps: upper limit of the result. each: maximum number of rows that a step stores.
         """
         return int(min(steps, max(0.0, self.most - self.rows) // each))
 
@@ -35,9 +35,9 @@ class StepCounters:
 class RowBuffer:
     """Memory that C fills with the rows (t, q, qd) of a run.
 
-    times: (n,) requested times of the rows, s; None: a row after each step. In the second case the
-    number of rows is not known in advance, so several arrays ("pieces") are allocated one after
-    the other; `count` is the number of rows of the first one.
+    times: requested times of the rows (n,), s; None: a row after each step. Without requested times
+    the number of rows is not known in advance. Several arrays ("pieces") are then allocated one
+    after the other, and `count` is the number of rows of the first piece.
     """
 
     def __init__(self, model: ModelInfo, times: Array | None, count: int) -> None:
@@ -53,21 +53,21 @@ class RowBuffer:
         self.to_t = self.to if self.times is None else address(real, self.times)
 
     def reserve(self, steps: int, each: int) -> None:
-        """Allocate a new piece for `steps` steps if the current one has no room for one more step.
+        """Allocate a new piece (array) for `steps` steps if the current one is full.
 
-        each: maximum number of rows that a step stores. Rows at requested times have one piece
-        only.
+        A piece is full if it cannot store the rows of another step. each: maximum number of rows
+        that a step stores. With requested times there is only one piece.
         """
         if self.own and self.count - self.filled < each:
             self.pieces.append(self._filled())
             self._piece(1 + each * steps)
 
     def c_arguments(self, steps: int, each: int) -> tuple[Any, ...]:
-        """Return the arguments on rows for the next call of the C function.
+        """Return the arguments about rows that the next call of the C function receives.
 
-        steps: maximum number of steps. each: maximum number of rows that a step stores. The result
-        is (maximum number of steps, pointer to the requested times, their number, pointers to the
-        buffers for t, q and qd).
+        steps: maximum number of steps of the call. each: maximum number of rows that a step stores.
+        The result is (maximum number of steps, pointer to the requested times, number of these
+        times, pointers to the buffers for t, q and qd).
         """
         null, nq, left = self.model._c[2], self.model.nq, self.count - self.filled
         to_q = self.to + (self.count + nq * self.filled)
@@ -77,7 +77,7 @@ class RowBuffer:
         return steps, self.to_t + self.filled, left, null, *at
 
     def concatenate(self) -> tuple[Array, Array]:
-        """Return the times (n,), s, and the states [q, qd] (2, n, nq) of all rows so far."""
+        """Return the times (n,), s, and the states [q, qd], (2, n, nq), of all stored rows."""
         times, rows = self._filled()
         if self.pieces:
             times = np.concatenate([*(t for t, _ in self.pieces), times])
@@ -92,14 +92,17 @@ class RowBuffer:
 
 
 def room_for(model: ModelInfo) -> float:
-    """Return the largest number of rows and events together that a run may store."""
+    """Return the largest number of rows and events, counted together, that a run may store.
+
+    The number follows from the memory of the machine.
+    """
     return PART * machine_memory() / _row(model)
 
 
 def rows_for(model: ModelInfo, count: int) -> Array:
-    """Allocate a flat array for `count` rows (t, q, qd), of count * (1 + 2 nq) numbers.
+    """Allocate a flat array for `count` rows (t, q, qd), which has count * (1 + 2 nq) numbers.
 
-    Raises MemoryError if it does not fit in the machine's memory.
+    Raises MemoryError if the array does not fit in the machine's memory.
     """
     try:
         if count * _row(model) > machine_memory():

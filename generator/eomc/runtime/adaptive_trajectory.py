@@ -43,9 +43,9 @@ def _friction() -> str:
 
 
 def failure_message(model: Stepping, status: str, fixed: str) -> str:
-    """Return a sentence that explains why a run ended with this status, and a remedy.
+    """Return a sentence with the reason why a run ended with this status, and with a remedy.
 
-    fixed: name of the method of fixed steps; "": adaptive steps.
+    status: such as "singular". fixed: name of the method of fixed steps; "": adaptive steps.
     """
     if status == "no convergence" and not fixed:
         return STEP_TOO_SHORT.format(FRICTION_REMEDIES[bool(model._rows.modes)].format(_friction()))
@@ -89,7 +89,7 @@ class AdaptiveTrajectory(Run):
 
     @property
     def message(self) -> str:
-        """Return a sentence on the result of the run, with the reason of a failure."""
+        """Return a sentence on the result of the run; for a failed run it states the reason."""
         progress = f"{self.steps} steps, {self.description}"
         if self.status == "ok":
             return progress
@@ -109,8 +109,8 @@ class AdaptiveTrajectory(Run):
     def events(self) -> dict[str, EventLog]:
         """Return the occurrences of each event of the scene as a dict from name to `EventLog`.
 
-        A log has the times t (n,), s, and the states q, qd (n, nq); at a state jump, the state
-        before it.
+        An `EventLog` has the times t (n,), s, and the states q, qd (n, nq) at the occurrences. At a
+        state jump, the state is that before the jump.
         """
         which, rows = self._event_data
         nq, names = self._model.nq, self._model.events

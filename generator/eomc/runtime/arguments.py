@@ -87,7 +87,7 @@ class Params:
 
 
 class Arguments:
-    """Names and dimensions of a compiled scene, and the conversion of call arguments for C.
+    """Names and dimensions of a compiled scene, and methods that convert arguments for C.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Arguments:
     defaults : Mapping
         Value of each parameter in the scene, by name.
     units : dict of str
-        Units by name of the quantity.
+        Unit of each quantity, by the name of the quantity.
     nq, nu : int
         Numbers of coordinates and of inputs.
     """
@@ -398,7 +398,7 @@ class Arguments:
 class StateArguments:
     """Time, inputs and parameters of one or many states, checked and converted for C.
 
-    Each of the three may be common to all states or differ between them.
+    Each of these three arguments may be the same for all states or differ between them.
 
     Parameters
     ----------
@@ -407,7 +407,7 @@ class StateArguments:
     t : float or (n,) array
         Times, s.
     u : (nu,) or (n, nu) array, dict or None
-        Inputs; None: the scene's signals.
+        Inputs; None: the scene's signals (formulas for the inputs).
     params : dict, Params, array or None
         Parameters; None: those of the scene.
     replacement : (width,) or (n, width) array, optional
@@ -464,9 +464,11 @@ class StateArguments:
     def pointers(self, k: int) -> tuple[float, Any, Any, Any]:
         """Return the arguments of a C function that evaluates the states from number k on.
 
-        The result is (t, u, p, strides): the common time in s, pointers to the inputs and the
-        parameters of state k, and a pointer to a struct that says which of them differ between
-        states (NULL if none does; it also contains the times if these differ).
+        The result is (t, u, p, strides):
+        t: the common time of the states, s.
+        u, p: pointers to the inputs and to the parameters of state k.
+        strides: pointer to a struct that says which of the three differ between states; NULL if
+        none does. If the times differ, the struct contains them.
         """
         if not self.own:
             return self.t, self.u, self.p, self.own
@@ -482,8 +484,9 @@ class StateArguments:
 def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
     """Return the times of many states as an array (n,), s, or None if t is a single number.
 
-    rows: shape of the states without the coordinate axis: () for one state, (n,) for n states.
-    Raises ValueError if t is an array of another shape, or is not finite.
+    t: the caller's time or times. rows: shape of the states without the coordinate axis, () for one
+    state and (n,) for n states. Raises ValueError if t is an array of another shape than `rows`, or
+    is not finite.
     """
     if not (rows and np.ndim(t)):
         return None
@@ -575,13 +578,13 @@ def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
     Parameters
     ----------
     u : array_like, dict, callable or None
-        The argument u of a simulation. The tables in a dict, by name of the input, are all
-        shortened.
+        The argument u of a simulation. In a dict, which contains a table for each input by name,
+        all tables are shortened.
     nu : int
-        Number of inputs, the length of the table's last axis; 0: the table has no such axis, as
-        that of a single input in a dict.
+        Number of inputs, which is the length of the table's last axis. 0: the table has no such
+        axis, as is the case for the table of one input in a dict.
     whole, count : int
-        Numbers of rows.
+        Numbers of rows before and after.
     axis : int
         Axis of the rows: 0 for a single run, 1 for a batch, whose axis 0 is the instance.
     """
@@ -603,10 +606,11 @@ def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
 
 
 def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = None) -> None:
-    """Raise ValueError if floating-point times are too coarse for the steps of a run.
+    """Raise ValueError if floating-point numbers are too coarse for the times of a run.
 
-    dtype: number type of the module. t0: start of the run, s. span: its duration, s. h: size of
-    fixed steps, s; None: adaptive steps.
+    This is the case if the steps are too short compared with the times. dtype: number type of the
+    module. t0: start of the run, s. span: duration of the run, s. h: size of fixed steps, s; None:
+    adaptive steps.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         least = float(np.spacing(dtype.type(abs(t0) + abs(span))))
@@ -683,9 +687,10 @@ def machine_memory() -> float:
 
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
-    """Return the error message for an unknown `name` in the argument `argument`.
+    """Return the error message for an unknown `name` that a user gave.
 
-    The message lists the known names and suggests a similar one.
+    argument: name of the function's argument in which the user gave `name`. known: the allowed
+    names; the message lists them and suggests a similar one.
     """
     if not known:
         return f"{argument}: there is no '{name}': this scene has none"
@@ -693,9 +698,10 @@ def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
-    """Join start, the comma-separated parts and end to one line of at most `width` characters.
+    """Join `start`, the comma-separated `parts` and `end` to one line of text.
 
-    The last parts are replaced by "... N more" if they do not fit.
+    width: maximum number of characters. If the parts do not fit, the last ones are replaced by
+    "... N more".
     """
     whole = start + ", ".join(parts) + end
     if len(whole) <= width:

@@ -106,8 +106,9 @@ class _PowerSamples:
 def balance(run: Trajectory) -> Balance | None:
     """Return the energy balance of a run, or None if it cannot be computed.
 
-    It cannot be computed if the inputs are unknown, as those of a function u whose values are not
-    stored at each step, or if an energy or a force is not finite at a row.
+    The balance cannot be computed if an energy or a force is not finite at a row, or if the inputs
+    at the rows are unknown. They are unknown for inputs u(t, q, qd) that are not stored at each
+    step.
     """
     if not np.isfinite(run.jacobi).all():
         return None
@@ -258,10 +259,10 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
 
 
 def with_jumps(run: Any) -> Any:
-    """Return a run that has two rows at each state jump, before and after it.
+    """Return a run that has two rows at each state jump, one before and one after it.
 
-    This is the run itself, unless its rows are at requested times and it has events; then it is
-    repeated with a row after each step.
+    A run with events whose rows are at requested times is repeated with a row after each step. Any
+    other run is returned unchanged.
     """
     event_indices = getattr(run, "_event_data", ((),))[0]
     if not len(event_indices) or (np.diff(run.t) == 0).any():

@@ -44,7 +44,7 @@ _ENDS = np.array([*STATUS, FULL])
 class AdaptiveBatchRun(BatchRun):
     """Trajectories of many instances with adaptive steps, or with fixed steps and events.
 
-    All instances have rows at the same times. The attributes of `BatchRun` are supplemented by:
+    All instances have rows at the same times. The attributes are those of `BatchRun` and:
 
     Attributes
     ----------
@@ -54,11 +54,11 @@ class AdaptiveBatchRun(BatchRun):
         Numbers of evaluations of the accelerations, of rejected steps, and of steps by Newton's
         method of each instance.
     reached : (batch,) array
-        Time that each instance reached, s. Its later rows are nan, as after an event that stops it,
-        or after `max_evaluations` (status "too long").
+        Time that each instance reached, s. Rows at later times are nan. An instance ends early
+        after a failure, at an event that stops it, or after `max_evaluations` (status "too long").
     events : dict of BatchEventLog
-        Times t, states q, qd and instances of the occurrences of each event, by the event's name,
-        sorted by instance.
+        Occurrences of each event, by the event's name: times t, states q, qd and instances, sorted
+        by instance.
     """
 
     tol: float = field(kw_only=True)
@@ -136,14 +136,14 @@ class AdaptiveBatchRun(BatchRun):
     def limit(self) -> Array:
         """Return the time at which the events of each instance accumulate, (batch,), s.
 
-        Such an instance (status "accumulated") shows Zeno behaviour: its events follow one another
-        ever sooner. The time is nan for other instances.
+        Events accumulate if they follow one another ever sooner (Zeno behaviour); the status of
+        such an instance is "accumulated". The time is nan for all other instances.
         """
         return np.full(len(self), np.nan) if self._limit is None else self._limit
 
     @property
     def message(self) -> str:
-        """Return a sentence with the numbers of instances, of steps and of each status."""
+        """Return a sentence with the number of instances and steps, and how many have each status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -310,9 +310,10 @@ def _run(
 
 
 def no_signals(model: Instances, u: Any, control_period: Any) -> None:
-    """Raise ValueError if a batch has a control period but no inputs u, for a scene with inputs.
+    """Raise ValueError if a batch has a control period, but no inputs u, for a scene with inputs.
 
-    A batch cannot hold the scene's signals constant over control periods.
+    The scene's signals (formulas for the inputs) would then be the inputs. A batch cannot hold
+    signals constant over control periods.
     """
     if u is None and control_period is not None and model.nu:
         raise ValueError("control_period: a batch follows the signals: give u, a row a period")

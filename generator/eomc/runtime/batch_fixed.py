@@ -27,10 +27,10 @@ _INTERRUPTED = STATUS.index("interrupted")
 class TimedBatchRun(BatchRun):
     """Trajectories of many instances with fixed steps and rows at requested times.
 
-    The state at a time between two steps is computed by a shorter step from the first of them. Rows
-    after the last successful step of an instance are nan. The attribute `steps` (batch,) is the
-    number of steps of size h that each instance completed; the other attributes are those of
-    `BatchRun`.
+    A requested time may lie between two steps. The state there is computed by a shorter step that
+    begins at the earlier of the two. Rows after the last successful step of an instance are nan.
+    The attribute `steps` (batch,) is the number of steps of size h that each instance completed.
+    The other attributes are those of `BatchRun`.
     """
 
     _times: Array = field(kw_only=True)
@@ -69,7 +69,7 @@ class FixedStepRequest(NamedTuple):
     Attributes
     ----------
     step : C function
-        Function that steps a group of instances.
+        Function that advances a group of instances by steps.
     h, t0 : float
         Step size and start time, s.
     steps : int
@@ -77,16 +77,16 @@ class FixedStepRequest(NamedTuple):
     every : int
         Number of steps between two rows.
     times : (n,) array or None
-        Requested times of the rows, s. None: rows after every `every` steps.
+        Requested times of the rows, s. None: a row after each `every` steps.
     method : str
         Name of the method.
     threads : int or None
         Number of threads; None: one for each processor.
     progress : callable or None
-        Called with the numbers of completed and of all steps of all instances.
+        Called with the numbers of completed and of all steps, summed over all instances.
     codes : (batch,) array or None
-        Status of each initial state: not 0 if it cannot be moved onto the constraints. None if all
-        are 0.
+        Status number of each instance before the first step: 0, or the number of the failure if its
+        initial state cannot be moved onto the constraints. None if all are 0.
     """
 
     step: Any  # C function

@@ -14,7 +14,7 @@ from .starts import initial_state_for_parameters, is_by_name
 
 
 class Instances(Model):
-    """Compiled scene whose arguments may describe many instances, with a row for each of them."""
+    """Compiled scene whose methods accept arguments with one row for each of many instances."""
 
     def __init__(self, extension: Any, **scene: Any) -> None:
         super().__init__(extension, **scene)

@@ -18,13 +18,16 @@ _OF_ONE = {"phase", "section", "other", "labels"}
 
 
 def single_run_hint(runs: Any) -> str:
-    """Return a hint for messages: the call that repeats an instance of a batch as a single run."""
+    """Return a hint for error messages: the call that repeats one instance as a single run.
+
+    runs: the batch that contains the instance.
+    """
     name = runs._model.name
     return f"is of one run: {name}.simulate(runs.q[k, 0], runs.qd[k, 0], params=...)"
 
 
 class Fans:
-    """Mixin of `batch_run.BatchRun` with its plots and animations."""
+    """Mixin that adds plots and animations to `batch_run.BatchRun`."""
 
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),

@@ -89,18 +89,18 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def u(self) -> Array:
-        """Return the inputs applied at each row, (batch, n, nu), saturated at their limits.
+        """Return the inputs applied at each row, (batch, n, nu), limited to their allowed ranges.
 
-        These are the scene's signals at the row, or the constant inputs of the step that begins
-        there; the last row has the inputs of the last step.
+        At each row they are the values of the scene's signals, or the constant inputs of the step
+        that begins there. The last row has the inputs of the last step.
         """
         return self._within(self._requested_inputs)
 
     @property
     def saturated(self) -> Array:
-        """Return True for each input that exceeds its limits at a row, (batch, n, nu).
+        """Return whether each input exceeds its limits at each row, as a bool array (batch, n, nu).
 
-        Rows that are nan have False.
+        The inputs are compared before they are limited. Values are False at rows that are nan.
         """
         inputs = self._requested_inputs
         return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
@@ -168,7 +168,10 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Return the occurrences of events as a dict by name; empty for scenes without events."""
+        """Return the occurrences of each event as a dict by the event's name.
+
+        The dict is empty for scenes without events.
+        """
         return ByName("events", (), ())
 
     def _to_arrays(self) -> dict[str, Any]:
@@ -186,7 +189,7 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def message(self) -> str:
-        """Return a sentence with the numbers of instances, of steps and of each status."""
+        """Return a sentence with the number of instances and steps, and how many have each status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())
@@ -254,17 +257,17 @@ class BatchRun(Values, Fans, Columns):
 def initial_failures(run: BatchRun) -> Array:
     """Return the status number of each instance that failed at its initial state, (batch,).
 
-    All other instances have 0.
+    The number is 0 for all other instances.
     """
     return np.where((run.steps == 0) & (run._codes < STATUS.index("interrupted")), run._codes, 0)
 
 
 def stepper_for(run: BatchRun, both: Array, inputs: Array | None, first: int = 0) -> BatchStepper:
-    """Return a stepper that continues a batch with fixed steps from some of its states.
+    """Return a stepper that continues a batch with fixed steps from given states.
 
-    both: states [q, qd] of all instances after `first` steps, (2, batch, nq). inputs: inputs of the
-    steps, (batch or 1, steps or 1, nu); None: the scene's signals. Instances that failed at their
-    initial state make no step.
+    run: the batch. both: states [q, qd] of all instances after `first` steps, (2, batch, nq).
+    inputs: inputs of the steps, (batch or 1, steps or 1, nu); None: the scene's signals. The
+    stepper does not advance instances that failed at their initial state.
     """
     model: Any = run._model
     stepper = BatchStepper(model, run.method, both, run.t0, run.h, inputs, run._params, None, first)

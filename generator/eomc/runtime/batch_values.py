@@ -32,9 +32,9 @@ class Values:
 
     @property
     def energy(self) -> Array:
-        """Return the energy K + P of each instance at each row, (batch, n), J.
+        """Return the energy K + P (kinetic and potential) at each row, (batch, n), J.
 
-        The conserved quantity may be `jacobi` instead.
+        In a rotating frame, `jacobi` is conserved instead of the energy.
         """
         return self._evaluate(self._model.energy, ())
 
@@ -85,11 +85,12 @@ class Values:
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """Return the reaction of the joint of each [[loop]] on its second body, by the loop's name.
+        """Return the reaction of each loop's joint on its second body, by the loop's name.
 
-        A reaction is the force, N, and the moment about the joint's point, N m, along the axes of
-        the world: (batch, n, 6), or (batch, n, 3) for plane scenes, with two components of the
-        force and the moment.
+        A loop is a [[loop]] of the scene: a joint that closes a kinematic chain. Its reaction is
+        the force, N, and the moment about the joint's point, N m, along the axes of the world, as
+        an array (batch, n, 6). In plane scenes the array is (batch, n, 3), with two components of
+        the force and the moment.
         """
         model, loops = self._model, self._model.loops
         shape = (len(loops), 3 if model._plane else 6)

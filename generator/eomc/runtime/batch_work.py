@@ -24,15 +24,14 @@ _FIRST_POLL_SECONDS = 0.02  # before the first check
 
 
 class Work:
-    """Simulation of a batch with fixed steps.
+    """Simulation of a batch with fixed steps, by threads that process groups of instances.
 
-    Threads simulate groups of instances. Each group advances in chunks of steps, so that Ctrl-C is
-    handled between two calls of C.
+    Each group advances in chunks of steps, so that Ctrl-C is handled between two calls of C.
 
     Parameters
     ----------
     step : C function
-        Function that steps a group of instances.
+        Function that advances a group of instances by steps.
     q, qd : (batch, nq) arrays
         Current states, which are overwritten.
     h : float
@@ -85,7 +84,11 @@ class Work:
         return q + first, qd + first, q_rows + row, qd_rows + row
 
     def leave(self, codes: Array | None) -> None:
-        """Mark instances that make no step: set their status to `codes` (batch,) where not 0."""
+        """Exclude instances from the simulation whose initial state is already known to fail.
+
+        codes: status number of each instance (batch,). An instance with a number other than 0 gets
+        it as its status and makes no step. None: no instance is excluded.
+        """
         if codes is not None:
             self.status[codes != 0], self.failed = codes[codes != 0], True
 
@@ -182,7 +185,7 @@ class Work:
 
 
 class BatchStepper:
-    """Compute states of a batch at any times: by whole steps, and a shorter one to the time.
+    """Compute the states of a batch at any times, by whole steps and one shorter last step.
 
     Parameters
     ----------
@@ -199,7 +202,7 @@ class BatchStepper:
     starts : pair of (batch, nq) arrays, optional
         Initial states, which are copied to `both`; by default `both` contains them.
     first : int
-        Number of steps that have led to the current states.
+        Number of steps from t0 to the current states.
     """
 
     def __init__(
@@ -216,11 +219,15 @@ class BatchStepper:
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> bool:  # fmt: skip
-        """Advance to n times and write the states there; return False if Ctrl-C interrupted this.
+        """Advance the batch to n times and write its states there into arrays.
+
+        Return False if Ctrl-C interrupted the computation, else True. Rows that are not reached are
+        set to nan.
 
         places: for each time the number of whole steps before it (n,), ascending, and the remaining
-        time (n,), s. into: arrays for q and qd, (batch, n, nq) each. Rows that are not reached
-        become nan.
+        time (n,), s. into: arrays for q and qd, (batch, n, nq) each. threads: number of threads;
+        None: one for each processor. progress: called with the numbers of completed and of all
+        steps, summed over all instances.
         """
         work, (whole, rest) = self.work, places
         last = work.count * int(whole[-1])
