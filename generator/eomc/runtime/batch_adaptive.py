@@ -143,7 +143,7 @@ class AdaptiveBatchRun(BatchRun):
 
     @property
     def message(self) -> str:
-        """Return a sentence with the number of instances and steps, and how many have each status."""
+        """Return a sentence with the numbers of instances, of steps and of instances by status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         step_count = int(self.steps.sum())

@@ -9,13 +9,14 @@ from .arguments import not_one_of
 
 
 class ByName(dict[str, Any]):
-    """Dict of values by name; the KeyError for an unknown name lists the known names.
+    """Dict of values by name, whose KeyError for an unknown name lists the known names.
 
     Parameters
     ----------
     what : str
-        What the dict contains, such as "events", for the message of the error.
+        What the dict contains, such as "events"; part of the error message.
     names : sequence of str
+        The known names.
     values : iterable
         One value for each name.
     """

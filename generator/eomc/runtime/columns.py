@@ -196,9 +196,10 @@ class Columns:
 
 
 def imported(package: str, function: str) -> Any:
-    """Import an optional package for the function `function` and return the module.
+    """Import and return an optional package such as pandas.
 
-    Raises ModuleNotFoundError that says how to install the package if it is missing.
+    package: name of the package. function: name of the function that needs it, for the error
+    message. If the package is missing, ModuleNotFoundError says how to install it.
     """
     try:
         return import_module(package)

@@ -23,20 +23,23 @@ REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/
 
 
 class ConstraintRows(NamedTuple):
-    """Facts about the constraint equations of a scene and about its discrete coordinates.
+    """Facts about the constraint equations and the discrete coordinates of a scene.
+
+    A discrete coordinate is one that only state jumps change.
 
     Attributes
     ----------
     names : tuple of str
         Names of the constraint equations.
     loops : tuple of str
-        Names of the loops that have reactions.
+        Names of the loops (joints that close a kinematic chain) that have reactions.
     fixed : tuple of bool
-        For each of q, then of qd, whether the assembly of an initial state leaves it unchanged.
+        For each coordinate, then for each velocity: True if its initial value stays unchanged when
+        an initial state is assembled, that is, moved onto the constraints.
     holonomic : int
         Number of holonomic constraint equations, which come first.
     redundant : tuple of int
-        Indices of the constraint equations that follow from the others and are not solved for.
+        Indices of the constraint equations that follow from the others. Their multipliers are 0.
     modes : tuple of (int, int)
         For each Coulomb friction with sticking: the index of the coordinate that contains its mode
         (sticking, or the sliding direction), and that of the coordinate that slides. The modes are
@@ -55,22 +58,23 @@ class ConstraintRows(NamedTuple):
 
 
 class Constrained(Frames):
-    """Methods of a compiled scene on its constraint equations, from [constraints] and [[loop]].
+    """Methods of a compiled scene that concern its constraint equations.
 
-    In all methods q and qd are one state (nq,) or n states (n, nq). For n states the results have n
-    as an additional first axis, t may be an array (n,), and params may contain arrays (n,).
+    The equations come from [constraints] and [[loop]] of the scene. In all methods q and qd are one
+    state (nq,) or n states (n, nq). For n states the results have a first axis n, t may be an array
+    (n,), and values in params may be arrays (n,).
     """
 
     _rows = ConstraintRows()
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return the names of the constraint equations, in the order of results."""
+        """Return the names of the constraint equations, in the order in which results list them."""
         return self._rows.names
 
     @property
     def loops(self) -> tuple[str, ...]:
-        """Return the names of the loops that have reactions, in the order of results."""
+        """Return the names of the loops that have reactions, in the order in which results list them."""
         return self._rows.loops
 
     def constraints(

@@ -22,8 +22,9 @@ class ConstrainedRun:
     Attributes
     ----------
     singular_steps : int
-        Number of steps at whose end a constraint equation depends on others (a singular position).
-        Its multiplier is large or 0 there, and joint forces are not unique; the motion is correct.
+        Number of steps that end at a singular position, where a constraint equation depends on the
+        others. Its multiplier is large or 0 there, and joint forces are not unique. The motion is
+        correct nevertheless.
     first_singular : float
         End time of the first of these steps, s; nan if there is none.
     """
@@ -52,9 +53,10 @@ class ConstrainedRun:
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
-        """Return the Lagrange multiplier of each constraint at all rows, (n,), in a dict by name.
+        """Return the Lagrange multiplier of each constraint as a dict from name to array (n,).
 
-        Values are nan at rows where they do not exist. Raises KeyError for unknown names.
+        The array has a value for each row; nan where the multiplier does not exist. Raises KeyError
+        for unknown names.
         """
         names = self._model.constraint_names
         values = self._evaluate_with_inputs(self._model._multipliers).T if names else ()
@@ -62,11 +64,12 @@ class ConstrainedRun:
 
     @property
     def reactions(self) -> Mapping[str, Array]:
-        """Return the reaction of the joint of each [[loop]] on its second body, by the loop's name.
+        """Return the reaction of each loop's joint on its second body, by the loop's name.
 
-        A reaction is the force, N, and the moment about the joint's point, N m, at all rows, along
-        the axes of the world: (n, 6), or (n, 3) for plane scenes, with two components of the force
-        and the moment.
+        A loop is a [[loop]] of the scene: a joint that closes a kinematic chain. Its reaction is
+        the force, N, and the moment about the joint's point, N m, along the axes of the world, at
+        all rows: an array (n, 6). In plane scenes the array is (n, 3), with two components of the
+        force and the moment.
         """
         loops = self._model.loops
         if not loops:

@@ -28,11 +28,11 @@ def within(run: Any, t: ArrayLike) -> Array:
 
 
 def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
-    """Return the positions and velocities of a run with fixed steps at any times within it.
+    """Return the positions and velocities of a run with fixed steps at any times within the run.
 
-    A shorter step of the run's method, from the last step before each time, yields the state. Its
-    error has the order of the method if the forces are smooth. Inputs are constant over the same
-    steps as in the run.
+    The state at a time is computed by a shorter step of the same method from the last step before
+    that time. Its error has the order of the method if the forces are smooth. Inputs are constant
+    over the same steps as in the run.
 
     Parameters
     ----------
@@ -59,10 +59,10 @@ def states(run: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
 
 
 def parts(times: Array, t0: float, h: float, most: int = 2**60) -> tuple[Array, Array]:
-    """Return the number of whole steps before each of `times` (n,), and the remaining time, s.
+    """Split times into a number of whole steps from t0 and a remaining time, both (n,).
 
-    Both results have the shape (n,). t0: start of the run, s. h: step size, s. most: largest number
-    of steps, as of the run.
+    times: (n,), s. t0: start of the run, s. h: step size, s. most: largest number of steps, such as
+    the number of steps of the run. The remaining time is in s.
     """
     steps = (times - t0) / h
     near = _STEP_TOLERANCE + 4 * np.finfo(float).eps * steps  # times are rounded

@@ -21,22 +21,24 @@ def discretize(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the derivatives of the state after a step with respect to the state and the inputs.
 
-    With x = [q; qd], a small change of the state and the inputs changes the next state by
-    dx_next = Phi dx + Gamma du.
+    A small change of the state x = [q; qd] before the step, dx, and of the inputs, du, changes the
+    state after the step by dx_next = Phi dx + Gamma du.
 
     Parameters
     ----------
     method : str
         Name of the integration method.
     q, qd : (nq,) or (n, nq) arrays
-        State, or n states, already checked.
+        State before the step, or n states, already checked.
     h : float
         Step size, s.
     hold : int or None
-        Number of steps, over which the inputs are constant. None: one step.
+        Number of steps over which the inputs are constant and whose total effect is differentiated.
+        None: one step.
     t, u, params
         Time, inputs and parameters: the same for all states, or a row for each state. If u is None,
-        the inputs are the scene's signals: within the step, or with `hold` at its start.
+        the inputs are the scene's signals (formulas for the inputs). They are evaluated within the
+        step, or with `hold` only at the start of the first step.
 
     Returns
     -------

@@ -82,10 +82,11 @@ class Motion(NamedTuple):
 
 
 def drive_forces(model: Constrained, which: list[int], motion: Motion) -> tuple[Array, Array]:
-    """Separate the forces that a motion requires into actuator and constraint forces, at one state.
+    """Separate the forces that a motion requires into actuator and constraint forces.
 
-    Solve tau + A^T lambda = force. If the solution is not unique, tau minimises tau^T D^-1 tau,
-    which does not depend on the units of the coordinates.
+    The solution (tau, lambda) satisfies tau + A^T lambda = force at one state. If it is not unique,
+    the one with the smallest tau^T D^-1 tau is returned, which does not depend on the units of the
+    coordinates.
 
     Parameters
     ----------

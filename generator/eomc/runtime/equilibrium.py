@@ -26,7 +26,7 @@ _Function = Callable[[Array], Array]
 
 
 class Equilibrium(NamedTuple):
-    """State and inputs at which the accelerations are zero, or a steady motion.
+    """State and inputs of an equilibrium (all accelerations are zero) or of a steady motion.
 
     Attributes
     ----------
@@ -50,15 +50,18 @@ def equilibrium(
 ) -> Equilibrium:  # fmt: skip
     """Solve tau + A^T lambda = C qd + g for the variables in `free`, by Newton's method.
 
-    q, qd, u: initial guess of the variables in `free`, and the values of all other variables. u
-    None: the scene's signals. free: names of coordinates, velocities (such as "theta_dot") and
-    inputs. Raises MotionError if no solution is found, ValueError for an unknown name.
+    q, qd, u: initial guess of the variables in `free`, and the values of all other variables. If u
+    is None, the inputs are the scene's signals. free: names of coordinates, velocities (such as
+    "theta_dot") and inputs. t: time, s. Raises MotionError if no solution is found, ValueError for
+    an unknown name.
 
     The residual is a force, not an acceleration, since D may be singular. The Jacobian is a finite
     difference; its error slows convergence but does not affect the result. Newton steps of
-    underdetermined systems are those of minimum norm. With constraints, the residual consists of
-    the forces that multipliers cannot balance, the residuals of the velocity constraints and the
-    time derivatives of these; steps are tangent to the position constraints.
+    underdetermined systems are those of minimum norm.
+
+    With constraints, the residual has three parts: the forces that multipliers cannot balance, the
+    residuals of the velocity constraints, and the time derivatives of these residuals. Steps are
+    tangent to the position constraints.
     """
     n, known = model.nq, (*model._states, *model.inputs)
     if strange := [name for name in free if name not in known]:
@@ -82,7 +85,10 @@ def equilibrium(
         return values
 
     def residual(z: Array) -> Array:
-        """Return what Newton's method reduces to zero at z."""
+        """Return the residual at z = [q; qd; u], the vector that Newton's method reduces to zero.
+
+        It is tau - C qd - g (nq,) without constraints, else `_Rows.residual`, (nq + 2 nc,).
+        """
         return rows.residual(z, forces(z)) if rows else forces(z)
 
     eps = float(np.finfo(model.dtype).eps)
@@ -94,7 +100,7 @@ def equilibrium(
         return matrix.astype(float)
 
     def directions(z: Array) -> Array:
-        """Return the directions (k, len(z)) in which z may change."""
+        """Return the directions (k, len(z)) in which z = [q; qd; u] may change, one in each row."""
         return rows.tangent_basis(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
 
     z, downhill, tried = onto(z), None, list[tuple[Array, Array]]()
@@ -277,7 +283,7 @@ class _Rows:
     def tangent_basis(self, z: Array) -> Array:
         """Return an orthonormal basis (k, len(z)) of directions in which z = [q; qd; u] may change.
 
-        Free coordinates change tangentially to the position constraints; each free velocity or
+        Free coordinates change tangentially to the position constraints. Each free velocity or
         input adds one direction.
         """
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
@@ -288,11 +294,13 @@ class _Rows:
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
     def residual(self, z: Array, forces: Array) -> Array:
-        """Return the part of `forces` that multipliers cannot balance, and the velocity residuals.
+        """Return the three parts of the residual of a scene with constraints, joined to one vector.
 
-        z: [q; qd; u]. forces: tau - C qd - g at z, (nq,). The result concatenates the part of the
-        forces that no A^T lambda can balance (nq,), the residuals of the velocity constraints
-        (nc,), and their time derivatives at constant velocities (nc,), by a central difference.
+        z: [q; qd; u]. forces: tau - C qd - g at z, (nq,). The parts are:
+        the part of `forces` that no A^T lambda can balance, (nq,);
+        the residuals of the velocity constraints, (nc,);
+        the time derivatives of these residuals, for constant velocities, (nc,), as a central
+        difference.
         """
         A, (q, qd) = self._slopes(z), self._halves(z)
         forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
@@ -304,9 +312,10 @@ class _Rows:
         return np.concatenate([forces, now, (then - before) / (2 * short)])
 
     def sizes(self, z: Array) -> Array:
-        """Return the magnitudes (2 nc,) of the terms of the velocity residuals and their rates.
+        """Return the magnitudes (2 nc,) of the terms in the last 2 nc entries of `residual`.
 
-        They are the scales of the last 2 nc entries of `residual`; z: [q; qd; u].
+        These entries are the residuals of the velocity constraints and their time derivatives. The
+        magnitudes are the scales of these entries. z: [q; qd; u].
         """
         sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
         return np.concatenate([sizes, sizes * self._pace(z)])

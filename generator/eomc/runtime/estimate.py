@@ -29,35 +29,37 @@ _ROUNDING_RMS = 0.3  # rms rounding error of a sum, relative to eps/2 times its 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Error estimate of a run, by repetition in shorter steps, and its reliability.
+    """Error estimate of a run, from repetitions with shorter steps, and its reliability.
 
     Attributes
     ----------
     q, qd : (n, nq) arrays
         Estimates of |q - exact| and |qd - exact| at every row of the run, in the units of the
-        coordinates and per s; inf where a run in shorter steps stopped before the row.
+        coordinates and per s; inf where a run with shorter steps stopped before the row.
     end : dict
-        The same at the last row, by name; velocities have names such as "theta_dot".
+        The same estimates at the last row, by name; velocities have names such as "theta_dot".
     digits : dict
-        Number of correct decimal digits at the last row, by name: -log10 of the error relative to
-        the scale of the variable, its largest absolute value along the run.
+        Number of correct decimal digits at the last row, by name. It is -log10 of the error divided
+        by the scale of the variable, which is its largest absolute value along the run.
     order : int
         Order of the method.
     observed : float
         Observed order: log2 of the factor by which halving h reduces the differences between runs;
-        nan if these are rounding errors.
+        nan if these differences are rounding errors.
     amplification : float
         Largest factor by which the motion multiplies a small difference of the initial states until
-        the end of the run, in the norm |d|^2 = dqd' D dqd + (dq/T)' D (dq/T) with the mean mass
-        matrix D and times T = |dq|/|dqd| (docs/python.md). It is 1 for a harmonic oscillator. It is
-        a lower bound if the difference becomes as large as the motion itself.
+        the end of the run. It is 1 for a harmonic oscillator. It is a lower bound if the difference
+        becomes as large as the motion itself. The norm of a difference d = [dq; dqd] is
+        |d|^2 = dqd' D dqd + (dq/T)' D (dq/T) with the mean mass matrix D and the times
+        T = |dq|/|dqd| (docs/python.md).
     verdict : str
         The reasons why the motion is not resolved; "" if it is resolved.
     events : mapping
-        Error in time of each occurrence of an event, (n,), s, by the event's name; inf if a run in
-        shorter steps does not detect it.
+        Error in time of each occurrence of an event, (n,), s, by the event's name; inf if a run
+        with shorter steps does not detect it.
     missed : mapping
-        Times (n,), s, by the event's name, of occurrences that only a run in shorter steps detects.
+        Times (n,), s, of occurrences that only a run with shorter steps detects, by the event's
+        name.
     """
 
     q: Array
@@ -73,12 +75,12 @@ class Estimate:
 
     @property
     def resolved(self) -> bool:
-        """True if the motion is resolved, that is if `verdict` is empty."""
+        """True if the run resolves the motion, that is, if `verdict` is empty."""
         return not self.verdict
 
     @property
     def warning(self) -> str:
-        """Text of a warning if the motion is not resolved, else ""."""
+        """Text of a warning that the run does not resolve the motion; "" if it does."""
         return f"this motion is not resolved: {self.verdict}" if self.verdict else ""
 
     def __str__(self) -> str:
@@ -95,13 +97,13 @@ class Estimate:
 
 
 def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None) -> Estimate:
-    """Estimate the error of a run, from repetitions at h/2, h/4 and finer until they converge.
+    """Estimate the error of a run by repeating it with steps h/2, h/4 and so on until convergence.
 
-    progress: function that is called with (completed steps, expected number of
-    steps). The error of the finest
-    repetition follows from the last difference and the observed order. The estimate is at least the
-    accumulated rounding error. The cost is eight to twelve times that of the run, or forty times if
-    the repetitions do not converge.
+    The error of the finest repetition follows from the last difference and the observed order. The
+    estimate is at least the accumulated rounding error. The cost is eight to twelve times that of
+    the run, or forty times if the repetitions do not converge.
+
+    progress: function that is called with (completed steps, expected number of steps).
     """
     if not run.steps:
         return _zero_error(run)
@@ -215,7 +217,7 @@ def growth_of(
 ) -> float:  # fmt: skip
     """Return the factor by which a motion multiplies small differences of its initial state.
 
-    The factor is the largest one over given differences and further directions, in the norm of the
+    It is the largest factor over the given differences and further directions, in the norm of the
     module `growth`.
 
     Parameters
@@ -231,8 +233,8 @@ def growth_of(
     place : tuple
         Initial state (2 nq,), initial time, s, and parameters.
     moved : callable
-        Function from a perturbation (2 nq,) of the initial state to the difference along the
-        motion.
+        Function that repeats the run from a perturbed start. It takes the perturbation (2 nq,) of
+        the initial state and returns the resulting differences of the states, (rows, 2 nq).
     """
     n, (start, t0, p) = model.nq - len(model.discrete_coordinates), place
     free = [*range(n), *range(model.nq, model.nq + n)]
@@ -335,21 +337,26 @@ def _counts(run: Trajectory, every: int, rows: int) -> Array:
 
 
 def moving_mask(model: Stepping) -> Array:
-    """Return (2 nq,): 1 for states that are perturbed, 0 for those that only jumps change."""
+    """Return a mask (2 nq,) of the states [q; qd]: 1 for those that may be perturbed, else 0.
+
+    States that only jumps change may not be perturbed.
+    """
     return np.tile(np.arange(model.nq) < model.nq - len(model.discrete_coordinates), 2).astype(
         float
     )
 
 
 def scales(x: Array, duration: float, eps: float, discrete: int = 0) -> Array:
-    """Return the scale (2 nq,) of each column of states x (rows, 2 nq): its largest absolute value.
+    """Return the scale (2 nq,) of each column of the states x, (rows, 2 nq).
 
-    duration: of the run, s. eps: unit roundoff. discrete: number of coordinates, the last ones,
-    that only jumps change; they have scales of their own.
+    A scale is the largest absolute value of the column, but at least a millionth of the largest
+    position (for positions) or velocity (for velocities). If all positions, or all velocities, are
+    0, the largest of all states takes the place of their largest value. At rest, velocities change
+    no position beyond its rounding error during the run; the scale of velocities is then the
+    largest position divided by the duration.
 
-    A scale is at least a millionth of the largest position, or velocity, or of the largest state if
-    all of these are 0. At rest, where velocities change no position beyond its rounding error
-    during the run, the scale of velocities is the largest position divided by the duration.
+    duration: of the run, s. eps: unit roundoff. discrete: number of the last coordinates, which
+    only jumps change; their scale is their own largest absolute value, or 1 if that is 0.
     """
     whole = np.max(np.abs(x), axis=0).reshape(2, -1)
     n = whole.shape[1] - discrete
@@ -390,10 +397,10 @@ def _padded(run: Trajectory, rows: int, every: int) -> Array:
 
 
 def rounding_words(model: Stepping, amplification: float, t_limit: float) -> str:
-    """Return the sentence of a verdict on rounding errors that exceed a tenth of the motion.
+    """Return a sentence that says from which time on rounding errors exceed a tenth of the motion.
 
-    amplification: as in `Estimate`; a large one is reported as chaos. t_limit: time, s, from which
-    the rounding errors are that large.
+    It is part of `Estimate.verdict`. model: the scene, whose number type is named. amplification:
+    as in `Estimate`; for a large one the sentence calls the motion chaotic. t_limit: the time, s.
     """
     if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
         return (

@@ -86,9 +86,10 @@ class BatchEventLog(EventLog):
 
 
 class BatchEventBuffer:
-    """Collect the events of all instances of a batch from the calls of C functions in all threads.
+    """Collect the events of all instances of a batch.
 
-    most: largest number of events that fit in memory.
+    Several threads call C functions, each of which writes events into a buffer of its own; `keep`
+    copies them. most: largest number of events that fit in memory.
     """
 
     def __init__(self, model: ModelInfo, most: float) -> None:
@@ -96,13 +97,13 @@ class BatchEventBuffer:
         self.pieces = list[tuple[Array, Array, Array]]()
 
     def room(self, count: int) -> GroupEventBuffer:
-        """Return a new buffer for a call of C with `count` instances."""
+        """Return a new, empty buffer for one call of C, which simulates `count` instances."""
         return GroupEventBuffer(self.model, count)
 
     def keep(self, room: GroupEventBuffer, first: int) -> None:
-        """Copy the events that a call of C wrote to the buffer `room`.
+        """Copy the events that a call of C wrote into its buffer.
 
-        first: index in the batch of the first instance of that call.
+        room: the buffer. first: index in the batch of the first instance of that call.
         """
         some = np.arange(room.which.shape[1]) < room.counts[:, None]
         if some.any():
@@ -111,13 +112,14 @@ class BatchEventBuffer:
 
     @property
     def full(self) -> bool:
-        """True if the events exceed the number that fits in memory."""
+        """True if the collected events exceed the number that fits in memory."""
         return self.count > self.most
 
     def all(self) -> tuple[Array, Array, Array]:
-        """Return the instances (n,), event indices (n,) and rows (n, 1 + 2 nq) of all events.
+        """Return the instances (n,), event indices (n,) and rows (n, 1 + 2 nq) of all occurrences.
 
-        Each row is [t, q, qd]. The events are sorted by instance.
+        A row is [t, q, qd]. The occurrences are sorted by instance. An event index is the position
+        of the event's name in `events` of the model.
         """
         none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.nq))
         parts = zip(*self.pieces, strict=True) if self.pieces else [[x] for x in none]
@@ -129,8 +131,16 @@ class BatchEventBuffer:
 class GroupEventBuffer:
     """Buffer into which one call of a C function writes the events of `count` instances.
 
-    counts: number of events of each instance, (count,). which, rows: index of each event, and its
-    time and state [t, q, qd]. given: the arguments of the C function.
+    Attributes
+    ----------
+    counts : (count,) array
+        Number of events of each instance.
+    which : (count, capacity) array
+        Index of each event in `events` of the model.
+    rows : (count, capacity, 1 + 2 nq) array
+        Time and state [t, q, qd] of each event.
+    given : tuple
+        The arguments of the C function: the capacity, and pointers to these three arrays.
     """
 
     def __init__(self, model: ModelInfo, count: int) -> None:
@@ -146,7 +156,10 @@ class GroupEventBuffer:
 
 
 class EventBuffer:
-    """Collect the events of a run: a buffer for one call of C, and copies from all calls so far."""
+    """Collect the events of a single run.
+
+    One call of C writes into a buffer, from which `keep` copies the events.
+    """
 
     def __init__(self, model: ModelInfo) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
@@ -154,13 +167,16 @@ class EventBuffer:
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
 
     def room(self) -> tuple[Any, ...]:
-        """Return the arguments of the C function: capacity, event indices and rows [t, q, qd]."""
+        """Return the arguments with which a C function writes events into the buffer.
+
+        They are the capacity, a pointer to the event indices and a pointer to the rows [t, q, qd].
+        """
         address, real, _ = self.model._c
         which = self.model._ffi.from_buffer("int[]", self.which)
         return len(self.which), which, address(real, self.rows)
 
     def keep(self, work: Any) -> None:
-        """Copy the events that the last call of C wrote.
+        """Copy the events that the last call of C wrote into the buffer.
 
         work: workspace of the C function; its number of events is reset to 0.
         """
@@ -169,7 +185,10 @@ class EventBuffer:
             self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
 
     def all(self) -> tuple[Array, Array]:
-        """Return the event indices (n,) and rows [t, q, qd] (n, 1 + 2 nq) of all calls so far."""
+        """Return the event indices (n,) and rows (n, 1 + 2 nq) of all n events copied so far.
+
+        A row is [t, q, qd].
+        """
         if not self.pieces:
             return self.which[:0], self.rows[:0]
         which, rows = zip(*self.pieces, strict=True)
