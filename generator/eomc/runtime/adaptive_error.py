@@ -206,10 +206,11 @@ class _Rerun:
         return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
 
     def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
-        """Repeat the run and return the new states [q; qd] at `times`, (m, 2 nq).
+        """Repeat the run from another start and return its states [q; qd] at `times`, (m, 2 nq).
 
-        The arguments are those of a call of this object. States after an early end of the new run
-        are nan.
+        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s; 0 for no limit.
+        steps: number of steps after which the new run ends early. States after an early end are
+        nan.
         """
         own, start, times = self.own, start.astype(self.own._model.dtype), self.times
         out = np.full((len(times), self.x.shape[1]), np.nan)
@@ -221,9 +222,10 @@ class _Rerun:
         return out
 
     def at_rows(self, states: Array) -> Array:
-        """Select from states at `times`, (m, 2 nq), those at the rows of the run, (n, 2 nq).
+        """Select from the states at `times`, (m, 2 nq), those at the rows of the run, (n, 2 nq).
 
-        A row at a jump gets the state of the last row before that is not at a jump.
+        At a row next to a state jump, the state at the last row before that is not next to a jump
+        is taken.
         """
         out = np.full_like(self.x, np.nan)
         out[self.own.t == self.own.t0] = states[0]
@@ -233,9 +235,8 @@ class _Rerun:
     def finer(self, begin: Array, least: float) -> tuple[Array, AdaptiveTrajectory | None]:
         """Repeat the run with a tighter tolerance and shorter steps, as the reference run.
 
-        begin: initial state [q; qd]. least: smallest tolerance of the module. The result is that
-        of a call of this object: the states at the rows of the original run, (n, 2 nq), and the
-        new run.
+        Return the states of the new run at the rows of the original run, (n, 2 nq), and the new run
+        itself. begin: initial state [q; qd]. least: smallest tolerance of the module.
         """
         own, end = self.own, None
         if own.stopped:  # shorter steps may detect that event later, or not at all
@@ -276,12 +277,13 @@ class _Events:
         """Pair the events of a run with those of a reference run and return their differences.
 
         Events are compared up to the time at which the states of the two runs differ by a tenth of
-        the motion. Two events count as the same one if they are nearest to one another in time, and
-        not further apart than a step, or than the time shift that the difference of the states
-        implies.
+        the motion. Two events count as the same event under two conditions. They are nearest to one
+        another in time. Their distance in time is at most a step, or at most the time shift that
+        the difference of the states implies.
 
         own: the run. other: the reference run, None if there is none. left: absolute difference of
-        the states at the rows, (n, 2 nq). scale: magnitude of the motion in each state, (2 nq,).
+        the states of both runs at the rows, (n, 2 nq). scale: magnitude of the motion in each
+        state, (2 nq,).
         """
         names = own._model.events
         if other is None or not names:

@@ -74,7 +74,7 @@ class Constrained(Frames):
 
     @property
     def loops(self) -> tuple[str, ...]:
-        """Return the names of the loops that have reactions, in the order in which results list them."""
+        """Return the names of the loops that have reactions, in the order of the reactions."""
         return self._rows.loops
 
     def constraints(

@@ -25,9 +25,19 @@ def simulate(
 ) -> SteppedRun:  # fmt: skip
     """Simulate by fixed steps with event detection, and return the run.
 
-    The arguments are those of `Model.simulate`. fixed: (h, steps, method, every, out).
-    check_stability: function that warns if h is beyond the stability limit. Raises ValueError for
-    invalid arguments.
+    Parameters
+    ----------
+    fixed : tuple
+        The arguments (h, steps, method, every, out) of `Model.simulate`.
+    check_stability : callable
+        Function that issues a warning if h is beyond the stability limit.
+
+    The other arguments are those of `Model.simulate`.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
     """
     h, steps, method, every, out = fixed
     if out is not None:
@@ -67,11 +77,13 @@ def as_rows(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, *, listed: bool = False,
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """Return the times (n,) of the rows of a run, s, and the span of the run, s.
+    """Return the times (n,) of the rows of a run, s, and the time from its start to its end, s.
 
-    The times are None if there is a row after each step, unless `listed` is True. times: output
-    times given by the user, or None for a row after every `every` steps. Raises ValueError if
-    arguments exclude each other.
+    If there is a row after each step, the times are None, unless `listed` is True.
+
+    times: times of the rows that the user requests; None: a row after every `every` steps. The
+    other arguments are those of `Model.simulate`. Raises ValueError if arguments exclude each
+    other.
     """
     every = as_count(every, "every", 1)
     if times is not None:
@@ -90,9 +102,11 @@ def as_rows(
 
 
 def as_hold(u: Any, control_period: float | None, h: float) -> float | None:
-    """Return the time over which inputs are constant, s, a whole number of steps of size h.
+    """Return the time over which the inputs of a run with fixed steps are constant, s.
 
-    None if the inputs are the scene's signals (u is None) without a control period.
+    It is the control period, a whole number of steps, or one step if there is none. Return None if
+    u and the control period are None: the inputs are then the scene's signals, which vary within
+    steps. u: the inputs that the user gives. h: step size, s.
     """
     if u is None and control_period is None:
         return None

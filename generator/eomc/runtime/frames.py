@@ -180,15 +180,16 @@ class Frames(Functions):
         self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """Return the generalized forces of wrenches on frames: the sum of J^T w.
+        """Return the generalized forces, the sum of J^T w, of wrenches w (force, moment) on frames.
 
         Parameters
         ----------
         q : (nq,) or (n, nq) array_like
             Generalized coordinates.
         wrenches : mapping or array_like
-            Wrenches by the frame's name, (6,) or (n, 6) each, or those of all frames, (nf, 6); in
-            plane scenes 3 instead of 6. Force at the frame's origin, N, then moment, N m.
+            Wrenches by the frame's name, (6,) or (n, 6) each, or those of all frames, (nf, 6). In
+            plane scenes they have 3 components instead of 6. A wrench is the force at the frame's
+            origin, N, then the moment, N m.
         t, params
             Time, s; parameters that differ from the scene's.
 
@@ -207,18 +208,19 @@ class Frames(Functions):
         f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
-        """Return the generalized force D qdd + C qd + g - sum(J^T f_ext) that a motion requires.
+        """Return the generalized force that a motion requires: D qdd + C qd + g - sum(J^T f_ext).
 
-        The evaluation is recursive, without D. The force is the sum of all forces along the
-        coordinates, including friction: drives must supply it minus `tau` at u = 0. With
-        constraints it equals tau + A^T lambda; `drive_forces` separates the two.
+        It is the sum of all forces along the coordinates, including friction. Drives must supply
+        this force minus the force `tau` at u = 0. With constraints it equals tau + A^T lambda;
+        `drive_forces` separates the two terms. The evaluation is recursive and does not form D.
 
         Parameters
         ----------
         q, qd, qdd : (nq,) or (n, nq) array_like
             State and accelerations.
         f_ext : mapping or array_like, optional
-            External wrenches on frames, in the form of `wrenches` in `frame_forces`.
+            External wrenches (force and moment) on frames, in the form of `wrenches` in
+            `frame_forces`.
         t, params
             Time, s; parameters that differ from the scene's.
 

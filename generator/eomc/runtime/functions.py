@@ -23,10 +23,14 @@ _ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at mo
 
 
 class StateFunction(NamedTuple):
-    """Shape of the result of a function of the state, and whether the function takes qd.
+    """Facts about a function of the state, such as D or energy.
 
-    shape: returns the shape of the result at one state, from the model. of_velocity: whether the
-    generated C function takes the velocities qd as well as q.
+    Attributes
+    ----------
+    shape : callable
+        Function that takes the model and returns the shape of the result at one state.
+    of_velocity : bool
+        Whether the generated C function takes the velocities qd as well as q.
     """
 
     shape: Callable[[Any], tuple[int, ...]]
@@ -213,21 +217,24 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """Return the generalized force tau = Q - dR/dqd of the inputs, friction and other forces.
+        """Return the generalized force tau of the inputs, friction and other forces, except gravity.
+
+        tau = Q - dR/dqd, where Q are the applied forces and R is the dissipation function. Forces
+        that derive from the potential energy P are in `g` instead.
 
         Parameters
         ----------
         q, qd : (nq,) or (n, nq) array_like
             State.
         u : (nu,) or (n, nu) array_like or mapping, optional
-            Inputs; by default the signals of the scene.
+            Inputs; by default the signals of the scene (its formulas for the inputs).
         t, params, out
             Time, s; parameters that differ from the scene's; array that receives the result.
 
         Returns
         -------
         (nq,) or (n, nq) array
-            Generalized forces, N or N m; Q are the applied forces, R is the dissipation function.
+            Generalized forces, N or N m.
         """
         return self._evaluate("tau", q, qd, t, u, params, out)
 
@@ -275,14 +282,17 @@ class Functions(Arguments):
 
     @property
     def has_jacobi(self) -> bool:
-        """True if Jacobi's integral differs from the energy: K is not purely quadratic in qd."""
+        """True if Jacobi's integral differs from the energy.
+
+        They differ if the kinetic energy K is not purely quadratic in qd.
+        """
         return hasattr(self._lib, "jacobi")
 
     @property
     def has_power(self) -> bool:
         """True if forces or explicit time dependence may change the energy (or Jacobi's integral).
 
-        Otherwise `power` is always zero.
+        If False, `power` is always zero.
         """
         return hasattr(self._lib, "power")
 
@@ -290,9 +300,11 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """Return the power d(jacobi)/dt of inputs, friction, other forces and driven supports, W.
+        """Return the power, W, by which forces change the energy.
 
-        `jacobi` is the energy if K is purely quadratic in qd.
+        It is the power of inputs, friction, other forces and driven supports. If the kinetic energy
+        K is not purely quadratic in qd, it is the rate of change of Jacobi's integral (see
+        `jacobi`) instead of the energy.
 
         Parameters
         ----------

@@ -34,10 +34,11 @@ def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Arra
 
 
 def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
-    """Return the matrix W (2n, 2n) with which the norm of a difference d = [dq; dqd] is |W d|.
+    """Return the matrix W (2n, 2n) that defines the norm |W d| of a difference d = [dq; dqd].
 
-    D: mean mass matrix (n, n). differences: arrays (rows, 2n) of differences along the motion, from
-    which the times T follow. duration: largest time T, s.
+    |W d|^2 = dqd' D dqd + (dq/T)' D (dq/T). D: mean mass matrix (n, n). differences: arrays
+    (rows, 2n) of differences along the motion. The time T of each coordinate is the median of
+    |dq|/|dqd| in these, at most `duration`, s.
     """
     values, vectors = np.linalg.eigh((D + D.T) / 2)
     values = np.maximum(values, _DEFINITE * max(float(values[-1]), np.finfo(float).tiny))
@@ -55,10 +56,11 @@ def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
 
 
 def growth(root: Array, first: Array, last: Array) -> float:
-    """Return the largest growth factor of differences, from initial to final ones.
+    """Return the largest factor by which differences of states grow between two times.
 
-    The maximum is over all linear combinations of the k columns of `first` (2n, k), which become
-    those of `last` (2n, k); inf if a value is not finite. root: matrix W (2n, 2n) of `norm_root`.
+    first, last: k differences at the first and at the last time, (2n, k), a column for each. The
+    maximum is over all linear combinations of the columns; inf if a value is not finite. root:
+    matrix W (2n, 2n) of `norm_root`, which defines the norm.
     """
     if not (np.isfinite(first).all() and np.isfinite(last).all()):
         return float("inf")
@@ -68,10 +70,11 @@ def growth(root: Array, first: Array, last: Array) -> float:
 
 
 def other_directions(root: Array, first: Array, moves: Array, rank: int) -> list[Array]:
-    """Return initial differences (2n,), as large as `first` (2n,) and orthogonal to it in the norm.
+    """Return further initial differences, (2n,) each, that are orthogonal to `first` (2n,).
 
-    root: matrix W (2n, 2n) of `norm_root`. moves (2n,): 1 for states that may differ, else 0. rank:
-    dimension of the space of differences.
+    They are also orthogonal to each other, and as large as `first`, in the norm of `root`, the
+    matrix W (2n, 2n) of `norm_root`. moves (2n,): 1 for states that may differ, else 0. rank:
+    dimension of the space of differences; there are fewer than `rank` results.
     """
     random, directions = np.random.default_rng(2), [first]
     size = float(np.linalg.norm(root @ first))

@@ -13,8 +13,8 @@ from .trajectory_data import Trajectory
 def infinite_at_start(run: Trajectory) -> str:
     """Return a sentence that names the quantity that is not finite at the initial state of a run.
 
-    Returns "" if all accelerations are finite there or the run made a step. An energy that
-    overflows while the accelerations are finite does not end a run.
+    The quantity is the potential energy, the kinetic energy or an acceleration. Return "" if all
+    accelerations are finite there, or if the run made a step.
     """
     if run.status != "not finite" or run.steps or not len(run):
         return ""

@@ -28,11 +28,12 @@ class ZeroOrderHold:
     Attributes
     ----------
     source : callable or (n, nu) array
-        Function u(t, q, qd) that is called at the start of each period, or a row for each period.
+        Function u(t, q, qd) that is called at the start of each period, or an array with a row for
+        each period.
     period : float
         Control period, s.
     count : int
-        Number of periods of the run, the last of which may be shorter.
+        Number of periods of the run. The last period may be shorter.
     """
 
     source: Callable[..., Any] | Array  # rows: (n, nu)
@@ -41,9 +42,10 @@ class ZeroOrderHold:
 
 
 def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array) -> Array:
-    """Return the row of `values` (..., n, nu) that applies at each of `times` (m,): (..., m, nu).
+    """Return the values at times (m,) of inputs that are constant over periods, (..., m, nu).
 
-    Row k of `values` applies from t0 + k period on, until the next one; times and period in s.
+    values: inputs (..., n, nu). Row k applies from the time t0 + k period until row k + 1 applies.
+    times, t0, period: in s.
     """
     starts = np.asarray(t0 + period * np.arange(values.shape[-2]), times.dtype)
     index = np.searchsorted(starts, times, side="right") - 1
@@ -54,9 +56,7 @@ def input_schedule(
     model: ModelInfo, u: Any, control_period: float | None, span: float, params: Any,
     duration: float | None = None,
 ) -> Array | ZeroOrderHold | None:  # fmt: skip
-    """Check the inputs of an adaptive run and return them in the form that `InputSchedule` takes.
-
-    Returns None for the scene's signals, (nu,) for constant inputs, else a ZeroOrderHold.
+    """Check the inputs of an adaptive run and convert them for `InputSchedule`.
 
     Parameters
     ----------
@@ -65,9 +65,16 @@ def input_schedule(
     control_period : float or None
         Control period, s.
     span : float
-        Time of the run, s.
+        Time from the start of the run to its end, s.
+    params
+        Parameters of the run.
     duration : float, optional
         Time, s, that a table of inputs may cover instead of `span`, if the run ends earlier.
+
+    Returns
+    -------
+    None, (nu,) array or ZeroOrderHold
+        None for the scene's signals, an array for constant inputs, else a ZeroOrderHold.
 
     Raises
     ------
@@ -126,7 +133,10 @@ def _check_memory(model: ModelInfo, hold: ZeroOrderHold) -> ZeroOrderHold:
 
 
 def count_periods(span: float, period: float) -> int:
-    """Return the number of control periods in a span; the last one may be shorter (both in s)."""
+    """Return the number of control periods that begin within a time span.
+
+    The last period may be shorter. span, period: in s.
+    """
     return max(ceil(span / period * (1 - 1e-12)), 1)
 
 
@@ -139,11 +149,19 @@ def period_end(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
 
 
 class InputSchedule:
-    """Inputs of an adaptive run in progress: current values, and the time until which they apply.
+    """Inputs of an adaptive run in progress.
 
-    u: as `input_schedule` returns it. t0, t_end: start and end of the run, s. q, qd: initial state.
-    Attributes: current (nu,) or None for the signals; stop, the time until which it applies, s;
-    values, the inputs of each control period so far.
+    u: the inputs as `input_schedule` returns them. t0, t_end: start and end of the run, s. q, qd:
+    initial state.
+
+    Attributes
+    ----------
+    current : (nu,) array or None
+        Present inputs; None for the scene's signals.
+    stop : float
+        Time until which `current` applies, s.
+    values : list of (nu,) arrays
+        Inputs of each control period so far.
     """
 
     def __init__(
@@ -164,13 +182,14 @@ class InputSchedule:
 
     @property
     def address(self) -> Any:
-        """Address of the current inputs for C; NULL if C evaluates the scene's signals."""
+        """Pointer to the present inputs, for C; NULL if C evaluates the scene's signals."""
         return self.model._pointer(self.current)
 
     def advance(self, work: Any) -> bool:
-        """Compute the inputs of the next control period if one has ended; return False at the end.
+        """Compute the inputs of the next control period if the present one has ended.
 
-        work: workspace of the C function, with the current time and state of the run.
+        Return False at the end of the run, else True. work: workspace of the C function, which
+        contains the current time and state.
         """
         if work.t < self.stop:
             return True

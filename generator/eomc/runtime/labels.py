@@ -84,9 +84,10 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Return free text of a scene for a figure: control characters and dollar signs are escaped.
+    """Return free text of a scene, such as its title, in a form that a figure prints as it is.
 
-    The result is one line, and matplotlib reads no part of it as a formula.
+    The result is one line. Control characters and dollar signs are escaped, so that matplotlib
+    reads no part of it as a formula.
     """
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return shown.replace("$", r"\$")

@@ -16,11 +16,11 @@ from .package import warn
 def evaluate_law(
     law: Callable[..., Any], inputs: Callable[[Any], Any], t: float, q: Array, qd: Array
 ) -> Array:
-    """Call the function law(t, q, qd) of a user and return its inputs, (nu,), as an array.
+    """Call a user's function law(t, q, qd) and return the inputs (nu,) that it computes.
 
-    inputs: function that converts and checks the returned value. t: time, s. An exception in the
-    function has a note with the time and the state; an invalid result raises ValueError or
-    TypeError.
+    inputs: function that checks the returned value and converts it to an array. t: time, s. q, qd:
+    state (nq,). An exception in the law gets a note with the time and the state. An invalid result
+    raises ValueError or TypeError.
     """
     try:
         try:
@@ -53,11 +53,11 @@ def warn_called_each_step(model: ModelInfo) -> None:
 
 
 class FeedbackLaw:
-    """A function u(t, q, qd) that a run by fixed steps calls once in each control period.
+    """A user's function u(t, q, qd) that a run by fixed steps calls once in each control period.
 
-    law: the function. inputs: function that converts and checks its result. every: number of steps
-    from one row of the run to the next. hold: number of steps of a control period. The inputs that
-    apply at the rows are stored.
+    The inputs that apply at each row of the run are stored. law: the function. inputs: function
+    that converts and checks its result. every: number of steps between two rows. hold: number of
+    steps of a control period.
     """
 
     def __init__(
@@ -76,16 +76,20 @@ class FeedbackLaw:
         return self.last  # type: ignore[no-any-return]
 
     def rows(self, count: int, width: int) -> Array:
-        """Return the inputs that apply from each of the `count` rows of the run on, (count, width).
+        """Return the stored inputs that apply from each row of the run on, (count, width).
 
-        width: number of inputs; nan if the function has not been called.
+        count: number of rows. width: number of inputs. Values are nan if the function has not been
+        called.
         """
         last = np.full(width, np.nan) if self.last is None else self.last
         return np.array([*self.values, last][:count], last.dtype)
 
 
 class SampledSignal:
-    """The scene's input signals as a function u(t, q, qd), for a zero-order hold."""
+    """The scene's input signals as a function u(t, q, qd).
+
+    A run with a control period calls it once in each period and holds the result constant.
+    """
 
     def __init__(self, model: Functions, params: Any) -> None:
         self.model, self.params = model, params

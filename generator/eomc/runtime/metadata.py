@@ -57,14 +57,15 @@ class ModelInfo(Statics):
 
     @property
     def orders(self) -> dict[str, int]:
-        """Order of each method, by its name."""
+        """Order of convergence of each integration method, as a dict by the method's name."""
         return {name: order for name, (order, *_) in self._method_data.items()}
 
     @property
     def stability_limits(self) -> dict[str, tuple[float, float]]:
-        """Stability limits of each method, by its name: largest h omega and largest h lambda.
+        """Stability limits of each integration method, as a dict by the method's name.
 
-        omega is the frequency of an undamped mode, rad/s, lambda the rate of decay of a mode, 1/s.
+        A value is (largest h omega, largest h lambda) for the step size h. omega is the frequency
+        of an undamped mode, rad/s; lambda is the rate of decay of a mode, 1/s.
         """
         return {name: (turn, decay) for name, (_, _, turn, decay) in self._method_data.items()}
 

@@ -299,7 +299,9 @@ class Model(Stepping):
         u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
         t0: float = 0.0,
     ) -> str | None:  # fmt: skip
-        """Return a message if h is beyond the stability limit of the method at the initial state.
+        """Return advice if the step size h is too large for a stable run from the initial state.
+
+        The stability limit is that of the method for the motion linearised at the initial state.
 
         Parameters
         ----------
@@ -319,7 +321,7 @@ class Model(Stepping):
         Returns
         -------
         str or None
-            None if h is within the limit, or if no limit can be computed.
+            A message; None if h is within the limit, or if no limit can be computed.
         """
         p, method = self._parameters(params), self._method(method)
         q, qd = self._state(*initial_state_for_parameters(self, q0, qd0, p))

@@ -17,10 +17,10 @@ SHOWN = 12  # maximum number of coordinates in the table
 
 
 def html(run: Any) -> str:
-    """Return the summary of a run as HTML: status, final state, error and a small picture.
+    """Return a summary of a run as HTML: status, final state, error and a small picture.
 
-    Free text of the scene is escaped, and nothing is loaded from URLs. The picture needs
-    matplotlib.
+    Names and titles from the scene are escaped, and nothing is loaded from URLs. Without matplotlib
+    there is no picture.
     """
     model = run._model
     words = [f"{run.steps} steps of {run.method}, {run.description}"]
