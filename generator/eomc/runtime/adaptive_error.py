@@ -208,7 +208,8 @@ class _Rerun:
     def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
         """Repeat the run from another start and return its states [q; qd] at `times`, (m, 2 nq).
 
-        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s; 0 for no limit.
+        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s, or size of fixed
+        steps.
         steps: number of steps after which the new run ends early. States after an early end are
         nan.
         """

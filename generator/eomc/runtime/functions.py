@@ -217,7 +217,7 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """Return the generalized force tau of the inputs, friction and other forces, except gravity.
+        """Return the generalized force tau of the inputs, friction and other applied forces.
 
         tau = Q - dR/dqd, where Q are the applied forces and R is the dissipation function. Forces
         that derive from the potential energy P are in `g` instead.

@@ -14,7 +14,7 @@ def infinite_at_start(run: Trajectory) -> str:
     """Return a sentence that names the quantity that is not finite at the initial state of a run.
 
     The quantity is the potential energy, the kinetic energy or an acceleration. Return "" if all
-    accelerations are finite there, or if the run made a step.
+    accelerations are finite there or cannot be computed, or if the run made a step.
     """
     if run.status != "not finite" or run.steps or not len(run):
         return ""

@@ -133,7 +133,7 @@ def _check_memory(model: ModelInfo, hold: ZeroOrderHold) -> ZeroOrderHold:
 
 
 def count_periods(span: float, period: float) -> int:
-    """Return the number of control periods that begin within a time span.
+    """Return the number of control periods, at least 1, that begin within a time span.
 
     The last period may be shorter. span, period: in s.
     """

@@ -51,10 +51,10 @@ def _upright(word: str) -> str:
 
 
 def mathtext(name: str, rate: bool = False) -> str:
-    r"""Return a name in the mathtext of matplotlib, for labels of figures.
+    r"""Return a name in mathtext, the LaTeX subset of matplotlib, for labels of figures.
 
-    rate: return its time derivative. That of a word is written d/dt, since matplotlib would set a
-    dot on one of the letters. Several words are separated by spaces.
+    rate: return the time derivative of the name. That of a word is written d/dt, since matplotlib
+    would set a dot on one of the letters. Several words are separated by spaces.
 
     >>> mathtext("theta_1", rate=True), mathtext("arm", rate=True)
     ('$\\dot{\\theta}_{1}$', '$\\mathrm{d}\\,\\mathrm{arm}/\\mathrm{d}t$')

@@ -31,10 +31,10 @@ _RARELY = 2**48  # steps from row to row: C stores the last state only
 
 @dataclass(eq=False, repr=False)
 class TimedRun(Run):
-    """A run by fixed steps whose rows are at given output times.
+    """A run by fixed steps whose rows are at requested times.
 
-    The attributes are those of a `Run`; `steps` is the number of steps of size h, not of rows. A
-    run that stops early ends with its last valid state.
+    The attributes are those of a `Run`, except that `steps` is the number of steps of size h, not
+    of rows. The last row of a run that stops early is its last valid state.
     """
 
     _times: Array = field(kw_only=True)
@@ -126,10 +126,11 @@ def as_times_and_steps(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, out: Any,
 ) -> tuple[Array | None, int | None]:  # fmt: skip
-    """Return the output times (n,), s, and the number of steps of size h that cover them.
+    """Return the requested times (n,), s, and the number of steps of size h up to the last of them.
 
-    If `times` is None, return (None, steps). Raises ValueError if `times` is invalid or combined
-    with `steps`, `every` or `out`, which determine the rows as well.
+    If `times` is None, return (None, steps). The arguments are those of `Model.simulate`. Raises
+    ValueError if `times` is invalid, or is combined with `steps`, `every` or `out`, which determine
+    the rows as well.
     """
     if times is None:
         return None, steps
@@ -146,7 +147,7 @@ def run(
     acts: tuple[FeedbackLaw | None, Array | None, int, int], p: Array, method: str,
     progress: Callable[[int, int], None] | None,
 ) -> TimedRun:  # fmt: skip
-    """Simulate by fixed steps with rows at output times, from checked arguments.
+    """Simulate by fixed steps with rows at requested times, from checked arguments.
 
     Parameters
     ----------
@@ -155,21 +156,24 @@ def run(
     t0, h : float
         Initial time and step size, s.
     steps : int
-        Number of steps up to the last output time.
+        Number of steps up to the last requested time.
     times : (n,) array
-        Output times from t0 on, s.
+        Requested times from t0 on, s.
     acts : tuple
-        Feedback law or None, constant inputs or None, stride of the inputs from step to step,
-        number of steps of a control period.
+        The inputs, as four values: the feedback law u(t, q, qd), or None; the inputs as an array,
+        or None; the distance in that array between the inputs of two steps (0 if they are
+        constant); the number of steps of a control period.
     p : (np,) array
         Parameters.
+    method : str
+        Name of the method.
     progress : callable or None
         Function that is called with (completed steps, all steps).
 
     Returns
     -------
     TimedRun
-        The run, whatever its status.
+        The run, even if it failed; `status` is then the reason.
     """
     stepper = _IntervalStepper(model, q, qd, t0, h, steps, acts, p, method)
     rows = np.empty((2, len(times) + 1, model.nq), model.dtype)
@@ -248,7 +252,7 @@ class _IntervalStepper:
         return int(own + self.extra_evaluations)
 
     def step_to(self, n: int, progress: Callable[[int, int], None] | None) -> str:
-        """Step until n steps are completed; return the status, "ok" or the reason for stopping."""
+        """Step until n steps are completed; return "ok", or the reason if the run stops before."""
         while self.completed < n:
             count = min(n - self.completed, self.chunk)
             if self.law:
@@ -264,7 +268,10 @@ class _IntervalStepper:
         return "ok"
 
     def interpolate(self, rest: float) -> tuple[Array, str]:
-        """Return the state (2, nq) `rest` seconds after the last completed step, and the status."""
+        """Compute the state `rest` seconds after the last completed step, by a shorter step.
+
+        Return (state, status): the state [q, qd], (2, nq), and "ok" or the reason of a failure.
+        """
         if not rest:
             return self.state, "ok"
         work, pair = self.model._ffi.new(self.work_type), np.repeat(self.pair[:, 1:], 2, axis=1)
@@ -287,9 +294,9 @@ class _IntervalStepper:
         return STATUS[code & 7]
 
     def inputs(self) -> Any:
-        """Return the address of the next step's inputs for C.
+        """Return a pointer to the inputs of the next step, for C.
 
-        The feedback law is called first if a control period begins.
+        If a control period begins, the feedback law is called first.
         """
         period = self.completed // self.hold
         if self.law and self.period != period:
@@ -300,5 +307,5 @@ class _IntervalStepper:
 
     @property
     def applied(self) -> Any:
-        """Inputs (nu,) that the feedback law returned last; nan if there is no law."""
+        """The inputs (nu,) that the feedback law returned at its last call; nan without a law."""
         return np.nan if not self.law or self.current is None else self.current

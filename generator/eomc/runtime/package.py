@@ -25,7 +25,7 @@ MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all o
 
 
 class Identity(NamedTuple):
-    """Identity of the build that pickled a value; it is stored in the pickle.
+    """Identity of a build (a compiled package); each pickled value contains that of its build.
 
     Attributes
     ----------
@@ -69,9 +69,10 @@ def own_model() -> Any:
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
-    """Return the result of `__reduce__` for a value that `call_path(path, arguments)` recreates.
+    """Return the result of `__reduce__` for an object that `call_path(path, arguments)` creates.
 
-    path: such as "status.MotionError", relative to this package.
+    path: name of a function or class relative to this package, such as "status.MotionError".
+    arguments: arguments of the call that creates the object again when the pickle is read.
     """
     if unpickler is None:
         return unpickled, (identity(), path, arguments)
@@ -80,9 +81,10 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
 
 
 def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
-    """Return the result of the object at a path in this package, such as "status.MotionError".
+    """Call a function or class of this package by its name and return the result.
 
-    The object is called with `arguments`.
+    path: the name relative to this package, such as "status.MotionError". arguments: arguments of
+    the call.
     """
     first, *rest = path.split(".")
     if first.startswith("_"):  # an attribute of the built package, not a module of its runtime
@@ -94,10 +96,11 @@ def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
 
 
 def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
-    """Return the value that a package of this name has pickled; pickle calls this function.
+    """Create a pickled value again, by this build, and return it; pickle calls this function.
 
-    pickled: the fields of the `Identity` of the build that pickled it. path, arguments: as in
-    `call_path`. Returns an `Unreadable` placeholder if this build cannot read the value.
+    A build is a compiled package. pickled: fields of the `Identity` of the build that pickled the
+    value. path, arguments: as in `call_path`, which creates the value. If this build cannot read
+    the value, return an `Unreadable` placeholder.
     """
     if why := refusal(pickled, path):
         return Unreadable(why, RuntimeError, (unpickled, (pickled, path, arguments)))
@@ -105,11 +108,12 @@ def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -
 
 
 def refusal(pickled: tuple[Any, ...], path: str) -> str:
-    """Return the reason why this build cannot read a pickle of another build, or "" if it can.
+    """Return the reason why this build cannot read a value of another build; "" if it can.
 
-    pickled: the fields of the other build's `Identity`. path: what the pickle recreates. Code of
-    another build is refused. Data of another build are read, with a warning, if their columns have
-    the same names in the same order.
+    A build is a compiled package. Compiled code that another build has pickled is refused. Data of
+    another build are read, with a warning, if their columns have the same names in the same order
+    and their number type is the same. pickled: fields of the other build's `Identity`. path: what
+    is called to create the value again, as in `call_path`.
     """
     if path.startswith("status."):  # errors have a text alone
         return ""
@@ -179,10 +183,10 @@ _SPELLED = {"true": "True", "method": "methods"}  # of [run], as System.make has
 
 
 def option(key: str, value: str = "true") -> str:
-    """Return the option with which the user builds a module, as text for a message.
+    """Return, as text for a message, the option with which the user builds a feature into a module.
 
-    For a scene it is a key of [run], such as "[run] linearize = true"; for a System it is an
-    argument of System.make.
+    For a scene, the option is a key of [run], such as "[run] linearize = true". For a System, it is
+    an argument of System.make. key: name of the option. value: its value in TOML.
     """
     if not is_built_from_system():
         return f"[run] {key} = {value}"
@@ -192,7 +196,7 @@ def option(key: str, value: str = "true") -> str:
 
 
 def named_outputs() -> str:
-    """Return text for a message that says where the user names the outputs of a module."""
+    """Return text for a message: where in the scene or System the user names the outputs."""
     where = "System.make(..., outputs={...})" if is_built_from_system() else "[outputs]"
     return f"name them in {where}"
 
@@ -204,7 +208,10 @@ def is_built_from_system() -> bool:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return text such as "; did you mean 'm_c'?" if a known name is similar to `name`, else ""."""
+    """Return text such as "; did you mean 'm_c'?" for an unknown name that a user gave.
+
+    known: the allowed names. Return "" if none of them is similar to `name`.
+    """
     import difflib  # of use here alone
 
     known = [*known]
@@ -214,7 +221,10 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 
 def initial_value_message(model: Any, name: str) -> str:
-    """Return a message that `name` is a coordinate, not a parameter, with a remedy."""
+    """Return a message that `name` is a coordinate, not a parameter, with a remedy.
+
+    The remedy says in which argument the value of the coordinate is given.
+    """
     if name in model.discrete_coordinates:
         return (
             f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
@@ -253,7 +263,11 @@ def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]
 
 
 def warn(words: str) -> None:
-    """Issue a RuntimeWarning that points to the user's line that called into a built package."""
+    """Issue a RuntimeWarning with the text `words`.
+
+    The warning points to the line of the user's code that called a function of eomc or of a built
+    package.
+    """
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _of_eomc(str(frame.f_globals.get("__package__"))):
         level, frame = level + 1, frame.f_back

@@ -48,12 +48,15 @@ class Curve:
 
     @property
     def text(self) -> str:
-        """The name in the mathtext of matplotlib."""
+        """The name of the curve in mathtext, the LaTeX subset of matplotlib, for labels."""
         return self.symbol or mathtext(self.name)
 
 
 def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
-    """Group curves into panels by kind, unit and size; return the list of panels."""
+    """Group curves into panels, each with curves of the same kind, the same unit and similar size.
+
+    Return the panels, each a list of its curves.
+    """
     panels: list[list[Curve]] = []
     for kind in dict.fromkeys((c.kind, c.unit) for c in curves):
         mine = [c for c in curves if (c.kind, c.unit) == kind]
@@ -88,9 +91,9 @@ def wrapped(values: Array) -> Array:
 
 
 def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
-    """Return the curve (x, y) with nan inserted where one of `angles` jumps by a turn.
+    """Return the curve (x, y) with gaps, so that no line is drawn where an angle jumps by a turn.
 
-    No line is drawn there. The arrays x, y and each of `angles`, rad, are (n,).
+    A gap is a nan that is inserted before the jump. x, y and each of `angles`, rad, are (n,).
     """
     jumps = np.flatnonzero(sum(np.abs(np.diff(a)) > np.pi for a in angles)) + 1
     return np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan)
@@ -99,9 +102,10 @@ def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
 def against(
     axes: Any, x: Array, curves: Sequence[Curve], suffix: str = "", **style: Any
 ) -> list[Any]:
-    """Plot curves over x into the Axes of matplotlib and label its y axis; return the new lines.
+    """Plot curves over x and label the y axis; return the new lines of matplotlib.
 
-    suffix: text that is appended to the labels of the curves. style: arguments of `Axes.plot`.
+    axes: the Axes to plot into. x: (n,) values on the horizontal axis. suffix: text that is
+    appended to the labels of the curves. style: arguments of `Axes.plot`.
     """
     every = max(len(x) // MAX_ROWS, 1)
     lines = []
@@ -116,10 +120,10 @@ def against(
 
 
 class Source:
-    """The columns of a run as curves, with their units, kinds and symbols.
+    """The columns of a run as curves, with units, kinds and symbols for a figure.
 
-    wrap: names of the angles that are reduced to [-pi, pi); True: all coordinates in rad. Raises
-    KeyError if one of these names is unknown.
+    run: the run. wrap: names of the angles that are reduced to [-pi, pi); True: all coordinates
+    with the unit rad. Raises KeyError if one of these names is unknown.
     """
 
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
@@ -190,14 +194,20 @@ def plot(
 
 
 def no_files(names: Sequence[str]) -> None:
-    """Raise ValueError if one of the names of columns is the name of a picture file."""
+    """Raise ValueError if one of the names ends like that of a picture file, such as ".png".
+
+    names: names of columns that the user wants to plot.
+    """
     for name in names:
         if str(name).endswith((".png", ".pdf", ".svg")):
             raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
 
 
 def finished(all_axes: Sequence[Any], file: File | None) -> Any:
-    """Write the figure of the Axes to `file`, if given; return the Axes, or an array of several."""
+    """Write the figure to `file`, unless that is None, and return its Axes.
+
+    all_axes: the Axes of the figure. A single one is returned as it is, several as an array.
+    """
     if file is not None:
         figure = all_axes[0].figure
         getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole

@@ -11,10 +11,11 @@ from .package import no_argument
 
 
 def require_eomc(module: str, what: str = "runs are drawn") -> Any:
-    """Import and return the module `eomc.<module>` of an installed eomc.
+    """Import and return the module `eomc.<module>` of the installed package eomc.
 
-    what: part of the message that needs eomc. Raises ImportError, with the remedy, if eomc is not
-    installed. Only pictures, and events that the scene does not define, need it.
+    A built package needs eomc only for pictures and for events that the scene does not define.
+    what: the purpose, as the beginning of the error message. Raises ImportError, with a remedy, if
+    eomc is not installed.
     """
     try:
         return import_module(f"eomc.{module}")
@@ -28,12 +29,14 @@ def require_eomc(module: str, what: str = "runs are drawn") -> Any:
 
 
 def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    """Return the model extended by additional events, and the remaining arguments of the call.
+    """Return the model extended by a call's additional events, and the other arguments of the call.
 
     call: the method that the user called. arguments: all its local variables, including "self",
-    "events" and "unknown" (arguments that it does not have). A parameter that a jump sets is a
-    state of the extended model, not a parameter: only the parameters that differ from the scene's
-    values are passed on. Raises TypeError for unknown arguments.
+    "events" and "unknown" (arguments that the method does not have). Raises TypeError for unknown
+    arguments.
+
+    A parameter that a jump of an additional event sets is a state of the extended model, not a
+    parameter. Therefore only the parameters that differ from the scene's values are passed on.
     """
     model, events, unknown = (arguments.pop(name) for name in ("self", "events", "unknown"))
     if unknown:
@@ -46,9 +49,10 @@ def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
 
 
 def eventful(model: Any, events: Any) -> Any:
-    """Return the model extended by `events`, a mapping of additional events by name.
+    """Return the model extended by additional events.
 
-    The extended module is compiled at the first call and reused afterwards.
+    events: mapping of the events by name, each a formula or a table such as [[event]] of a scene.
+    The extended model is compiled at the first call and reused afterwards.
     """
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:

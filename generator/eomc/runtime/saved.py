@@ -58,11 +58,12 @@ def _text(events: Any) -> str:
 
 
 def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
-    """Return the model of a saved run, the name of the run's class, and its arrays by name.
+    """Read an .npz file that `run.save` has written.
 
-    The class is one of KINDS. The model is extended if the run had additional events. A warning is
-    issued if the run is of another version of the scene. Raises ValueError if the file is not a
-    saved run of the scene, OSError if it cannot be read.
+    Return the model, the name of the run's class (one of KINDS) and the arrays by name. The
+    returned model is extended by events if the run had additional events. A warning is issued if
+    the run is of another version of the scene. Raises ValueError if the file is not a saved run of
+    the scene, OSError if it cannot be read.
     """
     arrays = _arrays(file)
     kind = next((k for k in KINDS if str(arrays.get("kind")) == _KIND.format(k)), "")

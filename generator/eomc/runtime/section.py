@@ -33,11 +33,12 @@ def as_section(
 def crossings(
     columns: Mapping[str, Array], name: str, value: float, rising: bool | None, period: float | None
 ) -> dict[str, Array]:
-    """Return all columns (m,) of a run at the times when the column `name` crosses `value`.
+    """Return all columns of a run at the m times when the column `name` crosses `value`.
 
-    columns: arrays (n,) by name, including "t". rising, period: as in `Run.section`. Columns are
-    interpolated by cubics through four rows. Two rows of the same time are a state jump: no cubic
-    spans it, and a jump is not a crossing. Raises ValueError for fewer than four rows.
+    The result is a dict of arrays (m,) by name. columns: arrays (n,) by name, including "t".
+    rising, period: as in `Run.section`. Columns are interpolated by cubics through four rows. Two
+    rows of the same time are a state jump: no cubic spans it, and a jump is not a crossing. Raises
+    ValueError for fewer than four rows.
     """
     t, column = columns["t"], columns[name]
     f, n = np.asarray(column, float) - value, len(t)

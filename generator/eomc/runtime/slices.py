@@ -10,19 +10,19 @@ _MAX_GROWTH = 16.0  # of a slice over the one before, since the first rows may b
 
 
 def next_chunk(count: int, elapsed: float, seconds: float = _SECONDS) -> int:
-    """Return the number of items that are expected to take `seconds`.
+    """Return the number of items that are expected to take `seconds` to process.
 
-    The time per item is that of the last chunk, `count` items in `elapsed` seconds. The number
-    grows or shrinks by at most a factor of 16.
+    The estimate uses the time per item of the last chunk: `count` items in `elapsed` seconds. The
+    result differs from `count` by at most a factor of 16.
     """
     return int(count * min(_MAX_GROWTH, max(1 / _MAX_GROWTH, seconds / (elapsed + 1e-9)))) + 1
 
 
 def slices(count: int, first: int) -> Iterator[tuple[int, int]]:
-    """Yield (start, size) of consecutive slices of `count` rows.
+    """Yield consecutive slices (start, size) of `count` rows, each of which takes some 50 ms.
 
-    The first slice has `first` rows. The size of each further one follows from the time that the
-    caller spent on the one before, so that a slice takes some 50 ms.
+    The first slice has `first` rows. The size of each further slice follows from the time that the
+    caller spent on the previous one.
     """
     start, size = 0, first
     while start < count:

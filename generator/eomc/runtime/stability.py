@@ -24,15 +24,14 @@ def beyond_end(h: float, duration: float) -> str | None:
 def advice(
     model: ModelInfo, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
 ) -> str | None:
-    """Return a message if h is beyond the stability limit of the method at a state, else None.
+    """Return a message if the step size h is too large for a stable run from a state, else None.
 
     q, qd: state (nq,). h: step size, s. t: time, s. u: inputs (nu,), or None for the scene's
-    signals.
+    signals. method: name of the method.
 
-    The limit follows from the eigenvalues of the linearised motion: their largest |imaginary part|
-    and their fastest decay are compared with the two limits of the method. A mode whose speed
-    depends on the width of the finite differences comes from a discontinuity of the forces and is
-    ignored.
+    The motion is linearised at the state. The largest |imaginary part| and the fastest decay of its
+    eigenvalues are compared with the two stability limits of the method. A mode whose speed depends
+    on the width of the finite differences comes from a discontinuity of the forces and is ignored.
     """
     undamped, decaying = model.stability_limits[method]
     modes = _fastest_modes(model, q, qd, t, u, params, 1.0)

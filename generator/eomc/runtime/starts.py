@@ -28,22 +28,23 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def is_by_name(q0: Any, qd0: Any) -> bool:
-    """Return True if the initial positions or velocities are mappings by name."""
+    """Return True if the initial positions q0 or velocities qd0 are a mapping by name."""
     return hasattr(q0, "keys") or hasattr(qd0, "keys")
 
 
 def initial_state_for_parameters(
     model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
 ) -> tuple[Any, Any]:
-    """Return the initial state (q0, qd0) for given parameters, completed from the scene.
+    """Return the initial state (q0, qd0), completed by the scene's initial values.
 
-    Values that are not given are those of the scene, whose formulas are evaluated at the
-    parameters.
+    An initial value of the scene may be a formula of parameters; it is evaluated for the parameters
+    p.
 
     Parameters
     ----------
     q0, qd0 : array, mapping or None
-        Arrays are returned unchanged. Mappings give values by the names of coordinates.
+        Arrays are returned unchanged. Mappings give values by the names of coordinates; all other
+        values are those of the scene. None: all values are those of the scene.
     p : (np,) or (n, np) array
         Parameters; with (n, np) the completed arrays are (n, nq).
     many_values : bool
@@ -107,11 +108,11 @@ def _instances(
 def values_by_name(
     model: Constrained, x: Any, half: int, many: bool = False
 ) -> dict[str, Array] | None:
-    """Return the values of a mapping of initial values by the names of coordinates.
+    """Check a mapping of initial values by coordinate name and return it as a dict of arrays.
 
-    half: 0 if x are positions q, 1 if they are velocities, whose names may end with "_dot". many:
-    values may be (n,), one for each instance. Returns {} if x is None, and None if x is an array.
-    Raises ValueError for unknown names.
+    x: the user's argument q0 or qd0. half: 0 if x are positions, 1 if they are velocities, whose
+    names may end with "_dot". many: values may be (n,), one for each instance. Returns {} if x is
+    None, and None if x is an array. Raises ValueError for unknown names.
     """
     if x is None:
         return {}

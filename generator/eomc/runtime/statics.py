@@ -16,14 +16,17 @@ from .starts import initial_state_for_parameters, values_by_name
 
 
 class Statics(Constrained):
-    """A compiled scene with inverse problems: actuator forces of a motion, equilibria."""
+    """A compiled scene with methods for inverse problems.
+
+    The problems are the actuator forces that a motion requires, and equilibria.
+    """
 
     def drive_forces(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, drives: Sequence[str] | None = None,
         f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return the actuator forces and the multipliers that a motion requires.
+        """Return the actuator forces tau and the multipliers lambda that a given motion requires.
 
         tau + A^T lambda equals `inverse_dynamics` minus friction and all other forces of the scene
         at zero inputs. If there are more drives than degrees of freedom, the solution with the
@@ -36,7 +39,8 @@ class Statics(Constrained):
         drives : sequence of str, optional
             Coordinates along which actuators act; by default all. tau is 0 along the others.
         f_ext : mapping or array_like, optional
-            External wrenches on frames, in the form of `wrenches` in `frame_forces`.
+            External wrenches (force and moment) on frames, in the form of `wrenches` in
+            `frame_forces`.
         t, params
             Time, s; parameters that differ from the scene's.
 
@@ -70,24 +74,26 @@ class Statics(Constrained):
         self, q: Start = None, qd: Start = 0.0, t: float = 0.0, u: Any = None,
         params: Parameters = None, *, free: Collection[str] | None = None,
     ) -> Equilibrium:  # fmt: skip
-        """Find a state and inputs at which q̈ = 0, by Newton's method from a guess.
+        """Find a state and inputs at which the accelerations are zero, by Newton's method.
 
         Parameters
         ----------
         q : (nq,) array or dict, optional
-            The guess of the positions; what is not given is the start of the scene.
+            Positions, or their guess. Values that are not given are the initial values of the
+            scene.
         qd : float, (nq,) array or dict
-            The velocities, 0 where they are not given.
+            Velocities, or their guess. Values that are not given are 0.
         t : float
-            The time, s.
+            Time, s.
         u : (nu,) array or dict, optional
-            The inputs, or their guess; by default the scene's signals.
+            Inputs, or their guess; by default the scene's signals.
         params : optional
             Parameters that differ from those of the scene.
-        free : names of coordinates, rates and inputs, optional
-            What is solved for; by default all coordinates that have velocities. All other values
-            stay as they are given. With rates among them, such as "charge_dot", the result is a
-            steady motion if no force changes along it.
+        free : collection of str, optional
+            Names of the coordinates, velocities (such as "theta_dot") and inputs that are solved
+            for; by default all coordinates that have velocities. All other values stay as they are
+            given. If `free` contains velocities, such as "charge_dot", the result is a steady
+            motion, provided that no force changes along it.
 
         Returns
         -------
@@ -97,7 +103,7 @@ class Statics(Constrained):
         Raises
         ------
         MotionError
-            No equilibrium was found; its status is "no convergence".
+            If no equilibrium is found; its status is "no convergence".
         """
         if isinstance(free, str):
             free = (free,)

@@ -35,12 +35,13 @@ STATUS_MESSAGES = {
 
 
 class MotionError(ArithmeticError):
-    """Error that is raised if no acceleration or step exists at a state.
+    """Error that is raised if the acceleration or the next step does not exist at a state.
 
     Attributes
     ----------
     status : str
-        The reason, a status of a run: "singular", "not finite", "no convergence", "locked", ...
+        The reason, in the words of a run's status: "singular", "not finite", "no convergence",
+        "locked" and others.
     """
 
     def __init__(self, message: str, status: str) -> None:

@@ -97,18 +97,21 @@ class Run(Trajectory):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """Occurrences of each event, as an EventLog by its name; empty without events."""
+        """Occurrences of each event as an `EventLog`, by the event's name.
+
+        The mapping is empty for a scene without events.
+        """
         return ByName("events", (), ())
 
     def balance(self) -> Balance | None:
-        """Return the energy balance of the run, J, and the numerical error that it reveals.
+        """Return the energy balance of the run, J, with the numerical error that follows from it.
 
         Returns
         -------
         Balance or None
-            Work of inputs, forces and state jumps, and dissipated energy. None if the inputs at the
-            rows are unknown, as those of a function with `every`, or if an energy or a force is not
-            finite.
+            Work of inputs, forces and state jumps, and dissipated energy. None if an energy or a
+            force is not finite, or if the inputs at the rows are unknown. They are unknown for a
+            function u in a run with `every` > 1.
         """
         return balance(self)
 
@@ -315,7 +318,7 @@ class Run(Trajectory):
 
     @property
     def message(self) -> str:
-        """The outcome of the run in a sentence: number of steps, or time and reason of the stop."""
+        """The outcome of the run as a sentence: number of steps, or time and reason of a stop."""
         if self.status == "ok":
             return f"{self.steps} steps of {self.h:g} s"
         reason = infinite_at_start(self) or STATUS_MESSAGES[self.status]

@@ -86,16 +86,16 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def u(self) -> Array:
-        """Inputs that act at each row, (n, nu), saturated at their limits.
+        """Inputs that act at each row, (n, nu), limited to their allowed ranges.
 
-        They are the signals at the row, or the inputs of the step that begins there; the last row
-        has the inputs of the last step.
+        At each row they are the values of the scene's signals, or the inputs of the step that
+        begins there. The last row has the inputs of the last step.
         """
         return self._model._within(self._requested_inputs, self._params)
 
     @property
     def saturated(self) -> Array:
-        """Array of bool (n, nu): True for each input that exceeds its limits at a row."""
+        """Array of bool (n, nu): True where an input exceeds its limits, before it is limited."""
         requested = self._requested_inputs
         return np.asarray(np.abs(requested - self._model._within(requested, self._params)) > 0)
 
@@ -117,7 +117,10 @@ class Trajectory(ConstrainedRun, Columns):
 
     @property
     def energy(self) -> Array:
-        """Energy K + P at each row, (n,), J. The conserved quantity may be `jacobi` instead."""
+        """Energy K + P (kinetic and potential) at each row, (n,), J.
+
+        In a rotating frame, `jacobi` is conserved instead of the energy.
+        """
         if self._energy is None:
             self._energy = self._evaluate(self._model.energy)
         return self._energy
@@ -133,9 +136,9 @@ class Trajectory(ConstrainedRun, Columns):
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
-        """The scene's outputs at the rows, arrays (n,) by name.
+        """The scene's outputs at the rows, as a dict from name to array (n,).
 
-        nan where an output needs accelerations and D is singular.
+        A value is nan where the output depends on accelerations and the mass matrix D is singular.
         """
         model = self._model
         if not model.outputs:
