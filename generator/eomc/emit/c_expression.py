@@ -147,9 +147,10 @@ class Printer:
         self.inline: dict[str, tuple[str, int]] = {}
 
     def name(self, name: str, binding: int = 4) -> str:
-        """Return the C text of a variable, in parentheses if it binds less strongly than `binding`.
+        """Return the C expression of the variable `name`.
 
-        Binding strengths are 1 for sums, 2 for products and 4 for names.
+        The expression is in parentheses if it binds less strongly than `binding`: 1 for sums, 2 for
+        products and 4 for names.
         """
         if name in self.inline:
             text, strength = self.inline[name]
@@ -157,8 +158,11 @@ class Printer:
         return self.where.get(name, name)
 
     def operand(self, o: Operand, binding: int = 1) -> str:
-        """Return the C text of a number times a variable, in parentheses if it binds less than
-        `binding`.
+        """Return the C expression of an operand.
+
+        An operand is a number, a variable, or a number times a variable. The expression is in
+        parentheses if it binds less strongly than `binding`: 1 for sums, 2 for products and 4 for
+        names.
         """
         if not o.name:
             return number(o.coefficient, self.real)
@@ -167,10 +171,10 @@ class Printer:
         return self.value(Product(o.coefficient, (o.name,)), binding)[0]
 
     def value(self, value: Value, binding: int = 1) -> tuple[str, int]:
-        """Return the C text of a right-hand side and its binding strength.
+        """Return the right-hand side of an assignment as a C expression, and its binding strength.
 
-        The strength is 1 for sums, 2 for products and 4 for names; text that binds less strongly
-        than `binding` is put in parentheses.
+        The strength is 1 for sums, 2 for products and 4 for names. An expression that binds less
+        strongly than `binding` is put in parentheses.
         """
         if isinstance(value, Sum):
             text, strength = self._sum(value), 1
@@ -242,8 +246,9 @@ class Printer:
         return f"({self.real.name})(({x} > 0) - ({x} < 0))"
 
     def in_lane(self, o: Operand) -> str:
-        """Return the C text of an operand; numbers are broadcast to a vector if values are
-        vectors.
+        """Return the C expression of an operand as a vector, if values are vectors.
+
+        A number is then broadcast to a vector. Otherwise the text is that of `operand`.
         """
         text = self.operand(o, 1)
         if self.real.lane and not o.name:
@@ -275,7 +280,7 @@ class Body:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """All C statements in lines, without comments."""
+        """The lines of all C statements, without the comments of the blocks."""
         return tuple(line for block in (*self.early, *self.blocks) for line in block.lines)
 
 
@@ -409,10 +414,11 @@ def _sincos(
 
 
 def group_angles(function: Function) -> Mapping[Operand, Sequence[Operand]]:
-    """Return groups of angles whose sines can be computed together, by each angle in a group.
+    """Return the groups of angles whose sines can be computed together in vector registers.
 
-    The angles are arguments of the function, of the same stage (time, position or velocity). A
-    group has at least MIN_SIMD_ANGLES.
+    The result maps each angle of a group to all angles of its group. The angles are arguments of
+    the function. Those of a group depend on the same kind of variables (time, position or
+    velocity). A group has at least MIN_SIMD_ANGLES angles.
     """
     computed = {a.name for a in (*function.early, *function.body)}
     by_stage: dict[Stage, dict[Operand, None]] = {}
@@ -498,16 +504,19 @@ def _numbered(
 
 
 def indent(lines: Iterable[str], width: int = 4) -> str:
-    """Return the lines as indented text, with long lines broken after operators.
+    """Return lines of C as one text, indented by `width` spaces.
 
-    width: number of spaces.
+    Long lines are broken after operators.
     """
     all_lines = [line for text in lines for line in broken(text, 100 - width)]
     return "\n".join((" " * width + line).rstrip() for line in all_lines)
 
 
 def broken(text: str, width: int = 100) -> Sequence[str]:
-    """Return a C statement or prototype as lines of at most `width` characters, if possible."""
+    """Return a C statement or prototype, broken into lines of at most `width` characters.
+
+    A line is longer where it cannot be broken.
+    """
     lines = []
     while len(text) > width:
         separators = (", ", " + ", " - ", " || ", "*", " | ", "; ", " = ", "(")

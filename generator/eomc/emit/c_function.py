@@ -1,8 +1,4 @@
-"""C functions as values, and the kinds of statement that occur in them.
-
-A function prints its prototype, its definition and calls, and determines which arguments its body
-does not read. Together with c_expression.py, this is the only Python code with C syntax.
-"""
+""" """
 
 from __future__ import annotations
 
@@ -28,18 +24,26 @@ class CArgument:
 
     @property
     def declaration(self) -> str:
-        """The declaration of the argument in a prototype."""
+        """The C declaration of the argument, as in a prototype."""
         gap = "" if self.type.endswith("*") else " "
         return f"{self.type}{gap}{self.name}" + (f"[{self.extent}]" if self.extent else "")
 
 
 def input_array(type: str, name: str, extent: str = "") -> CArgument:
-    """Return the argument for a C array that is only read; without an extent, a pointer."""
+    """Return an argument of a C function for an array that the function only reads.
+
+    `type` is the C type of an element and `extent` the size as C text. Without an extent, the
+    argument is declared as a pointer.
+    """
     return CArgument(f"const {type}" if extent else f"const {type} *", name, extent)
 
 
 def output_array(type: str, name: str, extent: str = "") -> CArgument:
-    """Return the argument for a C array that is written; without an extent, a pointer."""
+    """Return an argument of a C function for an array that the function writes.
+
+    `type` is the C type of an element and `extent` the size as C text. Without an extent, the
+    argument is declared as a pointer.
+    """
     return CArgument(type if extent else f"{type} *", name, extent)
 
 
@@ -91,30 +95,36 @@ class CFunction:
 
     @property
     def inside(self) -> str:
-        """The indented statements of the body as C text, after `(void)` casts of the unused
-        arguments.
+        """The C text between the braces of the function: the statements of the body, indented.
+
+        They begin with a `(void)` cast of each argument that the body does not read.
         """
         unread = Block("", tuple(f"(void){name};" for name in self.unused))
         return "\n\n".join(block_text(b) for b in (unread, *self.body) if b.lines)
 
     @property
     def definition(self) -> str:
-        """Prototype and body as C text; for functions with a qualifier (static), the comment comes
-        first.
+        """The C definition of the function as text: its prototype and its body.
+
+        For functions with a qualifier (static), the comment precedes them.
         """
         head = [self.comment] if self.doc and self.qualifier else []
         return "\n".join([*head, self.prototype, "{", self.inside, "}"])
 
     def call(self, **passed: str) -> str:
-        """Return a C call of the function, without a semicolon.
+        """Return a C expression that calls the function.
 
-        passed: C expressions of arguments by name; other arguments are variables of the same name.
+        passed: C expressions of arguments, by the argument's name. Each other argument is passed as
+        a variable of the same name.
         """
         return f"{self.name}({', '.join(passed.get(a.name, a.name) for a in self.arguments)})"
 
 
 def static(name: str, result: str, *arguments: CArgument) -> CFunction:
-    """Return a static C function without a body, which a template contains."""
+    """Return the prototype of a static C function; a template contains its body.
+
+    result: C type of the result.
+    """
     return CFunction(name, result, arguments, qualifier="static")
 
 
@@ -128,17 +138,17 @@ def block_text(block: Block) -> str:
 
 
 def constant(type: str, name: str, value: str) -> str:
-    """Return the C definition of a constant local variable."""
+    """Return the C definition of a constant local variable: `const type name = value;`."""
     return f"const {type} {name} = {value};"
 
 
 def local(type: str, name: str) -> str:
-    """Return the C declaration of a local variable."""
+    """Return the C declaration of a local variable: `type name;`."""
     return f"{type} {name};"
 
 
 def assign(place: str, value: str) -> str:
-    """Return a C statement that assigns `value` to `place`."""
+    """Return the C statement that assigns the expression `value` to the variable `place`."""
     return f"{place} = {value};"
 
 
@@ -153,12 +163,15 @@ def result(value: str) -> str:
 
 
 def note(conditions: Iterable[str]) -> tuple[str, ...]:
-    """Return C statements that combine conditions into the mask `failed` by "or"."""
+    """Return C statements that record failures in the variable `failed`, a bit mask.
+
+    Each statement combines `failed` with one of the conditions by "or".
+    """
     return tuple(f"failed |= {text};" for text in conditions)
 
 
 def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
-    """Return a C statement, in lines, that returns `value` if one of the conditions holds.
+    """Return the lines of a C statement that returns `value` if one of the conditions holds.
 
     Returns no lines if there are no conditions.
     """
@@ -167,15 +180,19 @@ def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
 
 
 def otherwise_signal(array: str, call: str) -> tuple[str, ...]:
-    """Return C statements that set u to the scene's signals if u is NULL.
+    """Return the lines of a C statement that computes the inputs u if u is NULL.
 
-    call: C call that stores the signals in `array`.
+    The scene's signals (functions of time and state) define the inputs. `call` is a C call that
+    stores their values in `array`.
     """
     return ("if (!u) {", f"    {call};", f"    u = {array};", "}")
 
 
 def listed(type: str, name: str, extent: str, values: Sequence[str]) -> str:
-    """Return the C definition of a constant array with these values."""
+    """Return the C definition of a constant array with the given elements.
+
+    type: C type of an element. extent: size of the array as C text.
+    """
     return f"const {type} {name}[{extent}] = {{ {', '.join(values)} }};"
 
 
@@ -185,18 +202,22 @@ def member(of: str, name: str) -> str:
 
 
 def cast(type: str, name: str) -> str:
-    """Return a C expression: the pointer `name` cast to a pointer to constant `type`."""
+    """Return a C expression that casts the pointer `name` to `const type *`."""
     return f"(const {type} *){name}"
 
 
 def struct(type: str, real: str, members: Sequence[str]) -> str:
-    """Return the C definition of a struct `type` with members of the number type `real`."""
+    """Return the C definition of a struct called `type`.
+
+    real: C type of all members. members: their declarators, such as "x" or "x[3]".
+    """
     return f"typedef struct {{\n    {real} {', '.join(members)};\n}} {type};"
 
 
 def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
-    """Return a C loop, in lines, that copies `count` elements of `array`, from index `first` on, to
-    `to`.
+    """Return the lines of a C loop that copies `count` elements of `array` to the array `to`.
+
+    The first copied element is `array[first]`; it becomes `to[0]`.
     """
     index = f"{first} + k" if first else "k"
     return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{index}];")
@@ -208,7 +229,7 @@ def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 
 def narrowed(text: str) -> str:
-    """Return finished C text with comments broken to at most WIDTH characters in a line.
+    """Return the text of a C file with its comments broken to lines of at most WIDTH characters.
 
     A long comment behind code is moved above the code if possible.
     """
@@ -254,9 +275,9 @@ def _split_comment(line: str) -> tuple[str, str]:
 
 
 def laid_out(text: str) -> str:
-    """Return finished C text with long comments and statements broken to at most WIDTH characters.
+    """Return the text of a C file with long lines broken to at most WIDTH characters.
 
-    Preprocessor directives stay as they are.
+    Comments and statements are broken; preprocessor directives are not.
     """
     result_lines: list[str] = []
     for line in narrowed(text).split("\n"):

@@ -47,27 +47,28 @@ def may_be_macro(name: str) -> bool:
 
 
 def may_be_enumerator_of_others(name: str) -> bool:
-    """Return True if a header of the C library or of Python may define a macro equal to an
-    enumerator.
+    """Return True if an enumerator of a scene may coincide with a macro of a header.
 
-    name: the enumerator, with the scene's prefix.
+    The headers are those of the C library and of Python. name: the enumerator, which begins with
+    the scene's name.
     """
     return not name.endswith("_") and bool(_FAMILY.fullmatch(name))
 
 
 def in_c(name: str, prefix: str) -> str:
-    """Return the C name for a name of the scene, with "_" appended if C cannot use it.
+    """Return the C name for the name of a coordinate, parameter or input of the scene.
 
-    prefix: the scene's name, with which other C names begin.
+    It is the same name, with "_" appended if C cannot use it. prefix: the scene's name, with which
+    other C names begin.
     """
     ours = name.lower().startswith(prefix.lower() + "_")
     return name + "_" if ours or may_be_macro(name) or name in _CALLED else name
 
 
 def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
-    """Return the program with names that C can use, and the renamed names of the scene.
+    """Return the program with names that C can use, and a mapping of the changed names.
 
-    The second result maps each new name of a coordinate, parameter or input to the name in the
+    The mapping leads from each new name of a coordinate, parameter or input to its name in the
     scene.
     """
     system = program.system

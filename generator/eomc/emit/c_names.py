@@ -51,8 +51,9 @@ class Target:
     written: Mapping[str, str] = field(default_factory=dict)
 
     def as_written(self, name: str) -> str:
-        """Return the name in the scene of a coordinate, parameter or input with the C name
-        `name`.
+        """Return the scene's name for a coordinate, parameter or input.
+
+        `name` is its C name, which may have "_" appended.
         """
         return self.written.get(name, name)
 
@@ -99,8 +100,9 @@ class Target:
 
     @cached_property
     def wrenches(self) -> list[Symbol]:
-        """The symbols of the forces and moments that act at the frames (N, N m), in the order of
-        the C array.
+        """The symbols of the external forces (N) and moments (N m) that act at the scene's frames.
+
+        They are in the order of the C array `wrenches`.
         """
         return wrenches(self.system)
 
@@ -116,20 +118,27 @@ class Target:
 
     @cached_property
     def signal_state(self) -> bool:
-        """Whether the signals, by which the scene defines its inputs, depend on q or qd."""
+        """Whether the scene's signals depend on q or qd.
+
+        Signals are the functions by which the scene defines its inputs.
+        """
         signal = self.program.functions.get("signal")
         state = {x.name for x in (*self.system.q, *self.system.qd)}
         return signal is not None and bool(signal.uses & state)
 
     @cached_property
     def signal_t(self) -> bool:
-        """Whether the signals, by which the scene defines its inputs, depend on time."""
+        """Whether the scene's signals depend on time.
+
+        Signals are the functions by which the scene defines its inputs.
+        """
         return "signal" in self.program and TIME in self.program["signal"].uses
 
     @cached_property
     def driven(self) -> bool:
-        """Whether the motion depends on time, directly or through the scene's signals for the
-        inputs.
+        """Whether the motion depends on time, directly or through the scene's signals.
+
+        Signals are the functions by which the scene defines its inputs.
         """
         functions = [
             f for n in ("acceleration", "projection") if (f := self.program.functions.get(n))
@@ -138,7 +147,10 @@ class Target:
 
     @cached_property
     def sincos(self) -> bool:
-        """Whether the generated C computes sines and cosines itself rather than by libm."""
+        """Whether the generated C has its own function for sines and cosines.
+
+        Otherwise the C code calls sin and cos of the C mathematics library, or needs neither.
+        """
         return self.real.reach > 0 and any(
             isinstance(a.value, Call) and a.value.function in ("sin", "cos")
             for f in self.program.functions.values()
@@ -147,11 +159,11 @@ class Target:
 
     @property
     def zero(self) -> str:
-        """The C literal of 0 in the type of numbers, such as 0.0f."""
+        """The C literal of 0 in the scene's type of floating-point numbers, such as 0.0f."""
         return "0.0" + self.real.suffix
 
     def literal(self, value: float) -> str:
-        """Return a number as a C literal of the type of numbers, such as 0.5f."""
+        """Return a C literal of the scene's type of floating-point numbers, such as 0.5f."""
         text = repr(value)
         return (
             text if "." in text or "e" in text or "n" in text else text + ".0"
@@ -162,8 +174,8 @@ class Target:
     def where(self) -> dict[str, str]:
         """Return the C expression of each coordinate, velocity, input and parameter, by name.
 
-        For example `p->m_c` for the parameter m_c. Other variables are local variables in C, with
-        "_" appended to reserved names.
+        An example is `p->m_c` for the parameter m_c. Variables other than parameters are local
+        variables in C; names that the C code reserves have "_" appended.
         """
         s = self.system
         expressions = {x.name: c_function.member("p", x.name) for x in s.parameters}
@@ -175,7 +187,8 @@ class Target:
     ) -> Body:
         """Return the C statements of a function of the program.
 
-        where: C expressions of further names. options: keyword arguments of `c_expression.body`.
+        where: C expressions of variables, by name, in addition to those of `Target.where`. options:
+        keyword arguments of `c_expression.body`.
         """
         known = self.where() | dict(where or {})
         reserved = self.system.names
@@ -186,8 +199,9 @@ class Target:
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:
         """Return definitions of C local variables for the array elements that a function reads.
 
-        state, inputs: functions (array, name) that return the C expression of an element of q, qd,
-        qdd and along (a direction), and of u.
+        state, inputs: functions that map the name of an array and of a variable to the C expression
+        of the element. `state` is for the arrays q, qd, qdd and along (a direction); `inputs` is
+        for u.
         """
         s, real, uses = self.system, self.real.name, function.uses
         NQ = f"{self.PREFIX}_NQ"
@@ -210,12 +224,12 @@ class Target:
     def element(self, array: str, name: str) -> str:
         """Return the C expression of an array element, such as q[CARTPOLE_THETA].
 
-        name: of a coordinate or input.
+        array: name of the C array. name: coordinate or input whose element it is.
         """
         return f"{array}[{self.enum[name]}]"
 
     def groups(self) -> dict[str, frozenset[str]]:
-        """Return, for each C argument, the names of the variables that it supplies.
+        """Return the names of the variables that each C argument supplies, by the argument's name.
 
         The arguments are q, qd, qdd, wrenches, lambda, t, u, p and along (a direction in q, qd and
         u).
@@ -235,7 +249,10 @@ class Target:
 
 
 def rename_reserved(function: Function) -> Function:
-    """Return the function with "_" appended to the names of values that the C templates reserve."""
+    """Return the function with its values renamed where the C templates reserve their names.
+
+    A renamed value has "_" appended to its name.
+    """
     clash = {
         a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in RESERVED_NAMES
     }
@@ -248,7 +265,7 @@ def local(name: str) -> str:
 
 
 def sentence(function: Function) -> str:
-    """Return a sentence for comments with the numbers of operations of one call of a function."""
+    """Return a sentence for comments that states the operation counts of a call of a function."""
     cost = str(function.cost)
     return cost[0].upper() + cost[1:] + "."
 

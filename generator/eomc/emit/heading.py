@@ -28,12 +28,18 @@ def stamp(target: Target) -> list[FreeText]:
 
 
 def notes(target: Target) -> list[str]:
-    """Return comment lines that state where unusual terms of the kinetic energy K appear."""
+    """Return comment lines about terms of the kinetic energy K that are unusual.
+
+    Such terms are not quadratic in the velocities; the lines state in which functions they appear.
+    """
     return [line for note in target.program.notes for line in textwrap.wrap(note, 92)]
 
 
 def description(target: Target) -> list[FreeText]:
-    """Return comment lines with the scene's note and with the names that differ in C."""
+    """Return comment lines that describe the scene.
+
+    They are the scene's note and a list of the names that differ in C.
+    """
     s = target.system
     lines = textwrap.wrap(flat(s.note), 92) if s.note else []
     if lines:
@@ -45,9 +51,7 @@ def description(target: Target) -> list[FreeText]:
 
 
 def words(unit: str, note: str) -> FreeText:
-    """Return the unit and the note of a coordinate, input or parameter as one text, for
-    comments.
-    """
+    """Return a comment with the unit and the note of a coordinate, input or parameter."""
     return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
 
 
