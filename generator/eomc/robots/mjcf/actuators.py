@@ -50,9 +50,10 @@ def read_actuators(
     root: Tag, bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Tendons,
     reader: Reader,
 ) -> tuple[list[MjcfJoint], list[Actuator]]:  # fmt: skip
-    """Return the joints with the armature and damping of their actuators, and the actuators.
+    """Return the joints and the actuators of a file.
 
-    Tendons are changed in place. `bodies` are in the pose of the file, and have masses.
+    The armature and damping of actuators are added to the joints, and to `tendons` in place.
+    `bodies` are in the pose of the file, and have masses.
     """
     by_name = {joint.name: joint for joint in joints}
     tags = [tag for section in root.each("actuator") for tag in section.children]
@@ -229,10 +230,10 @@ def _range_note(report: Report, name: str, own: Range, control: Range, force: Ra
 def with_key_frame_start(
     root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: Report
 ) -> tuple[list[MjcfJoint], tuple[Drive, ...]]:
-    """Return the joints and drives with the initial values of the key frame "home".
+    """Return the joints and drives with the initial values from the file's key frame "home".
 
-    Joints whose yaw, pitch and roll are singular at the start, at a pitch of a quarter turn, are
-    reported.
+    A joint whose yaw, pitch and roll are singular at the start (pitch of a quarter turn) is noted
+    in the report.
     """
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):

@@ -39,23 +39,27 @@ class _Ends:
     anchors: Mapping[str, Vector]
 
     def of_file(self, body: str) -> Pose:
-        """Return the pose in the world of a body's frame as the file defines it.
+        """Return the pose in the world of the frame that the file defines for a body.
 
-        The frames of the file and of the scene differ by an offset.
+        `body` is the body's name. The frames of the file and of the scene differ by an offset.
         """
         back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
         return self.poses[body].compose(back)
 
     def point(self, body: str, place: Vector) -> Vector:
-        """Return the position of a point of the world in a body's frame in the scene (m)."""
+        """Return the position of a point in the body's frame of the scene (m).
+
+        `body` is the body's name, and `place` the position of the point in the world (m).
+        """
         at, turn = self.poses[body]
         x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
         return _plain(x), _plain(y), _plain(z)
 
     def shifted(self, body: str, point: Vector) -> Vector:
-        """Return the position of a point in a body's frame in the scene (m).
+        """Return the position of a point in the body's frame of the scene (m).
 
-        `point` is its position in the body's frame in the file.
+        `body` is the body's name, and `point` the position of the point in the body's frame of the
+        file (m).
         """
         return plus(point, scaled(self.anchors.get(body, ORIGIN), -1.0))
 
@@ -104,7 +108,10 @@ class _Reading:
         self.couplings: list[Coupling] = []
 
     def read(self, tag: Tag) -> None:
-        """Read one equality constraint, or note in the report that it is left out."""
+        """Convert one equality constraint, or note in the report that it is left out.
+
+        `tag` is the element of the constraint in the file.
+        """
         report = self.reader.report
         a = self.reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "equality")
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]

@@ -54,7 +54,7 @@ Classes = dict[str, dict[str, Attributes]]
 
 @dataclass
 class Report:
-    """What reading a file yields besides the robot.
+    """Errors and notes from reading an MJCF file.
 
     Attributes
     ----------
@@ -71,11 +71,14 @@ class Report:
     left: dict[str, list[str]] = field(default_factory=dict)
 
     def leave(self, kind: str, name: str = "") -> None:
-        """Record that the part `name` of a kind is left out of the model."""
+        """Record that a part of the file is left out of the model.
+
+        `kind` describes the kind of part, and `name` is its name, or "" without one.
+        """
         self.left.setdefault(kind, []).append(name)
 
     def read(self, kind: str, name: str) -> None:
-        """Remove the record that the part `name` of a kind is left out."""
+        """Remove the record that the part `name` of the given kind is left out of the model."""
         those = self.left.get(kind, [])
         if name in those:
             those.remove(name)
@@ -83,7 +86,10 @@ class Report:
                 del self.left[kind]
 
     def lines(self) -> tuple[str, ...]:
-        """Return one note for each kind of part that is left out; a name counts once."""
+        """Return the notes on what is left out: one for each kind of part, with number and names.
+
+        A name that was recorded twice counts once. Notes on unknown elements come first.
+        """
         lines = [*self.strangers]
         for kind, those in self.left.items():
             names = [*dict.fromkeys(name for name in those if name)]
@@ -115,7 +121,10 @@ class AttributeReader:
         return self.attributes.get(key, default)
 
     def fault(self, message: str) -> None:
-        """Report a fault at the line of the element. Reading continues, to report all faults."""
+        """Add an error message, with the line of the element, to the report.
+
+        Reading continues, so that all faults are reported together.
+        """
         tag = self.tag
         self.report.faults.append(Problem(message, element_label(tag), str(tag.file), tag.line))
 
@@ -220,7 +229,7 @@ class Settings:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def angle(self, value: float) -> float:
-        """Return an angle given in the file's unit (degrees or radians) in rad."""
+        """Return an angle in rad; `value` is in the file's unit (degrees or radians)."""
         return math.radians(value) if self.degrees else value
 
 
@@ -288,14 +297,17 @@ def element_label(tag: Tag) -> str:
 
 
 def missing(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the message that nothing of this kind has the name, with a similar name of `known`."""
+    """Return the error message that there is no `kind` called `name`.
+
+    The message proposes a similar name among `known`, if there is one.
+    """
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
 def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
-    """Report the attributes of an element that change the motion in MuJoCo but are not read.
+    """Note in the report those attributes of an element that are ignored but affect the motion.
 
-    They are listed in `UNREAD` for its `kind`.
+    `UNREAD` lists such attributes for each `kind` of element. `name` is that of the element.
     """
     for key, what in UNREAD[kind].items():
         if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):

@@ -51,10 +51,10 @@ TYPES = ("hinge", "slide", "ball", "free")
 
 
 def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint | None:
-    """Return the joint that an element describes; None after a fault.
+    """Return the joint that an element of the file describes, or None if the element has a fault.
 
-    `pose` is that of the joint's body in its parent's frame. The motions of free and ball joints
-    are named by `with_coordinate_names`.
+    `pose` is the pose of the joint's body in the parent's frame. The motions of free and ball
+    joints get their final names later, from `with_coordinate_names`.
     """
     report, settings, tag = reader.report, reader.settings, placed.tag
     free = tag.kind == "freejoint"
@@ -195,14 +195,15 @@ def _limits(
 
 
 def without_limits(joint: MjcfJoint) -> MjcfJoint:
-    """Return the joint with unlimited positions."""
+    """Return the joint without its position limits."""
     return joint._replace(motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
 
 
 def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
-    """Return True if the range that the attribute `key` of an element switches is active.
+    """Return True if a range of an element is active.
 
-    "auto" means that it is active if the file says so (autolimits).
+    The attribute `key` (such as "limited") activates it by "true". With "auto", the default, it is
+    active if the file's setting `autolimits` is true.
     """
     word = a.get(key, "auto")
     return word == "true" or (word == "auto" and settings.autolimits)
@@ -217,11 +218,11 @@ def unique_name(name: str, taken: Collection[str]) -> str:
 
 
 def with_coordinate_names(joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
-    """Return the joints with unique names of coordinates.
+    """Return the joints with unique names of their coordinates.
 
-    A hinge or slide has the name of its joint. The coordinates of a free joint are x, y, z, yaw,
-    pitch and roll, those of a ball joint yaw, pitch and roll, with the joint's name appended. If
-    the file has exactly one free joint, nothing is appended to the names of its coordinates.
+    The coordinate of a hinge or slide has the name of its joint. The coordinates of a free joint
+    are x, y, z, yaw, pitch and roll, those of a ball joint yaw, pitch and roll. The joint's name is
+    appended to them, except for a free joint that is the only one in the file.
     """
     taken = {joint.name for joint in joints if joint.type in {"hinge", "slide"}}
     several = sum(joint.type == "free" for joint in joints) > 1

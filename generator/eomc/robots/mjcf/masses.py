@@ -44,9 +44,9 @@ class Pose(NamedTuple):
     turn: Matrix
 
     def compose(self, other: Pose) -> Pose:
-        """Return the pose of `other` in the outer frame of this pose.
+        """Return the product of two poses: frame C in frame A, from B in A and C in B.
 
-        `other` is a pose relative to the frame of this pose.
+        This pose is that of B in A, and `other` is that of C in B.
         """
         return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
 
@@ -62,7 +62,10 @@ class Mass(NamedTuple):
     inertia: Inertia = NO_INERTIA
 
     def in_frame(self, pose: Pose) -> Mass:
-        """Return the mass in the outer frame; `pose` is the pose of its own frame in that frame."""
+        """Return the mass with its centre and inertia tensor transformed to another frame.
+
+        `pose` is the pose of the present frame in that other frame.
+        """
         return Mass(
             self.mass,
             plus(pose.place, apply(pose.turn, self.center)),
@@ -111,17 +114,19 @@ class Reader:
     def attributes_with_defaults(self, placed: Placed, kind: str) -> AttributeReader:
         """Return the attributes of an element, completed by those of its default class.
 
-        The class is that of the element, else the enclosing childclass; `kind` is the element's
-        name in the class.
+        The default class is the one that the element names, or else the `childclass` of the
+        enclosing bodies. `kind` is the kind of element, such as "joint", to which entries of the
+        class apply.
         """
         tag = placed.tag
         default = self.class_of(tag.get("class", placed.childclass), tag)
         return AttributeReader(merged(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
-        """Return the default class `name`: attributes of each kind of element.
+        """Return the default class `name`, which maps each kind of element to its attributes.
 
-        It is the outermost class if the name is "", or after a fault, which is reported for `tag`.
+        If the name is "", this is the outermost class. If there is no such class, a fault is
+        reported for the element `tag`, and the outermost class is returned.
         """
         if name and name not in self.classes:
             self.own_attributes(tag).fault(missing("default class", name, self.classes))
@@ -137,9 +142,9 @@ class Reader:
 
 
 def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
-    """Return the unit vector along `vector`; None if its length is zero, which is reported.
+    """Return the unit vector along `vector`, or None if its length is zero.
 
-    `what` names the vector in the message.
+    A length of zero is reported as a fault; `what` describes the vector in the message.
     """
     x, y, z = vector
     if math.hypot(x, y, z) < 1e-14:
@@ -374,9 +379,10 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
 
 
 def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, is_static: bool) -> Mass:
-    """Return the mass of a body in its frame, from <inertial> or from its geoms.
+    """Return the mass of a body in the body's frame, from its <inertial> or its <geom> elements.
 
-    `inner` are the elements in the body; `is_static` says that the body does not move.
+    `tag` is the body's element, and `inner` are the elements in it. `is_static` says that the body
+    does not move.
     """
     how = reader.settings.inertia
     inertials = [p for p in inner if p.tag.kind == "inertial"]

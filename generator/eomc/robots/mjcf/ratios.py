@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 def has_ratio(law: Law | None) -> bool:
-    """Return True if the damping of a control law is a damping ratio.
+    """Return True if the control law of an actuator specifies its damping as a damping ratio.
 
-    MJCF has one for a servo of positions whose velocity coefficient is positive.
+    In MJCF this is a position servo with a positive velocity coefficient.
     """
     return bool(law and law.bias[2] > 0 and law.set_point == "kp" and law.kp > 0)
 
@@ -65,11 +65,12 @@ def sprung(
     tendons: Iterable[Tendon],
     disabled: Collection[str],
 ) -> list[MjcfJoint]:
-    """Return the joints with stiffness and damping in place of a springdamper.
+    """Return the joints with each `springdamper` replaced by a stiffness and a damping.
 
-    With the time constant t and the damping ratio r, the stiffness is m/(t r)^2 and the damping
-    2 m/t, where 1/m is the mean of M^-1 along the joint's coordinates. The damping of actuators is
-    added. `disabled` contains the effects that flags of the file disable.
+    MJCF specifies a springdamper by a time constant t and a damping ratio r. The stiffness is
+    m/(t r)^2 and the damping 2 m/t, where 1/m is the mean of M^-1 along the joint's coordinates and
+    M is the mass matrix. The damping of actuators is added. `disabled` contains the effects that
+    flags of the file disable.
     """
     import numpy as np
 
@@ -97,10 +98,10 @@ def sprung(
 def masses_at_start(
     bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Iterable[Tendon]
 ) -> tuple[NDArray[np.float64], list[str]]:
-    """Return the mass matrix in the pose of the file, and the name of each row's coordinate.
+    """Return the mass matrix in the pose of the file, and the names of the coordinates of its rows.
 
-    The rotations of free and ball joints have rows about x, y and z, which are named by the joint's
-    angles.
+    Free and ball joints have rows for rotations about x, y and z; the names are those of the
+    joint's angles.
     """
     import numpy as np
 

@@ -58,12 +58,13 @@ KINDS = {
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
-    """Return the robot of an MJCF file.
+    """Return the robot that an MJCF file describes.
 
-    Coordinates are MuJoCo's qpos: a hinge or slide has its `ref` in the pose in which the file
-    is written. Free and ball joints have yaw, pitch and roll in place of the quaternion; those of
-    a free joint begin at the body's own orientation, those of a ball joint at zero. The start is
-    the key frame called "home", or else the pose in which the file is written.
+    The coordinates are those of MuJoCo's qpos: in the pose in which the file is written, a hinge or
+    slide has the value of its attribute `ref`. Free and ball joints have yaw, pitch and roll in
+    place of MuJoCo's quaternion. In that pose, these angles are zero for a ball joint, and those of
+    the body's orientation for a free joint. The initial state is the key frame called "home", or
+    else the pose in which the file is written.
 
     With `include`, files that <include> names are opened if they lie in the folder of `path`.
 

@@ -56,7 +56,11 @@ class Tendons:
         self._reader.report.read(LEFT, f"fixed {name}".rstrip())
 
     def driven(self, name: str) -> str:
-        """Record that an actuator drives a fixed tendon, and return the tendon's unique name."""
+        """Record that an actuator drives a tendon, and return the unique name of the tendon.
+
+        `name` is the tendon's name in the file. It is a fixed tendon: a linear combination of joint
+        positions.
+        """
         self._driven.add(name)
         self.reads(name)
         return self.fixed[name].name
