@@ -14,20 +14,27 @@ _MAX_TERMS = 50  # of one sum: each term nests the formula deeper, and the limit
 
 
 def law_names(drive: Drive) -> tuple[str, ...]:
-    """Return the suffixes of the names in the scene that belong to a drive with a control law.
+    """Return the suffixes with which a drive's control law extends the drive's name.
 
-    Appended to the drive's name, they give its force and its gains kp and kv. Empty without a law.
+    The extended names are those of its force and of its gains kp and kv in the scene. Returns ()
+    if the drive has no control law.
     """
     return ("_force", "_kp", "_kv") if drive.law else ()
 
 
 def inputs(robot: Robot) -> dict[str, str]:
-    """Return the entries of the scene's table [inputs]: the TOML text of each drive, by name."""
+    """Return the entries of the scene's table [inputs]: the TOML text of each input, by name.
+
+    The scene has one input for each drive of the robot.
+    """
     return {d.name: _input(d, robot) for d in robot.drives}
 
 
 def gains(robot: Robot) -> dict[str, str]:
-    """Return the gains kp and kv of servos as entries of the scene's table [parameters]."""
+    """Return the entries of the scene's table [parameters] for the gains of servos.
+
+    They map the name of each gain (kp or kv) to its TOML text.
+    """
     units, entries = _units(robot), {}
     for d in robot.drives:
         if d.law:
@@ -82,9 +89,9 @@ def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
 
 
 def force(coordinate: str, robot: Robot) -> str:
-    """Return the formula of the force that drives exert along a coordinate (`actuator` in a scene).
+    """Return the formula of the force (N or N m) that drives exert along a coordinate.
 
-    It is "0" if no drive acts on the coordinate.
+    It is the value of the key `actuator` in a scene, and "0" if no drive acts on the coordinate.
     """
     terms = [
         (by * d.gear, f"{d.name}_force" if d.law else d.name)

@@ -172,10 +172,11 @@ def with_nearest_inertias(robot: Robot) -> Robot:
 
 
 def with_base(robot: Robot, free: bool) -> Robot:
-    """Return the robot with its root body free to move (`free`), or fixed to the world.
+    """Return the robot with its root body either free to move or fixed to the world.
 
-    A root that becomes fixed keeps its pose at the start; one that becomes free starts in the pose
-    in which it was fixed. Raises EomcError if several bodies are attached to the world.
+    `free` selects which. A root body that becomes fixed keeps its pose at the start. One that
+    becomes free starts in the pose in which it was fixed. Raises EomcError if several bodies are
+    attached to the world.
     """
     roots = [body for body in robot.bodies if body.parent == WORLD]
     if len(roots) != 1:

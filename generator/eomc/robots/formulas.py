@@ -15,9 +15,9 @@ def number(x: float) -> str:
 
 
 def angle(x: float) -> str:
-    """Return an angle x (rad) as a scene writes it: 0.3, or "pi/2" in quotes.
+    """Return the TOML text of an angle x (rad): a number such as 0.3, or a formula such as "pi/2".
 
-    Multiples of pi/12, to within 1e-10, are written with pi.
+    The formula, in quotes, is used for multiples of pi/12, to within 1e-10.
     """
     twelfths = round(x * 12 / math.pi)
     if abs(x - twelfths * math.pi / 12) > SNAP or abs(twelfths) > 48:
@@ -40,21 +40,27 @@ def _shortest(x: float) -> str:
 
 
 def length(x: float, of: str) -> str:
-    """Return an angle (rad) or a length (m) as a scene writes it; `of` is "rad" or "m"."""
+    """Return the TOML text of x, an angle if `of` is "rad", or a length if `of` is "m".
+
+    An angle that is a multiple of pi/12 is written as a formula in quotes, such as "pi/2".
+    """
     return angle(x) if of == "rad" else number(x)
 
 
 def vector(v: Vector) -> str:
-    """Return a vector as a TOML array."""
+    """Return the TOML text of a vector, an array of numbers."""
     return f"[{', '.join(map(number, v))}]"
 
 
 def total(terms: Sequence[tuple[float, str]]) -> str:
-    """Return the formula of a sum of terms (factor, name), such as "2*q1 - q2"."""
+    """Return the formula of a linear combination as text, such as "2*q1 - q2".
+
+    `terms` are pairs (factor, name of a coordinate).
+    """
     shown = [{1.0: q, -1.0: f"-{q}"}.get(by, f"{number(by)}*{q}") for by, q in terms]
     return " + ".join(shown).replace("+ -", "- ") or "0"
 
 
 def less(text: str, x: float) -> str:
-    """Return the formula `text` minus the number x."""
+    """Return the text of the formula `text` minus the number x, such as "q1 - 0.5"."""
     return f"{text} - {number(x)}".replace("- -", "+ ") if x else text

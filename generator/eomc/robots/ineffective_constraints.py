@@ -16,9 +16,10 @@ GAP_TOLERANCE = 1e-6  # m: a larger gap is reported
 
 
 def without_ineffective_constraints(robot: Robot) -> Robot:
-    """Return the robot without loops and couplings whose Jacobian is zero in all positions.
+    """Return the robot without those loops and couplings that have no effect on the motion.
 
-    They are noted in `left_out`. MuJoCo gives such a constraint no equations.
+    Their Jacobian is zero in all positions. They are noted in `Robot.left_out`. MuJoCo, too, gives
+    such a constraint no equations.
     """
     if not robot.loops and not robot.couplings:
         return robot

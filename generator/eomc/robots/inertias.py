@@ -14,9 +14,10 @@ TRIANGLE = 1e-6  # relative excess of a principal moment over the other two that
 
 
 def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
-    """Return the inertia tensor A I A^T, in the frame to whose axes A transforms vectors.
+    """Return the inertia tensor A I A^T, in which entries that are only rounding errors are zero.
 
-    Entries that are only rounding errors become zero.
+    A is the rotation matrix that transforms vectors from the frame of `inertia` to that of the
+    result.
     """
     size = 1e-15 * max(map(abs, inertia))
     return six(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
@@ -31,9 +32,9 @@ def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
 
 
 def indefinite(inertia: Inertia) -> str:
-    """Return a message if a principal moment of inertia is negative, else "".
+    """Return an error message if a principal moment of inertia is negative, otherwise "".
 
-    The message proposes the nearest valid tensor, if there is one.
+    The message proposes the nearest valid tensor, unless that tensor is zero (see `has_nearest`).
     """
     moments, _ = principal(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
@@ -51,10 +52,10 @@ def indefinite(inertia: Inertia) -> str:
 
 
 def has_nearest(inertia: Inertia) -> bool:
-    """Return True if the nearest valid tensor differs from zero.
+    """Return True if the valid inertia tensor nearest to `inertia` differs from zero.
 
-    It is zero if one principal moment is negative and fewer than two are positive; the tensor in
-    the file then has wrong signs.
+    A tensor is valid if a body can have it. The nearest one is zero if one principal moment of
+    `inertia` is negative and fewer than two are positive. The signs in the file are then wrong.
     """
     (small, middle, _), _ = principal(inertia)
     tiny = TRIANGLE * max(map(abs, inertia))
@@ -62,7 +63,10 @@ def has_nearest(inertia: Inertia) -> bool:
 
 
 def unbalanced(inertia: Inertia) -> str:
-    """Return a message if a principal moment of inertia exceeds the sum of the others, else ""."""
+    """Return a message if a principal moment of inertia exceeds the sum of the others.
+
+    No body has such an inertia. Returns "" for a valid tensor.
+    """
     (small, middle, large), _ = principal(inertia)
     if large <= (small + middle) * (1 + TRIANGLE):
         return ""
@@ -99,5 +103,5 @@ def nearest(inertia: Inertia) -> Inertia:
 
 
 def shown(inertia: Inertia) -> str:
-    """Return the six entries of an inertia tensor as text, for a message."""
+    """Return the text of the six different entries of an inertia tensor, for a message."""
     return f"[{', '.join(f'{x:.8g}' for x in inertia)}]"

@@ -16,7 +16,7 @@ _STOPS = "those of speed and effort are notes"  # a note of edit.with_joint_stop
 
 
 def input_range(force: Range, factor: float) -> Range:
-    """Return the limits of an input for which the force `factor` times input stays in `force`."""
+    """Return the range of an input such that `factor` times the input is in the range `force`."""
     if not factor:
         return UNLIMITED
     low, high = sorted(f / factor for f in force)

@@ -58,7 +58,10 @@ def _tips(robot: Robot) -> list[str]:
 
 
 def parameters(robot: Robot) -> dict[str, str]:
-    """Return the masses and payloads as entries of the scene's table [parameters], by name."""
+    """Return the entries of the scene's table [parameters] for masses and payloads.
+
+    They map the name of each mass parameter to its TOML text.
+    """
     entries = {}
     for b in robot.bodies:
         if b.parameter:
@@ -68,7 +71,7 @@ def parameters(robot: Robot) -> dict[str, str]:
 
 
 def inertia_text(body: RobotBody) -> str:
-    """Return the inertia tensor about the centre of mass as a TOML array.
+    """Return the TOML text of a body's inertia tensor about its centre of mass.
 
     If the mass is a parameter of the scene, the entries are formulas proportional to it.
     """

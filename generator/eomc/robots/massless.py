@@ -9,9 +9,10 @@ from eomc.scene.joints import JOINTS
 
 
 def without_inertia(robot: Robot) -> list[str]:
-    """Return a message for each joint that moves no mass or inertia, followed by a remedy.
+    """Return messages on the joints that move no mass or inertia.
 
-    Empty if there is none.
+    There is one message for each such joint; one last message proposes a remedy for all of them.
+    The list is empty if there is no such joint.
     """
     faults: dict[str, str] = {}  # by coordinate
     locks: dict[str, str] = {}
@@ -43,9 +44,10 @@ def without_inertia(robot: Robot) -> list[str]:
 
 
 def light_root(robot: Robot) -> str:
-    """Return the name of the free body without mass that carries exactly one joint, or "".
+    """Return the name of a free body without mass that carries exactly one joint.
 
-    Bodies fixed to it count as part of it. Such a body cannot resist the motion of its joint.
+    Returns "" if there is none. Bodies fixed to the free body count as part of it. Such a body
+    cannot resist the motion of the joint that it carries.
     """
     for root in (b for b in robot.bodies if b.joint == "free" and b.parent == WORLD):
         mine, joints = {root.name}, list[RobotBody]()

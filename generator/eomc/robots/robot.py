@@ -156,9 +156,10 @@ class Law:
 
     @property
     def set_point(self) -> str:
-        """The quantity that the input is the set point of: "kp" for position, "kv" for velocity.
+        """The gain of the quantity for which the input is a set point, or "".
 
-        It is "" if the input is no set point.
+        It is "kp" if the input is the set point of the position, "kv" if it is that of the
+        velocity, and "" if the input is no set point.
         """
         gain, *more = self.gain
         if not gain or any(more):
@@ -200,7 +201,7 @@ class Drive:
 
     @property
     def ends(self) -> Range:
-        """The range of the drive's force, before the gear."""
+        """The range of the drive's force before it is multiplied by the gear factor."""
         return self.law.force if self.law else self.limits
 
     @property
@@ -235,7 +236,10 @@ class Tendon:
 
     @property
     def acts(self) -> bool:
-        """Whether the tendon has stiffness, damping or armature, with or without a drive."""
+        """Whether the tendon itself has stiffness, damping or armature.
+
+        A drive that acts on the tendon does not count.
+        """
         return bool(self.stiffness or self.damping or self.armature)
 
 
@@ -292,15 +296,18 @@ class Coupling:
         return {q for _, q in (*self.first, *self.second)}
 
     def excess(self, values: Mapping[str, float]) -> float:
-        """Return the residual: the left side minus the right side, at the given coordinates."""
+        """Return the residual of the constraint: its left side minus its right side.
+
+        `values` are the coordinates by name.
+        """
         first, second = (sum(by * values[q] for by, q in s) for s in (self.first, self.second))
         right = sum(a * (second - self.at) ** k for k, a in enumerate(self.polynomial))
         return first - self.zero - right
 
     def root(self, near: float) -> float | None:
-        """Return the value of the only coordinate that satisfies the constraint, closest to `near`.
+        """Return the value of a coordinate that satisfies a constraint on this coordinate alone.
 
-        None if there is none.
+        Among several solutions it is the one closest to `near`. None if there is no solution.
         """
         from numpy.polynomial import Polynomial
 
@@ -348,12 +355,19 @@ class Robot:
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
     def coordinate_terms(self, name: str) -> Terms:
-        """Return the pairs (factor, coordinate) whose sum is a coordinate or a tendon's length."""
+        """Return a coordinate or the length of a tendon as a linear combination of coordinates.
+
+        `name` is that of the coordinate or tendon. The result has a pair (factor, coordinate) for
+        each term.
+        """
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
 def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
-    """Return the error with a note on parts of the file that are not read and may be its cause."""
+    """Return the error with an additional note on parts of the robot file that are left out.
+
+    Such parts (`left_out`) may be the cause of the error.
+    """
     if left_out:
         listed = "".join(f"\n  - {texts.line(words)}" for words in left_out)
         fault.add_note(f"not read of this file, which may be the cause:{listed}")
@@ -361,9 +375,10 @@ def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
 
 
 def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
-    """Return the pose of a body in its parent's frame, offset (m) and rotation, at joint positions.
+    """Return the pose of a body in its parent's frame for given positions of its joint.
 
-    `values` contains the position of each coordinate of its joint (rad or m).
+    The pose is the offset (m) and the rotation matrix. `values` contains the position of each
+    coordinate of the joint (rad or m).
     """
     offset, rotation = body.offset, body.rotation
     joint = JOINTS[body.joint]
@@ -376,7 +391,10 @@ def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]
 
 
 def fix_body(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
-    """Return the body with a fixed joint in the given pose, offset (m) and rotation."""
+    """Return the body, fixed to its parent in the given pose.
+
+    The pose is the offset (m) and the rotation matrix of the body's frame in the parent's frame.
+    """
     return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
 
 
@@ -487,7 +505,8 @@ def _reduced(c: Coupling, values: Mapping[str, float]) -> Coupling:
 def free_motions(of: str = "") -> tuple[Motion, ...]:
     """Return the six coordinates of a free body: x, y, z (m), yaw, pitch, roll (rad).
 
-    A non-empty `of` is appended to their names.
+    `of` is the name of the body or joint; if it is not empty, it is appended to the names of the
+    coordinates.
     """
     end = f"_{of}" if of else ""
     slides = (Motion(f"{name}{end}", "m") for name in "xyz")
@@ -500,14 +519,14 @@ def free_motions(of: str = "") -> tuple[Motion, ...]:
 
 
 def without_dust(body: RobotBody) -> Inertia:
-    """Return a body's inertia, or zero if it is a rounding error.
+    """Return a body's inertia tensor, or zero if the tensor is a rounding error.
 
-    It is one if the radii of gyration are below 0.1 um.
+    It is a rounding error if the radii of gyration are below 0.1 um.
     """
     dust = max(map(abs, body.inertia)) <= 1e-14 * body.mass
     return NO_INERTIA if dust else body.inertia
 
 
 def joined(*notes: str) -> str:
-    """Return the non-empty notes joined by semicolons."""
+    """Return one text with all notes that are not empty, separated by semicolons."""
     return "; ".join(note for note in notes if note)

@@ -31,12 +31,15 @@ def cleaned(a: Matrix) -> Matrix:
 
 
 def times(a: Matrix, b: Matrix) -> Matrix:
-    """Return the product A B of two rotation matrices, cleaned."""
+    """Return the product A B of two rotation matrices, with rounding errors removed.
+
+    Entries within 1e-12 of 0, 1 and -1 are rounded to these.
+    """
     return cleaned(product(a, b))
 
 
 def unit(v: Vector) -> Vector:
-    """Return v/|v|. Raises ValueError if |v| is zero or not finite."""
+    """Return the unit vector v/|v|. Raises ValueError if |v| is zero or not finite."""
     size = math.hypot(*v)
     if not size or not math.isfinite(size):
         raise ValueError("a vector of length zero" if not size else "a vector that is not finite")
@@ -91,9 +94,9 @@ def from_euler(sequence: str, angles: Sequence[float]) -> Matrix:
 
 
 def toward(z: Vector) -> Matrix:
-    """Return the smallest rotation that takes the z axis to the unit vector `z`.
+    """Return the matrix of the smallest rotation that takes the z axis to the unit vector `z`.
 
-    For the opposite direction it is half a turn about x.
+    If `z` is opposite to the z axis, it is half a turn about x.
     """
     sine = math.hypot(z[0], z[1])
     axis = (-z[1], z[0], 0.0) if sine > 1e-10 else (1.0, 0.0, 0.0)
@@ -101,11 +104,11 @@ def toward(z: Vector) -> Matrix:
 
 
 def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
-    """Return the rotations about z, y and x that make up the rotation matrix `a`, as (axis, angle).
+    """Return the rotations about z, y and x whose product is the rotation matrix `a`.
 
-    Zero rotations are left out. Near a pitch of pi/2 only the sum of the other two angles is well
-    determined: the last one is computed from the rotation that remains after the first, which
-    compensates the first one's rounding error.
+    Each is a pair (axis, angle in rad). Zero rotations are left out. Near a pitch of pi/2 only the
+    sum of the other two angles is well determined. The last angle is therefore computed from the
+    rotation that remains after the first one, which compensates its rounding error.
     """
     yaw = math.atan2(a[1][0], a[0][0]) if math.hypot(a[0][0], a[1][0]) > 1e-12 else 0.0
     rest = times(transposed(from_axis_angle((0.0, 0.0, 1.0), yaw)), a)
@@ -119,9 +122,9 @@ def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
 
 
 def yaw_pitch_roll(a: Matrix) -> Vector:
-    """Return the angles (rad) with a = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return the yaw, pitch and roll (rad) of a rotation matrix a = Rz(yaw) Ry(pitch) Rx(roll).
 
-    Where they are singular, at a pitch of a quarter turn, the roll is 0.
+    At a pitch of a quarter turn, where the angles are singular, the roll is 0.
     """
     cosine = math.hypot(a[0][0], a[1][0])
     pitch = math.atan2(-a[2][0], cosine)

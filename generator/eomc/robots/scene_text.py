@@ -38,12 +38,14 @@ _NAME = 32  # characters of a name, to leave room for suffixes such as "_torque"
 
 
 def prepared_for_scene(robot: Robot) -> Robot:
-    """Return the robot with names that are valid in a scene and with massless frames as points.
+    """Return the robot in the form in which it can be written as a scene (the TOML input).
 
-    Constraints without effect are removed, and adaptive steps are selected if forces are stiff.
+    Its names are valid in a scene, massless frames become points, and constraints without effect
+    are removed. Adaptive steps are selected if forces are stiff. Tensors that violate the triangle
+    inequality are noted in `left_out`.
+
     Raises EomcError if no joint moves, if a joint moves no mass or inertia, or if an inertia tensor
-    is not positive semi-definite. Tensors that violate the triangle inequality are noted in
-    `left_out`.
+    is not positive semi-definite.
     """
     robot = without_ineffective_constraints(robot)
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
@@ -191,7 +193,7 @@ def _renamed(old: str, new: str, note: str) -> str:
 def scene_text(robot: Robot) -> str:
     """Return the scene of a robot as TOML text, without keys that have their default values.
 
-    Numbers are written exactly, except angles within 1e-10 of a multiple of pi/12: these are
+    Numbers are written exactly, except angles within 1e-10 of a multiple of pi/12. These are
     written as multiples of pi, so that their sines are exact.
     """
     robot = prepared_for_scene(robot)

@@ -63,10 +63,11 @@ def parse(outline: str, groups: Mapping[str, str]) -> Element:
 
 
 def unknown_parts(root: Tag, element: Element, of: str) -> tuple[str, ...]:
-    """Return, in words, the elements, attributes and texts of a file that its format does not have.
+    """Return descriptions of the parts of a file that its format does not define.
 
-    `of` is the name of the format, such as "URDF". The contents of unknown elements are not
-    checked.
+    The parts are elements, attributes and texts. `root` is the file's root element, and `element`
+    describes what the format permits in it. `of` is the name of the format, such as "URDF". The
+    contents of unknown elements are not checked.
     """
     unknown: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
 

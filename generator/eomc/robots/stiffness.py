@@ -54,7 +54,7 @@ class Element:
     stiffness: float = 0.0
 
     def is_stiff(self, inverse: Array) -> bool:
-        """Return True if the element alone makes a scene's default steps unstable.
+        """Return True if this damper and spring alone make a scene's default steps unstable.
 
         `inverse` is the inverse of the mass matrix.
         """
@@ -64,10 +64,10 @@ class Element:
 
 
 def with_stable_steps(robot: Robot) -> Robot:
-    """Return the robot with adaptive steps if the default steps are unstable at the start.
+    """Return the robot, with adaptive steps if a scene's default steps are unstable.
 
-    Friction that is too stiff for adaptive steps too is smoothed over a wider range of velocities.
-    Both are noted in `left_out`.
+    Stability is determined at the initial state. Friction that is too stiff even for adaptive
+    steps is smoothed over a wider range of velocities. Both changes are noted in `left_out`.
     """
     if robot.method or not robot.motions:
         return robot
@@ -201,14 +201,17 @@ class Rigid:
     columns: tuple[tuple[int, Vector, Callable[[Vector], Vector]], ...] = ()
 
     def point(self, at: Vector) -> Vector:
-        """Return the position in the world of a point `at` given in the body's frame (m)."""
+        """Return the position in the world (m) of a point of the body.
+
+        `at` is the position of the point in the body's frame (m).
+        """
         return plus(self.place, apply(self.turn, at))
 
     def jacobians(self, at: Vector, n: int) -> tuple[Array, Array]:
         """Return the Jacobians (3, n) of a point's velocity and of the body's angular velocity.
 
-        The point belongs to the body and is at the place `at` in the world. `n` is the number of
-        coordinates.
+        They are with respect to the n coordinate velocities. The point is fixed to the body and has
+        the position `at` in the world (m).
         """
         moves, turns = np.zeros((2, 3, n))
         for row, turn, velocity in self.columns:
@@ -218,9 +221,10 @@ class Rigid:
 
 
 def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, Rigid]:
-    """Return the position and the motions of each body at the start, by name, and of the world.
+    """Return the frame and the motions of each body at the initial state, by name.
 
-    `rows` are the names of the coordinates, in the order of the columns of Jacobians.
+    The world is included as a body. `rows` are the names of the coordinates, in the order of the
+    columns of Jacobians.
     """
     rigid = {WORLD: Rigid(ORIGIN, IDENTITY)}
     for body in bodies:
@@ -251,9 +255,9 @@ def _sliding(velocity: Vector) -> Callable[[Vector], Vector]:
 
 
 def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
-    """Return the mass matrix (n, n) at the start, including armatures.
+    """Return the mass matrix (n, n) at the initial state, including armatures of joints.
 
-    `rows` are the names of the n coordinates.
+    `rows` are the names of the n coordinates, in the order of the matrix.
     """
     M = np.zeros((len(rows), len(rows)))
     rigid = rigid_bodies(robot.bodies, rows)
@@ -274,7 +278,7 @@ def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
 def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
     """Return an orthonormal basis (n, k) of the velocities that loops and couplings allow.
 
-    `rows` are the names of the n coordinates.
+    It applies at the initial state. `rows` are the names of the n coordinates, in order.
     """
     starts = {m.name: m.start for m in robot.motions}
     if not robot.loops and not robot.couplings:
@@ -287,9 +291,10 @@ def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
 
 
 def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
-    """Return the gradient (n,) of a coupling's residual at the positions `starts`.
+    """Return the gradient (n,) of a coupling's residual with respect to the coordinates.
 
-    `rows` are the names of the n coordinates.
+    `starts` are the positions of the coordinates by name, at which the gradient is evaluated;
+    `rows` are the names of the n coordinates, in order.
     """
     x = sum(by * starts[q] for by, q in c.second) - c.at
     slope = sum(k * a * x ** (k - 1) for k, a in enumerate(c.polynomial) if k)
@@ -297,10 +302,11 @@ def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]
 
 
 def loop_jacobian(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
-    """Return the Jacobian of a loop's constraint equations, (3, n), or (6, n) for a weld.
+    """Return the Jacobian (3, n) of a loop's constraint equations, or (6, n) for a weld.
 
-    The rows are the relative velocity of the two points of the loop, for a weld followed by the
-    relative angular velocity of its bodies. `rows` are the names of the n coordinates.
+    The first three rows are for the relative velocity of the loop's two points, the others for the
+    relative angular velocity of its bodies. `rigid` has the frame of each body at the initial
+    state, by name. `rows` are the names of the n coordinates, in order.
     """
     ends = zip((rigid[name] for name in loop.bodies), loop.points, strict=True)
     pairs = [body.jacobians(body.point(at), len(rows)) for body, at in ends]

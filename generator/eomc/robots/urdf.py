@@ -113,7 +113,7 @@ class _Reader:
         self.lines: dict[str, int] = {}  # of links and joints, by key
 
     def robot(self) -> Robot:
-        """Return the robot. Raises SceneError with all faults."""
+        """Return the robot that the file describes. Raises SceneError with all of its faults."""
         links = self._named("link")
         if not links and not self.faults:
             self.say("", "the robot has no <link>: a URDF has one for each body")
@@ -136,7 +136,7 @@ class _Reader:
         return with_joints_fixed(robot)
 
     def say(self, key: str, message: str) -> None:
-        """Record a fault of the link or joint `key`, with its line in the file."""
+        """Add an error message on the link or joint `key`, with its line in the file."""
         self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
     def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:

@@ -46,7 +46,7 @@ class Tag:
     text: list[str] = field(default_factory=list)
 
     def get(self, key: str, default: str = "") -> str:
-        """Return the text of an attribute, or `default` if it is missing."""
+        """Return the value of the attribute `key` as text, or `default` if it is missing."""
         return self.attributes.get(key, default)
 
     def each(self, kind: str) -> Iterator[Tag]:
@@ -76,11 +76,14 @@ class _Builder:
         self.prefixes: dict[str, str] = {}  # of namespaces, as the file declares them
 
     def start_ns(self, prefix: str, uri: str) -> None:
-        """Record the prefix of a namespace; that of xacro's namespace is always `xacro`."""
+        """Record the prefix of an XML namespace.
+
+        The prefix of the namespace of xacro is recorded as `xacro`, whatever it is in the file.
+        """
         self.prefixes[uri] = "xacro" if uri.endswith("/xacro") else prefix
 
     def written(self, name: str) -> str:
-        """Return the name of an element as the file writes it, from "{namespace}name"."""
+        """Return the name of an element with its prefix, as in the file, from "{namespace}name"."""
         uri, _, local = name[1:].rpartition("}") if name.startswith("{") else ("", "", name)
         prefix = self.prefixes.get(uri, "xml" if uri.endswith("/XML/1998/namespace") else "")
         return f"{prefix}:{local}" if prefix else local
@@ -141,10 +144,10 @@ def root(file: str | os.PathLike[str]) -> Tag:
 
 
 def number(word: str) -> float:
-    """Return the number that a word of a file stands for.
+    """Return the number that a word in an XML file denotes.
 
-    Raises ValueError if it is not a finite number, also for Python's own syntax such as 1_0, and if
-    it is too large. Numbers that are too small become zero.
+    Numbers that are too small for a double become zero. Raises ValueError if the number is too
+    large or not finite, and for Python's own syntax such as 1_0.
     """
     try:
         value = float("x" if "_" in word or not word.isascii() else word)
