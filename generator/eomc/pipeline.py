@@ -52,8 +52,9 @@ def _without_garbage_collection() -> Iterator[None]:
 def read(scene: ScenePath) -> System:
     """Read a scene file and return it as a System of SymPy expressions.
 
-    If the system has constraints, its free initial values are adjusted to satisfy them. scene:
-    path of the TOML file. Raises SceneError, which lists all problems of the scene.
+    scene: path of the TOML file that describes the mechanical system. If the system has
+    constraints, initial values that are not fixed are adjusted to satisfy them. Raises SceneError,
+    which lists all problems of the scene, if the scene is invalid.
     """
     from eomc.model.from_scene import from_scene
     from eomc.scene import read as scenes
@@ -80,10 +81,10 @@ def sources(
     *,
     warn: Callable[[Problem], None] | None = None,
 ) -> Sources:
-    """Generate the C and Python files of a system's module and return them as text.
+    """Generate the C and Python files of the Python module of a system; return their texts.
 
-    extension: name of the compiled extension that the Python files import. warn: function that is
-    called with each warning; by default warnings are discarded.
+    No file is written. extension: name of the compiled extension module that the Python files
+    import. warn: function that is called with each warning; by default warnings are discarded.
     """
     from eomc.emit import render
 
@@ -172,7 +173,7 @@ def build(
 ) -> Built:
     """Build the compiled Python module of a scene and return the name and folder of the build.
 
-    A build that is up to date is returned as it is, without a compiler.
+    If the folder contains an up-to-date build, nothing is compiled.
 
     Parameters
     ----------
@@ -319,7 +320,7 @@ def load(
 
 
 def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleType:
-    """Build and import the module of a model with additional events; return the module.
+    """Build and import the Python module of a model with additional events; return the module.
 
     Parameters
     ----------
@@ -327,10 +328,10 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         Model of an imported module; its attribute `source` is the path of its scene or its System.
     events
         Mapping from the name of each new event to its event function as a formula, or to a dict
-        with the keys of [[event]] in a scene. For a System, as the argument `events` of
-        System.make.
+        with the keys of [[event]] in a scene. If the model was made from a System, the argument
+        `events` of System.make.
     folder
-        The build is written below its subfolder .events/.
+        Folder in whose subfolder .events/ the build is written.
 
     Raises
     ------
@@ -419,7 +420,8 @@ def _renamed(key: str, names: Mapping[str, str]) -> str:
 def name_and_digest(path: Path) -> tuple[str, str]:
     """Return the name of a scene file and the digest of its text, without checking the scene.
 
-    If the file cannot be read, both are ""; if its name is not an identifier, the name is "".
+    The digest is the SHA-256 hash of the file. Both are "" if the file cannot be read or is not
+    TOML. The name is "" if the scene's entry `name` is not an identifier.
     """
     from eomc.scene.toml_text import tree_and_digest
 

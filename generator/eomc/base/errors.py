@@ -25,10 +25,10 @@ class EomcError(Exception):
 
 
 class FolderError(EomcError):
-    """Error for a folder of builds that can't be written.
+    """Error for a build folder that can't be written.
 
-    The message advises to pass another `root`, as Python code does. The command line shows `what`
-    with advice of its own.
+    The message advises a caller in Python to choose another folder by the argument `root`. The
+    command line instead shows the property `what`, followed by advice of its own.
     """
 
     def __str__(self) -> str:
@@ -36,7 +36,7 @@ class FolderError(EomcError):
 
     @property
     def what(self) -> str:
-        """The message without the advice."""
+        """The message without the advice to choose another folder."""
         return super().__str__()
 
 
@@ -65,10 +65,10 @@ class Problem:
     message
         What is wrong, and the remedy.
     key
-        The place in the scene, such as "parameters.m", or the argument of System.make.
+        Key of the faulty entry in the scene, such as "parameters.m", or argument of System.make.
     file, line, column
-        Where the fault is. `line` counts from 1 and is 0 if unknown; `column` counts from 0 and is
-        -1 if unknown.
+        Position of the fault in the file. `line` counts from 1 and is 0 if unknown; `column` counts
+        from 0 and is -1 if unknown.
     width
         Number of characters to underline from `column`.
     source

@@ -9,13 +9,19 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def folder(kind: str) -> Path:
-    """Return the path of a folder that comes with eomc. kind: "templates", "csrc" or "scenes"."""
+    """Return the path of one of the folders of data files that are installed with eomc.
+
+    kind: "templates" (Jinja templates), "csrc" (C source files) or "scenes" (example scenes).
+    """
     installed = PACKAGE / kind
     return installed if installed.is_dir() else PACKAGE.parent.parent / kind
 
 
 def text(kind: str, name: str) -> str:
-    """Return the text of the file `name` in the folder "templates", "csrc" or "scenes" (`kind`)."""
+    """Return the contents of a data file that is installed with eomc.
+
+    kind: the folder "templates", "csrc" or "scenes". name: name of the file in this folder.
+    """
     return (folder(kind) / name).read_text(encoding="utf-8")
 
 
@@ -25,10 +31,10 @@ def scenes() -> dict[str, Path]:
 
 
 def runtime(batch: bool) -> dict[str, str]:
-    """Return the Python files of eomc's runtime package, which are copied into each built module.
+    """Return the files of eomc's runtime package, which are copied into each built Python module.
 
-    The result is a dict from the path in the folder of the built module to the text. The files
-    for batches of simulations are included only if `batch` is true.
+    The result is a dict from the path of a file, relative to the folder of the module, to its text.
+    batch: True to include the files for simulating batches of trajectories.
     """
     files = sorted((PACKAGE / "runtime").glob("*.py"))
     return {
@@ -41,7 +47,7 @@ def runtime(batch: bool) -> dict[str, str]:
 def parts() -> Iterator[tuple[str, Path]]:
     """Yield a pair (name, path) for each file of eomc on which the result of a build depends.
 
-    The name is relative to the installation, such as "csrc/sincos/sincos.h".
+    The name is the path relative to the installed package, such as "csrc/sincos/sincos.h".
     """
     for kind, root, suffix in (
         ("eomc", PACKAGE, ".py"),

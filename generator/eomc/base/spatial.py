@@ -69,7 +69,8 @@ def matrix(rows: Any) -> Matrix[Any]:
 def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
     """Return the matrix of a rotation about the coordinate axis `k` (0, 1 or 2).
 
-    It takes vectors from the rotated frame to the original one. cosine, sine: of the angle.
+    The matrix transforms the components of a vector from the rotated frame to the original one.
+    cosine, sine: cosine and sine of the rotation angle.
     """
     zero = 0 * cosine
     i, j = (k + 1) % 3, (k + 2) % 3
@@ -82,7 +83,8 @@ def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
 def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
     """Return the matrix of a rotation about a unit vector `axis`, by the formula of Rodrigues.
 
-    It takes vectors from the rotated frame to the original one. cosine, sine: of the angle.
+    The matrix transforms the components of a vector from the rotated frame to the original one.
+    cosine, sine: cosine and sine of the rotation angle.
     """
     x, y, z = axis
     c, s = cosine, sine
@@ -104,10 +106,11 @@ def tensor(inertia: Sequence[T]) -> Matrix[T]:
 
 
 def rotated_inertia(R: Matrix[T], inertia: Sequence[T]) -> Inertia[T]:
-    """Return R I R^T, the inertia of a body in other axes, as six entries.
+    """Return the inertia R I R^T of a body with respect to rotated axes.
 
-    R: rotation that takes vectors from the axes of `inertia` to the other axes. inertia: Ixx, Iyy,
-    Izz, Ixy, Ixz, Iyz.
+    inertia: the inertia I in the original axes. R: rotation matrix that transforms the components
+    of a vector from the original axes to the other axes. Inertias are tuples of the six entries
+    Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
     """
     rotated = product(product(R, tensor(inertia)), transposed(R))
     return six(rotated[i][j] for i, j in ENTRIES)
@@ -128,7 +131,8 @@ def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
 def moved_inertia(inertia: Sequence[Any], mass: Any, center: Sequence[Any]) -> Inertia[Any]:
     """Return the inertia of a body about the origin, by the parallel axis theorem.
 
-    inertia: six entries about the centre of mass. center: position of the centre of mass.
+    inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass. center: position of the centre
+    of mass relative to the origin. The result has the same six entries.
     """
     return six(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
 

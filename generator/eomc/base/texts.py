@@ -28,10 +28,10 @@ _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\
 
 
 def checked_line(text: str) -> str:
-    """Return `text`, a title or unit, unchanged.
+    """Check that a title or unit is one line without hidden characters; return it unchanged.
 
-    Raises ValueError if it has a hidden character: a control character (line breaks and tabs too),
-    a mark of writing direction or a line separator.
+    Raises ValueError if `text` has a control character (line breaks and tabs are control
+    characters), a mark of writing direction or a line separator.
     """
     if match := _HIDDEN.search(text):
         raise ValueError(_fault(text, match))
@@ -39,10 +39,10 @@ def checked_line(text: str) -> str:
 
 
 def checked_lines(text: str) -> str:
-    """Return `text`, a note that may have line breaks and tabs, unchanged.
+    """Check that a note has no hidden characters; return it unchanged.
 
-    Raises ValueError if it has another control character, a mark of writing direction or a line
-    separator.
+    Line breaks and tabs are permitted. Raises ValueError if `text` has another control character, a
+    mark of writing direction or a line separator.
     """
     if match := _HIDDEN_IN_LINES.search(text):
         raise ValueError(_fault(text, match))
@@ -121,7 +121,7 @@ def comment(text: str) -> str:
 
 
 def python(value: str | Mapping[str, str]) -> str:
-    """Return a string, or a dict of strings, as the source text of a Python literal.
+    """Return Python source code of a literal whose value is the given string or dict of strings.
 
     Raises TypeError for values of other types.
     """
@@ -131,9 +131,9 @@ def python(value: str | Mapping[str, str]) -> str:
 
 
 def docstring(text: str) -> str:
-    """Return `text` with backslashes, quotes and hidden characters escaped for a Python docstring.
+    """Return `text` escaped for a Python docstring, to be inserted between triple quotes.
 
-    The result goes between triple quotes.
+    Backslashes, quotes and hidden characters are escaped.
     """
     return re.sub(r'"(?="|\Z)', r"\"", lines(text).replace("\\", "\\\\"))
 
@@ -187,8 +187,9 @@ def command(file: str) -> str:
 class FreeText:
     """Free text for a Jinja template: a string that a user wrote, or a dict of such strings.
 
-    A template prints it by a property that escapes it for the surrounding language, such as
-    `{{ title.comment }}`. Printing it without one raises TypeError.
+    The text must be escaped for the language that surrounds it. A template therefore prints one of
+    the properties, such as `{{ title.comment }}` in a C comment. Printing the object itself raises
+    TypeError.
     """
 
     text: str | Mapping[str, str]
@@ -204,7 +205,10 @@ class FreeText:
 
     @property
     def line(self) -> str:
-        """The text as one line, for a docstring; the docstring is escaped as a whole later."""
+        """The text as one line, for a Python docstring.
+
+        Quotes are not escaped, because the docstring is later escaped as a whole.
+        """
         return line(self._one())
 
     @property

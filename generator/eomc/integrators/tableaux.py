@@ -32,15 +32,17 @@ class Method:
     name, title, order, source
         Identifier, description, order of convergence and reference.
     limits
-        Limits of the step size h, beyond which a step is unstable or its stages do not converge:
-        the largest h omega of an undamped oscillation (omega in rad/s), and the largest h lambda
-        of a decaying motion exp(-lambda t).
+        Limits of the step size h, as a pair: the largest h omega for an undamped oscillation (omega
+        in rad/s), and the largest h lambda for a decaying motion exp(-lambda t). Beyond them, steps
+        are unstable, or the equations of the stages can't be solved by iteration.
     a, b
-        Matrix A (rows of an explicit method end before the diagonal) and weights b.
+        Matrix A and weights b of the Butcher tableau. In an explicit method, rows of A end before
+        the diagonal.
     notes
         Further properties, as lines of a comment in the generated C.
     nodes, end
-        Nodes c and row vector b A of a Nystrom method; empty if they follow from `a` and `b`.
+        Nodes c (times of the stages, as fractions of a step) and row vector b A of a Nystrom
+        method; empty if they follow from `a` and `b`.
     sweeps
         Fixed number of iterations for the stages of an implicit method; 0 if Newton's method is
         used or the method is explicit.
@@ -70,27 +72,36 @@ class Method:
 
     @property
     def newton(self) -> bool:
-        """Whether the stages are solved for by Newton's method, which converges for stiff systems
-        too.
+        """Whether Newton's method solves the equations of the stages.
+
+        It also converges for stiff systems. It is used if the method is implicit and has no fixed
+        number of iterations.
         """
         return self.implicit and not self.sweeps
 
     @cached_property
     def c(self) -> Row:
-        """The nodes c, the times of the stages as fractions of the step (default row sums of A)."""
+        """The nodes c, which are the times of the stages as fractions of the step.
+
+        They are the row sums of A unless `nodes` is given.
+        """
         return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
     @cached_property
     def a_squared(self) -> tuple[Row, ...]:
-        """Matrix A A. Its product with the stage accelerations, times h^2, is their contribution
-        to the positions at the stages.
+        """The matrix product A A.
+
+        With the accelerations k at the stages and the step size h, h^2 A A k is the contribution of
+        the accelerations to the positions at the stages.
         """
         return tuple(_times(row, self.a) for row in self.a)
 
     @cached_property
     def b_a(self) -> Row:
-        """Row vector b A (or `end`). Its product with the stage accelerations, times h^2, is their
-        contribution to the position at the end of the step.
+        """The row vector b A, or `end` if that is given.
+
+        With the accelerations k at the stages and the step size h, h^2 b A k is the contribution of
+        the accelerations to the position at the end of the step.
         """
         return self.end or _times(self.b, self.a)
 
@@ -98,24 +109,25 @@ class Method:
     def extrapolation(self) -> tuple[Row, ...]:
         """Matrix E that extrapolates the stage accelerations of one step to the stages of the next.
 
-        The extrapolation evaluates the polynomial through the accelerations at the nodes of the
-        step at the nodes of the next step, which has the same size.
+        The polynomial through the accelerations at the nodes of one step is evaluated at the nodes
+        of the next step. Both steps have the same size.
         """
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
     @cached_property
     def powers(self) -> tuple[Row, ...]:
-        """Matrix that converts values at the nodes c to the coefficients of their interpolation
-        polynomial in powers of 2 c - 1, lowest power first.
+        """Matrix from values at the nodes c to the coefficients of the polynomial through them.
+
+        The coefficients are those of the powers of 2 c - 1, lowest power first.
         """
         return tuple(zip(*_lagrange(tuple(2 * x - 1 for x in self.c)), strict=True))
 
     def legendre(self, n: int) -> Row:
-        """Return the weights, one for each stage, of the coefficient of P_n(2 c - 1).
+        """Return weights, one for each stage, that give the coefficient of P_n(2 c - 1).
 
-        The sum of the weights times values at the nodes is the coefficient of the Legendre
-        polynomial P_n in the polynomial through these values. Valid for Gauss methods and
-        n < stages.
+        Here P_n is the Legendre polynomial of degree n. The polynomial through given values at the
+        nodes c is expanded in Legendre polynomials; the coefficient of P_n is the sum of the
+        weights times the values. Valid for Gauss methods and n < stages.
         """
         p = _legendre(n)
         return tuple((2 * n + 1) * b * _value(p, x) for b, x in zip(self.b, self.c, strict=True))
@@ -124,11 +136,11 @@ class Method:
     def eigen(self) -> tuple[tuple[Row, ...], tuple[Row, ...], tuple[Row, ...]]:
         """Eigendecomposition of A as a tuple (eigenvalues, forward, back).
 
-        eigenvalues: those with positive imaginary part, as pairs (real, imaginary). forward: two
-        rows for each eigenvalue, which transform values at the stages to the real and imaginary
-        part of the coordinate along its eigenvector. back: two rows for each eigenvalue; the
-        values at the stages are the sum of these rows times the coordinates. Valid if A has an
-        even number of stages and no real eigenvalues.
+        eigenvalues: the eigenvalues with positive imaginary part, as pairs (real, imaginary).
+        forward: two rows for each eigenvalue. Their products with the values at the stages are the
+        real and the imaginary part of the component along its eigenvector. back: two rows for each
+        eigenvalue. The values at the stages are the sum of these rows times the real and imaginary
+        parts. Valid if A has an even number of stages and no real eigenvalues.
         """
         from mpmath import matrix, mp, mpf
 
@@ -154,15 +166,19 @@ class Method:
 
     @cached_property
     def a_extrapolated(self) -> tuple[Row, ...]:
-        """Matrix product A E, which applies A to stage accelerations extrapolated from the
-        previous step by E (`extrapolation`).
+        """The matrix product A E, with the matrix E of `extrapolation`.
+
+        It multiplies the stage accelerations of the previous step. The result is A times the
+        accelerations that are extrapolated to the stages of the current step.
         """
         return tuple(_times(row, self.extrapolation) for row in self.a)
 
     @cached_property
     def a_squared_extrapolated(self) -> tuple[Row, ...]:
-        """Matrix product A A E, which applies A A to stage accelerations extrapolated from the
-        previous step by E (`extrapolation`).
+        """The matrix product A A E, with the matrix E of `extrapolation`.
+
+        It multiplies the stage accelerations of the previous step. The result is A A times the
+        accelerations that are extrapolated to the stages of the current step.
         """
         return tuple(_times(row, self.extrapolation) for row in self.a_squared)
 
