@@ -62,8 +62,8 @@ GREEK = {
 def plain(name: str) -> str:
     """Convert a name, such as a Greek letter or LaTeX text, to a valid C identifier; return it.
 
-    Greek letters are written out, LaTeX syntax is removed, and "_1" is appended to keywords of C
-    and Python.
+    Greek letters are written out, LaTeX syntax is removed, and "_1" is appended to reserved names,
+    such as keywords and functions of C.
 
     >>> plain("θ₁"), plain(r"\\theta_{1}"), plain("lambda")
     ('theta_1', 'theta_1', 'lambda_1')

@@ -22,10 +22,11 @@ MAX_NAMED_COORDINATES = 9  # with more coordinates, entries of D get no names D_
 
 
 def abbreviate(equations: AnyEquations) -> AnyEquations:
-    """Return a copy of the equations in which subexpressions that occur twice or more have names.
+    """Return a copy of the equations in which repeated subexpressions are replaced by names.
 
-    The field `named` of the copy contains the pairs (name, expression). In the scalar equations,
-    long entries of the mass matrix D are replaced by names such as D_12.
+    A subexpression that occurs twice or more gets a name; the field `named` of the copy contains
+    the pairs (name, expression). In the scalar equations, long entries of the mass matrix D are
+    also replaced by names such as D_12.
     """
     entries = _entries_of_D(equations)
     left = tuple([(rates, entries.get(c, c)) for rates, c in terms] for terms in equations.left)
@@ -57,10 +58,10 @@ def abbreviate(equations: AnyEquations) -> AnyEquations:
 def extract_common_subexpressions(
     formulas: Sequence[Expr], letter: str
 ) -> tuple[list[tuple[Symbol, Expr]], list[Expr]]:
-    """Name the subexpressions that `formulas` share: `letter`_1, `letter`_2, ...
+    """Replace subexpressions that occur repeatedly in `formulas` by names.
 
-    Returns the list of definitions (name, expression over earlier names), and the formulas
-    rewritten with these names, in the given order.
+    letter: beginning of the names, which are `letter`_1, `letter`_2, ... Returns two lists: the
+    definitions (name, expression over earlier names), and the rewritten formulas in their order.
     """
     temporary = sympy.numbered_symbols("_", real=True)
     subexpressions, reduced = sympy.cse(formulas, order="none", symbols=temporary)

@@ -75,10 +75,10 @@ def animate(
 ) -> Animation | None:
     """Animate simulated runs, drawn side by side, as an HTML page or a film.
 
-    file: path with the suffix .html, .gif or .mp4; if None, no file is written. scene: the scene
-    of the first run, needed if its module was not loaded with `eomc.load`. title: heading in place
-    of the scenes' titles. Returns the page, or None if a film (.gif or .mp4) was written. Raises
-    EomcError if the animation can't be drawn or written.
+    file: path with the suffix .html for a page, or .gif or .mp4 for a film; if None, no file is
+    written. scene: the scene of the first run, needed if its module was not loaded with
+    `eomc.load`. title: heading that replaces the titles of the scenes. Returns the page, or None if
+    a film was written. Raises EomcError if the animation can't be drawn or written.
     """
     _check(file)
     timelines = [
@@ -98,10 +98,10 @@ def instances(
 ) -> Animation | None:
     """Animate several instances of a batch of runs, drawn over each other.
 
-    names: quantities to plot below the drawing, one panel each; by default coordinates and the
-    energy. chosen: the number of instances to show, spread evenly over the batch, or the list of
-    their indices. The other arguments, the result and the errors are those of `animate`; in
-    addition, KeyError is raised for unknown names.
+    An instance is one run of the batch. names: quantities to plot below the drawing, one panel
+    each; by default coordinates and the energy. chosen: the number of instances to show, spread
+    evenly over the batch, or the list of their indices. The other arguments, the result and the
+    errors are those of `animate`; in addition, KeyError is raised for unknown names.
     """
     _check(file)
     return shown([BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title)
@@ -196,7 +196,7 @@ class _RunOnPage:
 
     @property
     def rate(self) -> float:
-        """Number of rows (stored instants) per second of simulated time."""
+        """Number of stored states per second of simulated time."""
         lasting = self.rows[-1] - self.rows[0]
         return (len(self.rows) - 1) / lasting if lasting else 0.0
 

@@ -57,14 +57,27 @@ LARGE_CONDITION = 1e8  # condition number of D, diagonal scaled to 1, above whic
 class Point:
     """Accuracy and computing time of one run, with fixed steps or with adaptive steps.
 
-    Errors are relative to the largest value of each component along the motion, and inf if the run
-    did not reach its end.
+    Errors of positions and velocities are relative to the largest value of each component along the
+    motion. They are inf if the run ended early.
 
-    method: name of the stepper. h: step size in s, the mean one if steps are adaptive. q, qd, end:
-    error of the final positions, of the final velocities, and the larger of both. along: largest
-    error at any stored time. energy: largest energy error; energies: energy errors at the stored
-    times. seconds: computing time. evaluations: number of evaluations of the accelerations. tol:
-    tolerance of adaptive steps, nan for fixed steps.
+    Attributes
+    ----------
+    method
+        Name of the stepper (integration method).
+    h
+        Step size in s; for adaptive steps, the mean step size.
+    q, qd, end
+        Error of the final positions, error of the final velocities, and the larger of these two.
+    along
+        Largest error of positions and velocities at any stored time.
+    energy, energies
+        Largest error of the energy, and its errors at the stored times.
+    seconds
+        Computing time in s.
+    evaluations
+        Number of evaluations of the accelerations.
+    tol
+        Tolerance of adaptive steps; nan for fixed steps.
     """
 
     method: str
@@ -91,14 +104,27 @@ class Point:
 class Line:
     """Results of one stepper (integration method): its runs from coarse to fine, and their summary.
 
-    points: the runs. order: nominal order of the method. observed: observed order, nan if too few
-    errors are above rounding. usable_h: largest measured step size h (s) for which the relative
-    error of its run and of all finer runs is below 1. stable_to: largest stable h by the
-    eigenvalues of the linearised motion, inf if every h is stable. Below it, the method amplifies
-    no perturbation, but errors accumulate: usable_h is 0.4 to 0.8 of it for regular motions, and a
-    tenth or less if perturbations grow or if the fast part of the motion is short. rounding: h
-    below which finer steps do not reduce the error, or nan. For adaptive steps, all numbers but
-    `order` are nan.
+    For adaptive steps, all numbers but `order` are nan. Step sizes h are in s.
+
+    Attributes
+    ----------
+    method
+        Name of the stepper.
+    order
+        Nominal order of the method.
+    points
+        The runs.
+    observed
+        Order of convergence observed in the runs; nan if too few errors are above rounding.
+    usable_h
+        Largest h among the runs for which the relative error is below 1, also in all finer runs.
+    stable_to
+        Largest stable h, computed from the eigenvalues of the linearised motion; inf if every h is
+        stable. `usable_h` is smaller, since errors accumulate in stable steps too. For regular
+        motions it is 0.4 to 0.8 times `stable_to`. It is a tenth of `stable_to` or less if
+        perturbations grow, or if the fast part of the motion is short.
+    rounding
+        Step size below which smaller steps do not reduce the error; nan if no run is so fine.
     """
 
     method: str
@@ -114,12 +140,29 @@ class Line:
 class Report:
     """Cost of accuracy of one scene: the results of all steppers and properties of the motion.
 
-    duration: simulated time, s. digits: correct digits of the reference solution at its end. lines:
-    results of each stepper. growth: growth of a perturbation of the initial state. eigenvalue:
-    eigenvalue of the largest magnitude along the motion, 1/s. condition: largest condition number
-    of the mass matrix D, with the time t and the coordinates q at which it occurs. corners:
-    non-smooth functions in the equations. events: names of the scene's events. t: stored times of
-    the reference solution, s. skipped: reason why a stepper can't be used, by its name.
+    Attributes
+    ----------
+    duration
+        Simulated time in s.
+    digits
+        Number of correct digits of the reference solution at the end.
+    lines
+        Results of each stepper (integration method).
+    growth
+        Growth of a small perturbation of the initial state.
+    eigenvalue
+        Eigenvalue of the linearised motion with the largest magnitude at any time, in 1/s.
+    condition
+        Largest condition number of the mass matrix D, with the time t and the coordinates q at
+        which it occurs.
+    corners
+        Text that lists the non-smooth functions in the equations.
+    events
+        Names of the scene's events.
+    t
+        Stored times of the reference solution in s.
+    skipped
+        Dict from the name of a stepper that can't be used to the reason.
     """
 
     scene: str
@@ -148,7 +191,7 @@ class Report:
 
     @property
     def finest(self) -> Point:
-        """The run whose largest error along the motion is smallest."""
+        """The most accurate run: that with the smallest value of `Point.along`."""
         return min(self.points, key=lambda p: p.along)
 
 
@@ -224,11 +267,12 @@ def measure(
 
 
 def variant(system: System, names: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
-    """Build a module from the system with all steppers in `names` that can integrate it.
+    """Build a Python module of a system with several steppers (integration methods).
 
-    root: build directory. Returns the loaded module, and a mapping from each of the other steppers
-    to the reason why it can't be used. The scene's events are removed, since neither fixed steps
-    nor the reference solution detect them. Raises EomcError if no stepper can be used.
+    names: the steppers. Those that can't integrate the system are left out. root: build directory.
+    Returns the loaded module, and a dict from each stepper that was left out to the reason. The
+    module has no events, since neither fixed steps nor the reference solution detect them. Raises
+    EomcError if no stepper can be used.
     """
 
     def with_methods(methods: Sequence[str]) -> System:

@@ -34,11 +34,21 @@ EPSILON = 2.0**-53
 class Growth:
     """Growth of a small perturbation of the initial state along a motion.
 
-    t: times (n,), s. amplification: factors (n,) by which the perturbation has grown up to the
-    times `t`. rate: mean exponential growth rate over the second half of the motion, relative to
-    the growth of the motion itself, 1/s. wild: True if this growth is exponential (chaos). horizon:
-    time in s at which rounding errors have grown to a tenth of the size of the motion; inf if they
-    do not grow that far.
+    Attributes
+    ----------
+    t
+        Times (n,) in s.
+    amplification
+        Factors (n,) by which the perturbation has grown up to the times `t`.
+    rate
+        Mean exponential growth rate of the perturbation in 1/s, over the second half of the motion.
+        If the distance of the motion from its start grows too, the perturbation is first divided
+        by the factor of that growth.
+    wild
+        True if this growth is exponential, as in chaotic motion.
+    horizon
+        Time in s at which rounding errors have grown to a tenth of the size of the motion; inf if
+        they do not grow that far.
     """
 
     t: Vector
@@ -130,9 +140,10 @@ def _project(module: ModuleType, x: Vector, t: float) -> Vector:
 def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
     """Return the growth of a perturbation of the initial state along a reference solution.
 
-    It is the norm of the product of the transition matrices of segments of the motion. Each matrix
-    is computed by differences of runs with the stepper `method` over one segment; `steps` is the
-    number of steps over the whole motion. `runtime.growth` defines the norm.
+    The motion is divided into segments, and the transition matrix of each segment is computed by
+    differences of runs of the generated `module` from perturbed states. The growth up to a time is
+    the norm of the product of these matrices; `runtime.growth` defines the norm. method: stepper of
+    the runs. steps: number of steps over the whole motion.
     """
     n, scale = reference.q.shape[1], reference.scale
     stride = (len(reference.t) - 1) // SEGMENT_COUNT

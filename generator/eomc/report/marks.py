@@ -17,8 +17,9 @@ TRAVEL_LIMIT = 8.0  # times its own extent: how far a mechanism may move in one 
 class Mark:
     """One graphical symbol of a drawing, such as a line or a joint.
 
-    points: indices of the points of the drawing on which the mark is drawn; their number depends on
-    the kind. instance: index of the instance, if several are drawn over each other. The kinds are:
+    points: indices, in `Drawing.points`, of the positions that define the symbol; their number
+    depends on the kind. instance: index of the mechanism to which the mark belongs, if several
+    instances are drawn over each other. kind: one of
 
     =========  ============================================================================
     line       of a [picture], through two points or more
@@ -46,10 +47,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Path:
-    """The path of a point during the motion.
+    """The path of a point during the motion, which is drawn as a curve.
 
-    name: name of the point. point: its index among the points of the drawing. instance: index of
-    the instance, if several are drawn over each other.
+    name: name of the point. point: its index in `Drawing.points`. instance: index of the mechanism
+    to which the point belongs, if several instances are drawn over each other.
     """
 
     name: str
@@ -61,10 +62,23 @@ class Path:
 class Drawing:
     """A drawing of a mechanism at n instants.
 
-    points: positions (n, number of points, 2 or 3) in `unit`, not finite if a formula has no value.
-    marks: the symbols drawn on the points, in a plane drawing ordered from back to front. paths:
-    paths of points. axes: "xy", "xz" or "yz" in the plane, "xyz" in space. names: the scene's own
-    names of the axes, empty if it has none. up: index of the axis that points upwards in space.
+    Attributes
+    ----------
+    points
+        Positions (n, number of points, 2 or 3) in `unit`, to which marks and paths refer by index.
+        They are not finite at instants at which a formula can't be evaluated.
+    marks
+        The graphical symbols, ordered from back to front in a plane drawing.
+    paths
+        Paths of points, drawn as curves.
+    axes
+        "xy", "xz" or "yz" for a drawing in the plane, "xyz" in space.
+    unit
+        Unit of the positions.
+    names
+        Names of the axes that the scene gives; empty if it gives none.
+    up
+        Index of the axis that points upwards, for a drawing in space.
     """
 
     points: Array
@@ -137,9 +151,10 @@ class Marks:
         return self._index[key]
 
     def add(self, kind: str, *points: int) -> None:
-        """Add a mark of the given kind on the points with these indices (see `Mark`).
+        """Add a mark (graphical symbol) that is defined by points.
 
-        Nothing is added if the mark exists already, or if all its points are the same.
+        kind: kind of the mark, see `Mark`. points: indices of its points, as `point` returns them.
+        Nothing is added if the mark exists already, or if it has several points that are all equal.
         """
         if len(points) > 1 and len(set(points)) == 1:
             return
@@ -148,7 +163,10 @@ class Marks:
             self.marks.append(mark)
 
     def path(self, name: str, point: int) -> None:
-        """Add the path of the point with index `point`, named `name`, if the point moves."""
+        """Add the path of a point, unless the point is fixed or has a path already.
+
+        name: name of the path. point: index of the point, as the method `point` returns it.
+        """
         moves = np.ptp(self.points[point], axis=0).max(initial=0.0) > 0
         if moves and point not in [p.point for p in self.paths]:
             self.paths.append(Path(name, point))
@@ -174,10 +192,10 @@ class Marks:
 
 
 def superpose(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Drawing | None:
-    """Combine the drawings of several instances into one; the first path of each is kept.
+    """Combine the drawings of several instances of a mechanism into one drawing.
 
-    names: names of the instances, which become the names of the paths. Returns None if all drawings
-    are None.
+    Of each drawing, only the first path is retained. names: names of the instances, which become
+    the names of these paths. Returns None if all drawings are None.
     """
     points, marks, paths = list[Array](), list[Mark](), list[Path]()
     nonempty = [each for each in drawings if each]

@@ -16,10 +16,11 @@ _SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
 
 
 def lines(derived: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool, Markup]]]:
-    """Convert equations to MathML; return the equations of motion, and all other formulas.
+    """Convert equations to MathML and return them as a pair of lists of printed lines.
 
-    Both are lists of pairs (continues, MathML of one line), where continues is True if the line
-    continues the equation of the previous line. Raises EomcError if latex2mathml is not installed.
+    The first list contains the equations of motion, the second all other formulas. Each line is a
+    pair (continues, MathML), where continues is True if the line continues the equation of the
+    previous line. Raises EomcError if latex2mathml is not installed.
     """
     first, second = (
         [_line(x) for x in lines] for lines in equations_text.latex_lines(derived.set_out)

@@ -24,11 +24,19 @@ Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
 class Overview:
     """Data for the overview in the template report/report.html.jinja, escaped for HTML.
 
-    note: the scene's note. coordinates, parameters, inputs, outputs: rows of tables, each with
-    name, value, unit and note. equations, rest: the equations of motion and all other formulas, as
-    pairs (True if the line continues the previous one, MathML of the line). text: plain text in
-    place of equations that are too long or can't be converted to MathML. motion: figure of the
-    motion as SVG, empty without matplotlib. caption: caption of the figure.
+    Attributes
+    ----------
+    note
+        Note of the scene.
+    coordinates, parameters, inputs, outputs
+        Rows of the tables of these quantities, each with name, value, unit and note.
+    equations, rest
+        Lines of the equations of motion, and lines of all other formulas. Each is a pair (True if
+        the line continues the previous one, MathML of the line).
+    text
+        Plain text that replaces equations that are too long or can't be converted to MathML.
+    motion, caption
+        Figure of the motion as SVG (empty without matplotlib), and its caption.
     """
 
     note: Markup

@@ -32,10 +32,11 @@ BODY, GHOST = "#4D4D4D", 0.80  # colour of rods; lightest grey of an earlier ins
 
 
 def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve | None:
-    """Return the picture of a run: its mechanism, a phase portrait (nq = 1) or a path (nq = 2).
+    """Return a picture of a run, for the figure of its motion.
 
-    `t` (n,) is in s; `q` and `qd` have shape (n, nq). The mechanism is drawn if the scene describes
-    its shape. Returns None if it does not and nq > 2, or if `t` is empty.
+    t: times (n,) in s. q, qd: coordinates and velocities (n, nq). The picture shows the mechanism
+    if the scene describes its shape. Otherwise it is a phase portrait if nq = 1, or the path in
+    configuration space if nq = 2. Returns None for nq > 2 without a shape, or if `t` is empty.
     """
     if not len(t):
         return None
@@ -68,7 +69,7 @@ def of_run(run: Any) -> Mechanism | None:
 class Curve:
     """A plot of one quantity against another: a phase portrait or a path in configuration space.
 
-    values: (n, 2), horizontal and vertical. labels: of the two axes.
+    values: (n, 2), the horizontal and vertical quantity. labels: labels of the two axes.
     """
 
     values: Array
@@ -91,7 +92,8 @@ class Curve:
 class Mechanism:
     """A picture of a mechanism at several instants of a run, with the paths of its points.
 
-    t: times (n,), s. drawing: the drawing at these times. Earlier instants are drawn lighter.
+    t: times (n,) in s. drawing: the drawing of the mechanism at these times. Earlier instants are
+    drawn in a lighter colour.
     """
 
     t: Array
@@ -184,10 +186,11 @@ def project_points(picture: Drawing) -> Array:
 
 
 def frame(axes: Axes, picture: Drawing, flat: Array) -> None:
-    """Set equal scales and limits of `axes` that contain the whole motion, and draw its axes.
+    """Prepare matplotlib axes for the drawing of a motion: limits, scales and coordinate axes.
 
-    flat: the points projected onto the plane of the picture, (n, number of points, 2). A plane
-    drawing gets labelled axes, a drawing in space three arrows and a scale.
+    The limits contain the whole motion, and both directions have the same scale. flat: the points
+    of `picture` at all n instants, projected onto the plane of the picture, (n, number of points,
+    2). A plane drawing gets labelled axes, a drawing in space three arrows and a scale bar.
     """
     low, high = _bounds(flat)
     size = max(float((high - low).max()), 1e-9)
@@ -255,9 +258,9 @@ def shapes(
 ) -> Iterator[tuple[Array, dict[str, Any]]]:
     """Yield the lines and symbols of all marks at one instant, as pairs (points, style).
 
-    points: array (k, 2). style: keyword arguments for `axes.plot`. The arguments are those of
-    `draw_marks`. The number of pairs is the same at every instant, so that a film can update the
-    lines. If a point of a mark is not finite, all points of its lines are nan.
+    In each pair, points is an array (k, 2) and style a dict of keyword arguments for `axes.plot`.
+    The arguments are those of `draw_marks`. The number of pairs is the same at every instant, so
+    that a film can update the lines. If a point of a mark is not finite, its lines consist of nan.
     """
     widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
     width = 0.02 * float(widest)

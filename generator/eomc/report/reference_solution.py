@@ -64,10 +64,19 @@ MIN_PLAIN_DIGITS = 26.0  # of accelerations: with fewer, the equations differ
 class Reference:
     """A reference solution: coordinates `q` and velocities `qd` (n, nq) at times `t` (n,) in s.
 
-    q, qd: decimal texts of 37 digits. digits: (n,), number of digits to which two independent
-    computations agree up to each time, relative to the largest value of each coordinate. plain:
-    agreement with the symbolic equations evaluated with mpmath, as (digits of the accelerations,
-    digits of the motion, last compared time in s); None if these equations are too large.
+    Attributes
+    ----------
+    t
+        Times in s.
+    q, qd
+        Coordinates and velocities, as decimal texts of 37 digits.
+    digits
+        Array (n,): number of digits to which two independent computations agree up to each time,
+        relative to the largest value of each coordinate.
+    plain
+        Agreement with a third computation, in which mpmath evaluates the symbolic equations: a
+        tuple (digits of the accelerations, digits of the motion, last compared time in s). None if
+        these equations are too large.
     """
 
     t: Vector
@@ -96,8 +105,9 @@ class Reference:
     def error_of(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
         """Return the error of the states [q; q̇], states minus reference, of shape (n, 2 nq).
 
-        q, qd: coordinates and velocities (n, nq) of a run. rows: the indices of the reference's
-        times at which these states are, all by default. The difference is accurate to rounding.
+        q, qd: coordinates and velocities (n, nq) of a run. rows: the indices, in `t` of the
+        reference, of the times of these states; by default all times. The difference is accurate
+        to rounding.
         """
         high, low = self.halves
         return np.asarray((np.hstack([q, qd]) - high[rows]) - low[rows])

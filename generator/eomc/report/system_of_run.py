@@ -16,7 +16,7 @@ Source = str | os.PathLike[str] | System
 
 
 def system_of(run: Any, scene: Source | None = None) -> System:
-    """Return the system that a run was simulated with, with the parameter values of the run.
+    """Return the system that a run simulated, with the parameter values of the run.
 
     Parameters
     ----------

@@ -26,9 +26,10 @@ MAX_KEY_PARAMETERS = 2  # that differ between the instances, in the key
 
 @dataclass(frozen=True)
 class Line:
-    """A curve against time: its name and its values at the stored times that are shown.
+    """A curve against time in a panel of an animation: its name and its values.
 
-    stairs: True for an input that is held constant from one time to the next (zero-order hold).
+    The values belong to the stored times that the animation shows. stairs: True for an input that
+    is held constant from one time to the next (zero-order hold), which is drawn in steps.
     """
 
     name: str
@@ -38,9 +39,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves that share one pair of axes, and their unit.
+    """A panel of an animation: curves with the same unit that share one pair of axes.
 
-    name: the quantity, if all curves show the same quantity for different instances, else "".
+    name: name of the quantity, if all curves show one quantity for different instances (runs of a
+    batch); else "".
     """
 
     unit: str
@@ -51,7 +53,7 @@ class Panel:
 class Timeline:
     """The data of one run for an animation: the drawing of the mechanism and curves against time.
 
-    t: times (n,) of the run's rows (stored states), s.
+    t: times (n,) in s of the stored states of the run.
     """
 
     key: tuple[str, ...] = ()  # a label for each instance of a batch
@@ -87,10 +89,11 @@ class Timeline:
         return drawing(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
 
     def panels(self, rows: Rows) -> Iterator[Panel]:
-        """Yield the panels with curves of coordinates, outputs and inputs, then that of the energy.
+        """Yield the panels with curves of coordinates, outputs and inputs, and one of the energy.
 
         rows: indices of the stored times that the curves show. If there are few curves, each has a
-        panel of its own; otherwise all curves with the same unit share a panel.
+        panel of its own; otherwise all curves with the same unit share a panel. The panel of the
+        energy is the last one.
         """
         system, run = self.system, self.run
         q = np.asarray(run.q, dtype=float)[rows]
@@ -115,8 +118,8 @@ class Timeline:
 class BatchTimeline(Timeline):
     """The data of several instances of a batch for an animation that shows them superimposed.
 
-    names: quantities to plot, by default coordinates and the energy. chosen: number of instances to
-    show, or the list of their indices.
+    An instance is one run of the batch. names: quantities to plot, by default coordinates and the
+    energy. chosen: number of instances to show, or the list of their indices.
     """
 
     def __init__(self, system: System, batch: Any, names: Sequence[str], chosen: Any) -> None:

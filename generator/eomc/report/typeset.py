@@ -36,7 +36,8 @@ Term = tuple[bool, Expr]  # (True if subtracted, the term without its sign)
 class Typesetter:
     """Prints SymPy expressions over the names of a system as blocks of Unicode text or as LaTeX.
 
-    A `Term` is a pair (True if the term is subtracted, the term without its sign).
+    Methods for sums use pairs of the type `Term`: (True if the term is subtracted, the term without
+    its sign).
     """
 
     def __init__(self, system: System) -> None:
@@ -90,7 +91,8 @@ class Typesetter:
     def term(self, *factors: Expr) -> Term:
         """Return the product of `factors`, sorted for printing, as a pair (subtracted, term).
 
-        The first value is True if the coefficient is negative; the term itself has no sign.
+        subtracted: True if the numerical coefficient of the product is negative. term: the product
+        without this sign.
         """
         factors = tuple(x for f in factors for x in sympy.Mul.make_args(f) if x != 1)
         signed = sympy.Mul(*(f for f in factors if f.is_Number))
@@ -110,7 +112,10 @@ class Typesetter:
         return bool(signed < 0), product
 
     def ordered(self, e: Expr) -> Expr:
-        """Return an expression whose sums and products are sorted for printing, not evaluated."""
+        """Return an expression equal to `e` whose sums and products are sorted for printing.
+
+        SymPy does not evaluate them, so that the order is preserved.
+        """
         if e.is_Add:
             signed = [(-1 if minus else 1, term) for minus, term in self.terms(e)]
             return sympy.Add(*(_negative(x) if s < 0 else x for s, x in signed), evaluate=False)
@@ -224,8 +229,9 @@ class Typesetter:
     def latex_lines(self, terms: Sequence[Term], right: Sequence[Term] | None = None) -> list[str]:
         """Return a sum, or an equation, as lines of LaTeX.
 
-        The arguments are those of `text_lines`. A line contains the terms that fill about WIDE
-        columns as Unicode text.
+        terms: the sum, or the left-hand side. right: terms of the right-hand side, where an empty
+        sequence is 0; None for a sum. Lines are broken between terms so that each line would be
+        about WIDE columns wide as Unicode text.
         """
         lines = [self._latex_row(row, k > 0) for k, row in enumerate(self.rows(terms, WIDE))]
         if right is not None:
