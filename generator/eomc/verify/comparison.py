@@ -198,7 +198,10 @@ class Comparison:
 
     @cached_property
     def corners(self) -> str:
-        """Names of the scene's functions with discontinuities or kinks, as text; "" without any."""
+        """Names of functions with discontinuities or kinks in the scene, as text for a message.
+
+        The text is "" if there are none.
+        """
         return nonsmooth_functions(self.system)
 
     @property
@@ -415,18 +418,18 @@ class Comparison:
         return s.t if self.system.constraints else 0.0
 
     def simulate(self, s: State, **how: Any) -> Any:
-        """Return the module's run from the state `s`.
+        """Return the module's run from the state `s`, as by its method `simulate`.
 
-        how: further arguments of the module's `simulate`, such as h and steps.
+        how: further arguments of `simulate`, such as h and steps.
         """
         if begin := self.start_time(s):
             how.setdefault("t0", begin)
         return simulate(self.module, projected_start(self.module, s), **how)
 
     def run_energy(self) -> float:
-        """Return the largest error of the energies that a run stores, in units of rounding.
+        """Return the largest error of the energies stored in a run, in units of rounding.
 
-        They are compared with the reference's energy at the states that the run stores.
+        They are compared with the reference's energies at the states stored in the same run.
         """
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
@@ -439,13 +442,13 @@ class Comparison:
         return float(np.max(errors, initial=0))
 
     def ask(self, name: str, s: State) -> Vector:
-        """Return the module's value `name`, such as "D" or "energy", at the state `s`."""
+        """Return the value of the module's function `name`, such as "D", at the state `s`."""
         return evaluate_module(self.module, name, s)
 
     def has_finite_accelerations(self, s: State) -> bool:
-        """Return whether the module's accelerations at `s` are finite in single precision.
+        """Return whether the module's accelerations at `s` are finite, for single precision.
 
-        In double precision the result is True.
+        In double precision the result is always True.
         """
         if self.dtype == np.float64:
             return True

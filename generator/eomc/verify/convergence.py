@@ -81,9 +81,10 @@ class _Ladder:
 
     @property
     def orders(self) -> Iterator[tuple[float, bool]]:
-        """Yield the order of each halving above rounding, and whether the finer difference is too.
+        """Yield the observed order of each halving of h, and whether it is exact or a lower bound.
 
-        If it is not, the order is a lower bound.
+        Each pair is (order, exact). Halvings whose coarser difference is mere rounding are left
+        out. The order is a lower bound if the finer difference is mere rounding.
         """
         for a, b in pairwise(self.differences):
             if NOISE_FACTOR * self.noise < a < MAX_DIFFERENCE:
@@ -97,7 +98,7 @@ class _Ladder:
     def best(self, least: float) -> float:
         """Return the largest observed order that is at least `least`; nan if there is none.
 
-        It does not count if a finer halving has an order below half of `least`.
+        An order does not count if a later halving of h has an order below half of `least`.
         """
         observed = list(self.orders)
         for k, (order, _) in enumerate(observed):
@@ -107,7 +108,7 @@ class _Ladder:
 
     @property
     def agreed_order(self) -> float:
-        """Order on which the last two halvings above rounding error agree; nan if they do not."""
+        """Order of the last two halvings of h above rounding, if they agree; otherwise nan."""
         observed = [p for p, clear in self.orders if clear]
         if len(observed) < 2 or abs(observed[-1] - observed[-2]) > ORDER_TOLERANCE:
             return math.nan
@@ -164,10 +165,10 @@ class Convergence:
         return np.array([run.q[-1], run.qd[-1]]) / self.scale
 
     def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
-        """Return how far rounding moves the final state of a run, in units of the scale.
+        """Return how far rounding moves the final state of a run, divided by the scale.
 
-        Runs start at states that differ from that of `at` by a rounding. The result is the largest
-        change of the final state, and at least one rounding.
+        Runs start at states that differ from that of `at` by one rounding error. The result is the
+        largest change of the final state, and at least one rounding error.
 
         Parameters
         ----------
@@ -175,6 +176,10 @@ class Convergence:
             The initial state of the run.
         end : callable
             Returns the scaled final state of a run of `steps` steps over `span` seconds.
+        span : float
+            Duration of the run, s.
+        steps : int
+            Number of steps.
         there : (2, nq) array
             The scaled final state of the run from `at`.
         """

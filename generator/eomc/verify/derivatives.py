@@ -20,22 +20,25 @@ def differentiate(
     reference: Reference, s: State, scale: Vector, defaults: Mapping[str, float],
     name: str = "acceleration",
 ) -> Iterator[tuple[Vector, Vector]]:  # fmt: skip
-    """Yield difference quotients of the reference's accelerations, one pair for each of WIDTHS.
+    """Yield derivatives of the reference's accelerations at a state, as difference quotients.
 
-    Each pair is (J, scales). J (nq, 2 nq + nu + np) are the derivatives with respect to q, q̇, the
-    inputs u and the parameters p; scales are typical sizes of these variables. WIDTHS are the steps
-    of the quotients relative to `scales`.
+    Each item is a pair (J, scales), one for each step width in WIDTHS. J (nq, 2 nq + nu + np)
+    contains the derivatives with respect to q, q̇, the inputs u and the parameters p. scales are
+    typical sizes of these variables; the steps are WIDTHS times these. Inputs are constant: those
+    of the state or, if it has none, the values of the scene's signals.
 
     Parameters
     ----------
+    reference : Reference
+        The independent evaluation of the system in Python.
+    s : State
+        The state.
     scale : (2, nq) array
         Typical sizes of q and q̇.
     defaults : mapping
         Parameter values, used if the state has none.
     name : str
         Method of the reference to be differentiated in place of `acceleration`.
-
-    Inputs are held constant: at those of the state or, if it has none, at the scene's signals.
     """
     n, params = len(s.q), dict(s.params or defaults)
     u = np.zeros(0)

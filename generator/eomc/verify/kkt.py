@@ -31,8 +31,9 @@ CONVERGENCE_TOLERANCE = (
 def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
     """Return x and λ with D x - Aᵀλ = force and A x = level, at one or many states.
 
-    Shapes: D (..., n, n), A (..., m, n), force (..., n), level (..., m), x (..., n), λ (..., m).
-    The results are nan for a state with an argument that is not finite.
+    D (..., n, n) is the mass matrix and A (..., m, n) the constraint Jacobian. force is (..., n),
+    level (..., m), x (..., n) and λ (..., m). The results are nan for a state with an argument that
+    is not finite.
     """
     n, m = D.shape[-1], A.shape[-2]
     shape = np.broadcast_shapes(D.shape[:-2], A.shape[:-2], force.shape[:-1], level.shape[:-1])
@@ -182,10 +183,10 @@ def project(
 ) -> tuple[Vector, float]:
     """Return an x near q that satisfies the constraints, and the size of the last correction.
 
-    Newton's method starts at q and each correction is minimal in the metric of D; a long one is
-    halved until it reduces the residual. rows: a function of x that returns D, A and the residual
-    of the constraint equations. The size is relative to x: rounding if the iteration has converged,
-    inf if x does not satisfy the constraints.
+    Newton's method starts at q. Each correction is the shortest in the metric of D; a long one is
+    halved until it reduces the residual. rows: a function of x that returns D, A (constraint
+    Jacobian) and the residual of the constraint equations. The size is relative to x. It is of the
+    order of rounding if the iteration has converged, and inf if x does not satisfy the constraints.
     """
     D, A, residual = rows(q)
     last = np.inf

@@ -25,9 +25,10 @@ class Measurement:
 
 
 def largest(errors: Iterable[float | None], why: str) -> float | Measurement:
-    """Return the largest of the errors that are not None; nan if one of them is nan.
+    """Return the largest of the errors; None in place of an error means nothing to compare.
 
-    If all are None, return a Measurement with the reason `why`, which is not judged.
+    The result is nan if one of the errors is nan. If all are None, it is a Measurement with the
+    reason `why`, which is not judged.
     """
     known = [x for x in errors if x is not None]
     return float(np.max(known)) if known else Measurement(math.nan, why)

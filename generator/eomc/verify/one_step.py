@@ -26,9 +26,9 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
     """Return q and q̇ at t + h by one step of the Runge-Kutta method `m`, (2, ..., nq).
 
     q and qd are (..., nq), t is a number or (...,). acceleration: a function of q, q̇ and t that
-    returns q̈ of the same shape; for a single state and an implicit method it is also called with
-    all stages at once, (stages, nq) and t (stages,). The result is nan if the fixed-point iteration
-    for the stages does not converge because h is too long.
+    returns q̈ of the same shape. For a single state and an implicit method, it is also called with
+    all stages at once, (stages, nq) and t (stages,). The result is nan if h is so long that the
+    fixed-point iteration for the stages does not converge.
     """
     q, qd = np.asarray(q, float), np.asarray(qd, float)
     A, AA = (_square(rows, m.stages) for rows in (m.a, m.a_squared))
@@ -64,9 +64,10 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
 
 
 def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> Vector:
-    """Return the derivatives of the acceleration function `a` with respect to q and q̇, (nq, 2 nq).
+    """Return the derivatives of the accelerations with respect to q and q̇ at one state, (nq, 2 nq).
 
-    They are central differences at one state, with steps of WIDTH times the scale (2, nq).
+    a: a function of q, q̇ and t that returns the accelerations. The derivatives are central
+    differences with steps of WIDTH times `scale` (2, nq), the typical sizes of q and q̇.
     """
     n = len(q)
     by = np.diag(WIDTH * np.ravel(scale))

@@ -14,10 +14,10 @@ LIMIT = 1e3
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the report: a check with its measured error, the limit, and the unit of both.
+    """One line of the report: a check with its measured error, its limit, and the unit of both.
 
-    If nothing could be judged, `judged` is False and `unit` gives the reason; such a row counts as
-    passed.
+    passed: whether the check has passed. judged: False if nothing could be judged; the row then
+    counts as passed and `unit` gives the reason.
     """
 
     name: str
@@ -33,8 +33,8 @@ class Report:
     """The report of `eomc check`: its rows, one for each check, and how they were obtained.
 
     states: number of states used. rejected: number of random states left out since their mass
-    matrix D was not regular. reference: how expected values were computed, "equations written out"
-    or "Taylor arithmetic".
+    matrix D was not regular. reference: how the expected values were computed, either "equations
+    written out" (formulas) or "Taylor arithmetic" (numerical).
     """
 
     scene: str
@@ -70,7 +70,10 @@ class Report:
         return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the report as a dict for JSON; an error that is not finite becomes None."""
+        """Return the report as a dict that can be written as JSON.
+
+        An error that is not finite becomes None.
+        """
         rows = [asdict(row) for row in self.rows]
         for row in rows:
             row["error"] = row["error"] if math.isfinite(row["error"]) else None

@@ -184,12 +184,12 @@ class BatchRows:
         self, starts: list[State], span: float, steps: int, *, stiff: bool = False,
         longest: float = 0.0,
     ) -> BatchResult:  # fmt: skip
-        """Return the results of a run by the C function `adaptive_batch`.
+        """Return the results of an adaptive batch run by the C function `adaptive_batch`.
 
-        The run lasts `span` seconds from the time of the checked state, with the initial states
-        `starts`. The function is called until no instance is left, with at most `steps` steps of
-        each per call. stiff: begin with Newton's method. longest: limit of the step size, s; 0 for
-        none.
+        starts: initial states of the instances. The run begins at the time of the checked state and
+        lasts `span` seconds. steps: largest number of steps of each instance per call; calls are
+        repeated until all instances are finished. stiff: whether to begin with Newton's method.
+        longest: limit of the step size, s; 0 for none.
         """
         model, n, s = self.model, len(starts), starts[0]
         new = model._ffi.new

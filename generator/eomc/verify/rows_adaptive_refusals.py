@@ -43,10 +43,10 @@ class _RunResult:
 
 
 def report(check: Comparison, refusals: Refusals) -> None:
-    """Append checks of refusals and of the longest step in adaptive runs to the report.
+    """Append checks of adaptive runs to the report: refusals, and the limit of the step size.
 
     There are none if the scene has no tolerance. refusals: the checks of refusals by fixed steps,
-    which have found states with a singular D.
+    which have found states with a singular mass matrix D.
     """
     if check.system.run.tolerance is None:
         return
@@ -67,7 +67,7 @@ class _Adaptive:
         """Return an adaptive run of `span` seconds by the C function, of at most MAX_STEPS steps.
 
         s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff:
-        begin with Newton's method. each: number of steps in each call of the C function.
+        whether to begin with Newton's method. each: number of steps per call of the C function.
         """
         model, many = self.model, 2 * MAX_STEPS
         x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)

@@ -100,11 +100,12 @@ class Batches:
         self, method: str, states: list[State], u: Vector | None, *, own: bool = True,
         every: int = 1, h: float = 0.0,
     ) -> Any:  # fmt: skip
-        """Return the run of a batch with these initial states, by STEPS steps of `method`.
+        """Return the run of a batch from the initial states `states`, by STEPS steps of `method`.
 
-        u: inputs for each instance, (n, nu) or (n, STEPS, nu), or None for the scene's signals.
-        own: each instance has its state's parameters; otherwise all share those of the first state.
-        every: only each `every`-th state is stored. h: step size, s; 0 for the scene's.
+        u: inputs of the instances, (n, nu), or (n, STEPS, nu) with values for each step; None for
+        the scene's signals, its formulas for the inputs. own: whether each instance has its state's
+        parameters; otherwise all have those of the first state. every: only each `every`-th state
+        is stored. h: step size, s; 0 for the scene's.
         """
         names = self.check.sampler.defaults
         params: Any = states[0].params

@@ -46,7 +46,7 @@ UNITS = "units of rounding"
 
 
 def report(check: Comparison) -> None:
-    """Append checks of constraints to the report of `eomc check`, for a scene that has some."""
+    """Append checks of constraints to the report of `eomc check`, if the scene has constraints."""
     rows = FormRows(check, check.module)
     for name in VALUES:
         check.row(name, LIMIT, UNITS, partial(check.value, name))
@@ -80,9 +80,10 @@ def _values(check: Comparison, module: Any) -> float:
 
 
 class FormRows:
-    """Checks of constraints for the module of one form of C, optimised or portable.
+    """Checks of constraints for one module, compiled from the optimised or the portable C code.
 
-    holonomic: for each constraint equation, whether it is one of positions.
+    holonomic: for each constraint equation, whether it restricts positions (holonomic) rather than
+    velocities.
     """
 
     def __init__(self, check: Comparison, module: Any) -> None:
@@ -92,9 +93,9 @@ class FormRows:
     def slopes(self) -> float:
         """Return the largest relative error of the module's constraint Jacobian A over the states.
 
-        It is compared with differences of the constraint equations, along q for holonomic and along
-        q̇ for nonholonomic ones. Of several widths the smallest error counts: none makes a wrong A
-        right.
+        The exact A is a difference quotient of the constraint equations, with respect to q for
+        holonomic and with respect to q̇ for nonholonomic equations. Steps of several widths are
+        used and the one with the smallest error counts, since no width makes a wrong A right.
         """
         check, spread = self.check, self.check.sampler.spread
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
@@ -122,7 +123,9 @@ class FormRows:
     def tangent(self) -> float:
         """Return how much constraints and their rates change along the module's tangent directions.
 
-        The change must be zero. It is relative to the sum of the sizes of its terms.
+        The module's function `tangent` returns directions in [q; q̇] along which the constraints
+        stay satisfied, so that the change must be zero. The result is relative to the sum of the
+        absolute values of the terms of the change.
         """
         moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
         steps = {"q": self.check.sampler.spread, "qd": self.check.sampler.speed}
@@ -163,8 +166,8 @@ class FormRows:
     def power(self) -> float:
         """Return the largest error of the power of the multipliers, λ·(A q̇), in units of rounding.
 
-        If the constraint equations' rates are A q̇ + b, it must be -λ·b: 0 unless constraints
-        depend on time.
+        A q̇ + b are the rates of the constraint equations, and must be zero. The expected power is
+        therefore -λ·b, which is 0 unless constraints depend on time.
         """
 
         def error(e: Expected) -> float:
@@ -182,9 +185,10 @@ class FormRows:
     def reactions(self) -> float:
         """Return the largest relative error of the virtual work of reactions over some states.
 
-        As one coordinate moves, reactions at a loop must do the work λ·A of the loop's equations.
-        Force and moment act at the loop's point on its second body, and against the first one.
-        Velocities follow from the scene's own tables, as in rows_bodies.py.
+        Reactions are the force and moment at the point of a closed loop: they act on the loop's
+        second body and, reversed, on the first one. When one coordinate moves, their work must
+        equal that of the loop's multipliers, λ·A. Velocities of the bodies are computed from the
+        scene file.
         """
         return self.check.largest(self._work, STATES)
 
@@ -235,7 +239,7 @@ class FormRows:
         return float(total / np.sum(moving))
 
     def residual_along_run(self, method: str) -> float | Measurement:
-        """Return the largest residual of constraints and their rates along runs, in roundings.
+        """Return the largest residual of constraints and of their rates along runs, in roundings.
 
         The runs by `method` start at a few states.
         """

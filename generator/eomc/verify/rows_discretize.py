@@ -30,9 +30,9 @@ Differences = Callable[[str, int, float], list[Vector]]  # of a method, state an
 
 
 def report(check: Comparison) -> None:
-    """Append checks of `discretize` to the report of `eomc check`, if the scene requires it.
+    """Append checks of `discretize` to the report of `eomc check`, one for each method.
 
-    There is one for each method.
+    There are none if the scene does not require this function, which linearises one step.
     """
     if not check.system.run.discretize:
         return

@@ -23,7 +23,10 @@ from eomc.verify.sampling import State
 
 
 def report(check: Comparison) -> None:
-    """Append checks of event functions and jumps to the report, if the scene defines events."""
+    """Append checks of event functions and jumps to the report, if the scene defines events.
+
+    An event is detected at a root of its event function; a jump then changes the state.
+    """
     system = check.system
     events = system.own_events
     groups = {"events": [Output(e.name, e.when) for e in events]}

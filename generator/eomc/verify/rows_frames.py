@@ -27,7 +27,8 @@ TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 def report(check: Comparison, scene: Scene) -> None:
     """Append checks of frames and momentum to the report of `eomc check`.
 
-    Functions that the module does not have are left out.
+    Frames are coordinate systems on bodies for which the module has functions, such as poses and
+    velocities. A function that the module does not have is not checked.
     """
     run, eps = check.system.run, check.eps
     for module, form in check.forms:
@@ -48,9 +49,9 @@ def report(check: Comparison, scene: Scene) -> None:
 
 
 def inverse_dynamics(check: Comparison) -> None:
-    """Append checks of `inverse_dynamics` to the report of `eomc check`.
+    """Append checks of the module's `inverse_dynamics` to the report of `eomc check`.
 
-    It is compared with D q̈ + bias of the reference.
+    This function is compared with D q̈ + bias of the reference.
     """
     for module, form in check.forms:
         measure = partial(check.largest, partial(_inverse, check, module), STATES)
@@ -82,9 +83,9 @@ class _Frames:
         self.plane = check.system.plane
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:
-        """Yield lines of motion through the state `s`, one for each of several widths.
+        """Yield short motions through the state `s`, one for each of several durations.
 
-        bend: accelerations along the line, (nq,). See `rows_bodies.Line`.
+        bend: accelerations during the motion, (nq,). See `rows_bodies.Line`.
         """
         for width in widths(self.check.sampler.spread, s.qd, bend):
             with np.errstate(all="ignore"):
@@ -97,8 +98,9 @@ class _Frames:
     ) -> float:
         """Return the largest error of the module's `values`, relative to the largest exact value.
 
-        exact: a function that computes them from a line of motion. state: arguments of `lines`,
-        which yields several; the smallest error counts. least: lower bound of the divisor.
+        exact: a function that computes the exact values from a line of motion (a short motion
+        through a state). state: arguments of `lines`, which yields such lines of several widths;
+        the smallest error counts. least: lower bound of the divisor.
         """
         best = np.inf
         for line in self.lines(*state):
@@ -140,7 +142,10 @@ class _Frames:
         return self.off(both, exact, e.state)
 
     def twists(self, line: Line) -> Vector:
-        """Return linear and angular velocities of all frames at the nodes of a line, (nf, 6, n)."""
+        """Return linear and angular velocities of all nf frames along a motion, (nf, 6, n).
+
+        line: the motion, evaluated at n times.
+        """
         motions = (line.motion(line.frames[name], np.zeros(3)) for name in self.names)
         return np.array([np.hstack(motion).T for motion in motions])
 
@@ -160,7 +165,10 @@ class _Frames:
         return self.off(twists, exact, s, least=least)
 
     def twist_scale(self, s: State, rates: Vector) -> float:
-        """Return the largest component of frames' velocities at coordinate velocities `rates`."""
+        """Return the largest component of the frames' velocities for given coordinate velocities.
+
+        rates: the coordinate velocities, (nq,), used in place of those of `s`.
+        """
         J = np.abs(self.module.jacobian(s.q, **self.arguments(s)))
         return float(np.max(J @ rates, initial=0))
 
@@ -182,8 +190,8 @@ class _Frames:
     def jacobians(self, e: Expected) -> float:
         """Return the relative error of the module's Jacobians of frames.
 
-        Each column is compared with the frames' velocities as one coordinate moves, less those at
-        rest, which are due to time alone.
+        Column i is compared with the frames' velocities when coordinate i alone moves, minus their
+        velocities when no coordinate moves, which are due to time alone.
         """
         s = e.state
         J = np.asarray(self.module.jacobian(s.q, **self.arguments(s)), float)

@@ -39,9 +39,10 @@ def _differ(check: Comparison, module: Any) -> float:
 
 
 def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]:
-    """Return the least and the largest values of the inputs, both (nu,); infinite without a limit.
+    """Return the smallest and the largest permitted values of the inputs, both (nu,).
 
-    params: the parameters, which the limits' formulas may contain.
+    An input without a limit has the value -inf or inf there. params: values of the parameters,
+    which the formulas of the limits may contain.
     """
     values = {symbol(name): value for name, value in params.items()}
     ends = [

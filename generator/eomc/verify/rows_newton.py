@@ -62,10 +62,10 @@ class _Equilibrium:
 
 
 def report(check: Comparison) -> None:
-    """Append checks of Newton's method to the report, for each implicit method that has it.
+    """Append checks of Newton's method to the report, for each implicit method that uses it.
 
-    There are none in single precision, which leaves a motion near an equilibrium too few digits,
-    nor under constraints, where a step is corrected after its stages are found.
+    There are none in single precision, in which a motion near an equilibrium has too few digits.
+    There are none under constraints either, where a step is corrected after its stages are found.
     """
     if check.system.constraints:
         return
@@ -82,7 +82,7 @@ def report(check: Comparison) -> None:
 
 
 class Newton:
-    """Comparison of the iterations of the module's implicit steps with the reference's.
+    """Comparison of iteration counts: the module's implicit steps against those of the reference.
 
     scale: typical sizes of q and q̇, (2, nq).
     """
@@ -92,9 +92,11 @@ class Newton:
         self.scale = check.sampler.scale
 
     def extra_sweeps(self, method: str) -> float | Measurement:
-        """Return the largest number of iterations per step beyond those of the reference.
+        """Return by how many iterations per step the module at most exceeds the reference.
 
-        It is inf if the module's steps fail or end at a wrong state.
+        The maximum is over steps of several sizes by `method`. It is inf if the module's steps fail
+        or end at a wrong state. Nothing is judged (a Measurement with the reason) without a
+        suitable motion.
         """
         place = self.place()
         if place is None or not place.fastest:
@@ -104,11 +106,12 @@ class Newton:
         return float(np.max(known)) if known else Measurement(math.nan, "no stiff motion is linear")
 
     def sweeps(self, method: str, place: _Equilibrium, h: float) -> float | None:
-        """Return the module's additional iterations per step, for steps of h seconds.
+        """Return by how many iterations per step the module exceeds the reference, in steps of h s.
 
-        place: the equilibrium near which the run starts. None if the motion is not linear there, or
-        if fixed-point iteration converges, however slowly, since the module may use it. inf if the
-        module's steps fail or end at a wrong state.
+        place: the equilibrium near which the run starts. The result is None if the motion is not
+        linear there. It is also None if fixed-point iteration converges, however slowly, since the
+        module may then use it in place of Newton's method. It is inf if the module's steps fail or
+        end at a wrong state.
         """
         m, s = METHODS[method], place.start
         if one_step.contraction_factor(m, place.slopes, h) < MAX_PLAIN_CONTRACTION:
@@ -143,14 +146,14 @@ class Newton:
     def accelerations(self, q: Vector, qd: Vector, t: Vector) -> Vector:
         """Return the reference's accelerations at n states, (n, nq).
 
-        q and qd are (n, nq), t is (n,). Parameters and inputs are the scene's own.
+        q and qd are (n, nq), t is (n,). Parameters and inputs are those of the scene.
         """
         return self.check.reference.acceleration(q, qd, t)
 
     def place(self) -> _Equilibrium | None:
-        """Return an equilibrium, found by Newton's method from the start, with a state near it.
+        """An equilibrium found by Newton's method from the scene's start, and a state near it.
 
-        None if accelerations or their derivatives are not finite on the way.
+        It is None if accelerations or their derivatives become infinite or nan in the search.
         """
         s = self.check.sampler.start
         q, rest = s.q.copy(), np.zeros_like(s.q)

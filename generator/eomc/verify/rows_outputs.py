@@ -36,7 +36,10 @@ _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x
 
 
 def report(check: Comparison) -> None:
-    """Append checks of outputs and of their derivatives to the report of `eomc check`."""
+    """Append checks of outputs and of their derivatives to the report of `eomc check`.
+
+    Outputs are quantities that the scene defines by formulas.
+    """
     formulas = Formulas(check.system)
     limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
     for module, form in check.forms:
@@ -65,8 +68,8 @@ def compare_outputs(
 ) -> float:
     """Return the largest error of a function of the module over some states, in units of rounding.
 
-    function: computes values (ny,) at a state. formulas: the formulas of these values, evaluated in
-    many digits with the module's own accelerations and multipliers.
+    function: returns the module's values, (ny,), at a state. formulas: evaluate the same values
+    with many digits, from the module's own accelerations and multipliers.
     """
 
     def error(e: Expected) -> float:
@@ -152,9 +155,10 @@ def _with_fixed_inputs(check: Comparison, module: Any, s: State) -> State:
 
 @dataclass
 class Formulas:
-    """The outputs of a system, evaluated from their formulas in many digits.
+    """The outputs of a system, evaluated from their formulas with many digits.
 
-    Rates dot(...) in formulas are difference quotients along the motion.
+    Outputs are quantities that the scene defines by formulas. A rate dot(...) in a formula is
+    computed as a difference quotient along the motion.
     """
 
     system: System
@@ -164,15 +168,19 @@ class Formulas:
 
     @cached_property
     def multipliers(self) -> tuple[Symbol, ...]:
-        """Symbols of the multipliers of all constraint equations; empty if no output uses one."""
+        """Symbols of the multipliers of all constraint equations.
+
+        The tuple is empty if no output contains a multiplier.
+        """
         read = {x for o in self.system.outputs for x in o.formula.free_symbols}
         multipliers = tuple(c.multiplier for c in self.system.constraints)
         return multipliers if read & {*multipliers} else ()
 
     def evaluate(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
-        """Return the outputs, (ny,), at a state with inputs.
+        """Return the values of the outputs, (ny,), at a state.
 
-        qdd: accelerations (nq,). forces: multipliers, if the outputs use them.
+        s: the state, with its inputs. qdd: the accelerations, (nq,). forces: the Lagrange
+        multipliers, needed if `multipliers` is not empty.
         """
         with mpmath.workdps(DIGITS):
             return np.array([float(y) for y in self._values(self._symbol_values(s, qdd, forces))])
@@ -182,8 +190,9 @@ class Formulas:
     ) -> Vector:
         """Return difference quotients of the outputs, (ny, 3 nq + nu + nc).
 
-        The columns are q, q̇, u, q̈ and the nc multipliers that outputs use. With `by_parameters`,
-        the parameters replace q, q̇ and u. qdd, forces: as in `evaluate`.
+        The columns are derivatives with respect to q, q̇, u, q̈ and the nc multipliers; nc is 0 if
+        no output contains one. With `by_parameters`, the parameters replace q, q̇ and u. qdd,
+        forces: as in `evaluate`.
         """
         system = self.system
         own = (*system.q, *system.qd, *system.u)
@@ -218,10 +227,11 @@ class Formulas:
         return [_real(motion, o.formula) for o in self.system.outputs]
 
     def compiled(self, e: Expr) -> tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]:
-        """Return a formula as a function of its symbols and of the rates dot(...) in it.
+        """Return a formula as a Python function, with a description of its arguments.
 
-        The results are the function, its symbols, and the expressions inside of dot(...), whose
-        rates are the function's further arguments.
+        The result is (function, symbols, expressions). The arguments of the function are the values
+        of `symbols`, followed by the time derivatives of `expressions`: these are the y of all
+        dot(y) in the formula.
         """
         if e not in self._compiled:
             rates = [d for d in e.atoms(dot) if not any(d != o and o.has(d) for o in e.atoms(dot))]
@@ -252,14 +262,17 @@ class _Motion:
         self.known: dict[tuple[Symbol, Any], Any] = {}
 
     def value(self, e: Expr, time: Any) -> Any:
-        """Return the value of the formula `e` at `time`, s, from that of the state."""
+        """Return the value of the formula `e` at `time`, in s after the time of the state."""
         f, symbols, rates = self.formulas.compiled(e)
         ends = [[self.value(x, time + h) for h in (WIDTH, -WIDTH)] for x in rates]
         slopes = ((a - b) / (2 * WIDTH) for a, b in ends)
         return f(*(self.symbol(x, time) for x in symbols), *slopes)
 
     def symbol(self, x: Symbol, time: Any) -> Any:
-        """Return the value of a symbol at `time`, s, from that of the state."""
+        """Return the value of the symbol `x` at `time`, in s after the time of the state.
+
+        Accelerations are taken as constant.
+        """
         if (x, time) not in self.known:
             if x in self.definitions:
                 value = self.value(self.definitions[x], time)

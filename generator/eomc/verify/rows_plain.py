@@ -40,7 +40,7 @@ COMPARED_VALUES = (*VALUES, "acceleration")
 
 
 def rows(check: Comparison) -> None:
-    """Append checks of the portable form of the C code to the report of `eomc check`.
+    """Append checks of the portable C code (as opposed to the optimised one) to the report.
 
     There are none if there is no module of that form.
     """

@@ -139,8 +139,8 @@ class ProjectionChecks:
     def refusals(self) -> float:
         """Return the number of wrong results of `project` for states that are hard to project.
 
-        States that can't be projected must be refused and left unchanged. States far away must be
-        refused or satisfy the constraints afterwards.
+        A state that can't be projected must be refused (an error is returned) and left unchanged. A
+        state far from the constraints must be refused or satisfy the constraints afterwards.
         """
         random = np.random.default_rng(13)
         scale = self.of.sampler.scale

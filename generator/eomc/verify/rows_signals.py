@@ -18,9 +18,10 @@ from eomc.verify.sampling import Expected
 
 
 def report(check: Comparison) -> None:
-    """Append checks of closed loops to the report of `eomc check`.
+    """Append checks of the linearised closed loop to the report of `eomc check`.
 
-    There are none unless the inputs' signals are a smooth feedback of the state.
+    The loop is closed by the signals, the scene's formulas for inputs. There are no checks if no
+    signal depends on the state or if a signal has discontinuities.
     """
     if not check.system.run.needs_derivatives or not _is_feedback(check.system):
         return

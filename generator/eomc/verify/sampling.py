@@ -108,14 +108,17 @@ class State:
 
 
 def evaluate_module(module: Any, name: str, s: State) -> Vector:
-    """Return the module's value `name`, such as "D" or "acceleration", at the state `s`."""
+    """Return the value of a module's function at a state, as an array.
+
+    name: the function, such as "D" or "acceleration".
+    """
     place = (s.q,) if name in OF_POSITIONS else (s.q, s.qd)
     inputs = {"u": s.u} if name in OF_INPUTS else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
 
 
 def projected_start(module: Any, s: State) -> State:
-    """Return the state projected onto the module's constraints, as at the start of a run."""
+    """Return the state moved onto the module's constraints, as runs do with their initial state."""
     if not getattr(module, "constraint_names", ()):
         return s
     q, qd = module.project(s.q, s.qd, t=s.t, params=s.params)

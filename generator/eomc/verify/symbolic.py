@@ -38,7 +38,7 @@ def derive(system: System) -> SymbolicReference:
     of the system. U is the linear part of a generalized potential. T = K - U is split by its degree
     in q̇, T = T2 + a·q̇ + T0, and p = ∂T/∂q̇:
 
-    - D = d2T/dqd2, symmetric, others call it M;
+    - D = d2T/dqd2, the mass matrix, symmetric (often called M);
     - bias = (dp/dq) qd + dp/dt - dT/dq + dP/dq, and g = bias at qd = 0;
     - C_ij = 1/2 sum_k (dD_ij/dq_k + dD_ik/dq_j - dD_jk/dq_i) qd_k (Christoffel; Spong, Hutchinson,
       Vidyasagar, Robot Modeling and Control, 2006, eq. 7.60) + (da_i/dq_j - da_j/dq_i) + dD_ij/dt,
@@ -49,7 +49,7 @@ def derive(system: System) -> SymbolicReference:
     - of constraints phi(q, t), then psi(q, qd, t): A = dphi/dq, then dpsi/dqd; rates
       A qd + dphi/dt, then psi; gamma = d(rates)/dt at qdd = 0, so that A qdd + gamma = 0.
 
-    The last few results are cached, with their functions: a report needs the same in three places.
+    The last 16 results are cached, since `eomc check` needs the same one several times.
     Raises EomcError if K is not quadratic in the velocities, or if a definition can't be
     differentiated.
     """
@@ -219,11 +219,14 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 @dataclass(frozen=True)
 class SymbolicReference(Reference):
-    """Reference whose equations of motion are expressions in q, qd, t, u and the parameters.
+    """Reference whose equations of motion are SymPy expressions in q, qd, t, u and the parameters.
 
-    The expressions are explained in `derive`. Shapes: constraints, constraint_rates, gamma (m, 1);
-    constraint_jacobian (m, nq); D, C (nq, nq); g, bias, tau, friction (nq, 1), where friction is
-    ∂R/∂q̇ and contained in tau; signals (nu, 1), the inputs by default; the others are scalars.
+    A reference is the independent evaluation of a system in Python, with which modules are
+    compared. `derive` explains the expressions.
+
+    Their shapes are: constraints, constraint_rates, gamma (m, 1); constraint_jacobian (m, nq); D, C
+    (nq, nq); g, bias, tau, friction (nq, 1); signals (nu, 1), the scene's formulas for the inputs.
+    The others are scalars. friction is ∂R/∂q̇, which tau contains with a minus sign.
     """
 
     system: System

@@ -63,16 +63,19 @@ _REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
 
 
 class TaylorReference(Reference):
-    """Reference that evaluates equations of motion numerically; quantities as in `symbolic.derive`.
+    """Reference that evaluates equations of motion with arrays of derivatives instead of formulas.
 
-    D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) + c(0))/2 with c = T_vvs + N: that is
-    Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part da_i/dq_j
-    - da_j/dq_i and the explicit dD/dt, as in `symbolic.derive`. The module's docstring explains the
-    derivatives. No differences are taken: every value is good to a few roundings of its largest
+    A reference is the independent evaluation of a system in Python, with which modules are
+    compared. The quantities have the same meaning as in `symbolic.derive`.
+
+    With the notation of the module's docstring, D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) +
+    c(0))/2 with c = T_vvs + N. This is the sum of Christoffel's 1/2 (Ddot + dp2_i/dq_j -
+    dp2_j/dq_i) for p2 = D qd, the gyroscopic part da_i/dq_j - da_j/dq_i and the explicit dD/dt.
+    There are no difference quotients: each value is exact up to a few roundings of its largest
     terms.
 
-    Raises EomcError if K is not seen to be a polynomial of degree 2 in the velocities, or if a
-    derivative is needed that is not known.
+    Raises EomcError if K is not recognised as a polynomial of degree 2 in the velocities, or if a
+    required derivative is not known.
     """
 
     def __init__(self, system: System) -> None:
@@ -269,10 +272,10 @@ class _List:
         return len(self.ops) - 1
 
     def make(self, kind: str, args: Iterable[int], data: Any = None, degree: float = 0) -> int:
-        """Append an operation on earlier ones and return its index.
+        """Append an operation on the results of earlier ones and return its index.
 
-        kind, data, degree: as in `Op`. args: indices of its arguments, whose dependencies it
-        inherits.
+        kind, data, degree: as in `Op`. args: indices of its arguments. The operation depends on q,
+        time, rates and inputs if an argument does.
         """
         args = tuple(args)
         of = [self.ops[i] for i in args]
@@ -282,7 +285,10 @@ class _List:
         return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", given))
 
     def node(self, e: Any) -> int:
-        """Return the index of the operation that evaluates `e`."""
+        """Return the index of the operation that evaluates the expression `e`.
+
+        The operations are appended if `e` is new.
+        """
         e = sympy.sympify(e)
         if e not in self.known:
             self.known[e] = self.build(e)
@@ -350,10 +356,11 @@ class _List:
         return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
 
     def plan(self, fields_by_root: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
-        """Return the operations needed for some derivatives, in order of evaluation.
+        """Return the operations that some derivatives require, in the order of their evaluation.
 
-        fields_by_root: names of the needed derivatives, separated by spaces, for each result. Each
-        entry is the index of an operation, the operation, and the derivatives needed from it.
+        fields_by_root: for each root, the name of a quantity such as "K", the names of its required
+        derivatives, separated by spaces. Each entry of the result is the index of an operation, the
+        operation, and the derivatives that must be computed for it.
         """
         need: dict[int, set[str]] = {}
         for root, fields in fields_by_root.items():

@@ -41,12 +41,22 @@ FEEDS: Mapping[str, Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Op:
-    """One operation on the results of earlier ones.
+    """One operation: a rule that is applied to the results of earlier operations.
 
-    kind: its rule, a key of RULES. args: indices of its arguments. data: a number, index or
-    function that the rule needs. degree: degree in the velocities; inf if it is no polynomial in
-    them. moves: 2 if it depends on q, 1 if on t only, else 0. rate, has_inputs: whether it depends
-    on a dot(...), on an input.
+    Attributes
+    ----------
+    kind : str
+        Its rule, a key of RULES.
+    args : tuple of int
+        Indices of the operations whose results are its arguments.
+    data : object
+        A number, index or function that the rule needs.
+    degree : float
+        Degree in the velocities; inf if it is not a polynomial in them.
+    moves : int
+        2 if it depends on q, 1 if it depends on t only, else 0.
+    rate, has_inputs : bool
+        Whether it depends on a time derivative dot(...), and on an input.
     """
 
     kind: str
@@ -62,8 +72,8 @@ class Op:
 class Point:
     """The b states at which operations are evaluated.
 
-    q, qd: (b, nq). t: time, s. u, values: inputs and parameters. Each of these is one number or a
-    column (b, 1).
+    q, qd: coordinates and velocities, (b, nq). t: time, s. u: inputs. values: parameters. The time
+    and each input and parameter are one number or a column (b, 1).
     """
 
     q: Vector
@@ -74,11 +84,14 @@ class Point:
 
     @cached_property
     def d(self) -> Vector:
-        """Direction (q̇, 1) in which x = (q, t) moves, (b, nq + 1)."""
+        """Time derivative (q̇, 1) of x = (q, t), (b, nq + 1)."""
         return np.concatenate([self.qd, np.ones((len(self.qd), 1))], axis=1)
 
     def unit(self, i: int, more: int) -> Vector:
-        """Return the unit vector along entry i as a matrix with one row, (1, nq + more)."""
+        """Return the unit vector along entry i, as a matrix with one row, (1, nq + more).
+
+        more: number of entries after the nq coordinates, such as 1 for the time.
+        """
         row = np.zeros((1, self.q.shape[1] + more))
         row[0, i] = 1
         return row
@@ -299,9 +312,9 @@ def _asin(x: Any) -> Three:
 
 
 def step_at(at_zero: float) -> Callable[[Any], Three]:
-    """Return a function that computes value and two derivatives of the step function.
+    """Return a function of x that computes the step function and its first two derivatives.
 
-    at_zero: value of the step function at 0, where its derivatives are nan.
+    at_zero: value of the step function at x = 0, where the derivatives are nan.
     """
     return lambda x: (np.heaviside(x, at_zero), _corner(x), _corner(x))
 

@@ -22,19 +22,20 @@ _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the gene
 
 
 def simplify_trig(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
-    """Return an expression equal to `e` with as few operations as found, or `e` itself.
+    """Return an equal expression with fewer operations, or `e` itself if none is found.
 
-    rates: velocities; the coefficient of each product of them is shortened separately. Parts that
-    are not polynomial stay unchanged.
+    rates: velocities. For each product of velocities in `e`, its coefficient is simplified
+    separately. Parts that are not polynomial in sines and cosines, such as roots, are kept; only
+    their arguments are simplified.
     """
     e = sympy.sympify(e)
     return min((e, simplify_by_rates(e, rates)), key=lambda form: form.count_ops())
 
 
 def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
-    """Return `e` as a sum of products of rates, each with the shortest coefficient found.
+    """Return `e` as a sum of products of velocities, each with the shortest coefficient found.
 
-    rates: velocities. If `e` is not polynomial in them, it is shortened as a whole.
+    rates: the velocities. If `e` is not polynomial in them, the whole of it is simplified at once.
     """
     terms = coefficients(e, rates)
     if terms is None:
@@ -43,9 +44,9 @@ def simplify_by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
 
 
 def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
-    """Return pairs (product of rates, coefficient) whose sum of products is `e`.
+    """Return pairs (product of velocities, simplified coefficient) that add up to `e`.
 
-    rates: velocities. Coefficients are shortened. None if `e` is not polynomial in the rates.
+    rates: the velocities. The result is None if `e` is not polynomial in them.
     """
     if not rates or not e.has(*rates):
         coefficient = _coefficient(e)
