@@ -14,11 +14,17 @@ Names = frozenset[str]
 
 @dataclass(frozen=True)
 class Dependencies:
-    """What accelerations, outputs and event functions of a program depend on.
+    """Names of the variables that accelerations, outputs and event functions depend on.
 
-    Each dependency is a name of a coordinate, velocity, input or parameter, or of the time.
-    signals: whether the scene's signals may replace the inputs, so that results also depend on what
-    the signals depend on.
+    Variables are coordinates, velocities, inputs, parameters and the time.
+
+    Attributes
+    ----------
+    program
+        The program that computes these results.
+    signals
+        Whether the scene's signals (formulas for its inputs) may replace the inputs. If so, results
+        that depend on an input also depend on the variables in its signal.
     """
 
     program: Program
@@ -26,7 +32,10 @@ class Dependencies:
 
     @cached_property
     def known(self) -> Names:
-        """The names of all variables that an importer of the FMU sets, including the time."""
+        """The names of all variables that a simulation tool sets in the FMU, including the time.
+
+        These are coordinates, velocities, inputs, parameters and the time.
+        """
         s = self.program.system
         return frozenset(x.name for x in (*s.q, *s.qd, *s.u, *s.parameters)) | {TIME}
 
@@ -73,7 +82,10 @@ class Dependencies:
 
 
 def read(function: Function) -> list[Names]:
-    """Return, for each result of a function, the names of the arguments that determine it."""
+    """Return the names of the arguments that each result of a function depends on.
+
+    function: a function of the program, a list of elementary operations.
+    """
     dependencies: dict[str, Names] = {}
     for a in (*function.early, *function.body):
         dependencies[a.name] = frozenset().union(*(dependencies.get(n, {n}) for n in a.value.names))

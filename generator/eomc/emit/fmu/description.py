@@ -20,10 +20,10 @@ from eomc.scene.formulas import parse
 def view(
     target: Target, version: int, token: str, sources: Sequence[str]
 ) -> Description2 | Description3:
-    """Return the template data of modelDescription.xml.
+    """Return the template data of modelDescription.xml, which describes an FMU to simulation tools.
 
-    version: of FMI, 2 or 3. token: text that identifies the build. sources: names of the C files to
-    compile.
+    target: the scene's program and its C names. version: version of FMI, 2 or 3. token: text that
+    identifies the build. sources: names of the C files to compile.
     """
     s, known = target.system, variables(target)
     dependencies = Dependencies(target.program, has_signals(target))

@@ -54,10 +54,10 @@ class Unit:
 def unit(
     program: Program, version: int, show: Callable[[View], str], plain: Callable[[PlainView], str]
 ) -> Unit:
-    """Return the FMU of a program, without a binary; the same program gives the same texts.
+    """Return the texts that form the FMU of a program. There is no compiled binary among them.
 
-    version: of FMI, 2 or 3. show, plain: functions that render the template data of the FMU and of
-    portable C as text.
+    The same program always gives the same texts. version: version of FMI, 2 or 3. show: function
+    that renders template data of the FMU as text. plain: the same for template data of portable C.
     """
     safe, written = rename_for_c(program)
     target = Target(safe, REALS[safe.system.run.real], written)

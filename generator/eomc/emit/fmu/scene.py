@@ -22,9 +22,11 @@ STEPS = 10_000  # largest number of adaptive steps in one call
 
 
 def view(target: Target, token: str) -> SceneCalls:
-    """Return the data for the template of scene.h, the C between a scene and the code of all FMUs.
+    """Return the data for the template of scene.h, a C header of the FMU.
 
-    token: text that identifies the build, as in modelDescription.xml.
+    The header lets the hand-written C, which is the same in all FMUs, call the functions of this
+    scene. target: the scene's program and its C names. token: text that identifies the build, as in
+    modelDescription.xml.
     """
     s, public = target.system, Public(target)
     by_tolerance = s.run.tolerance is not None

@@ -51,22 +51,26 @@ _MOST = 20  # largest magnitude of an exponent
 
 @dataclass(frozen=True)
 class Meaning:
-    """A unit of measurement: `factor` times the product of the base units `BASE` to given powers.
+    """A unit of measurement in terms of FMI's base units (`BASE`: kg, m, s, ...).
 
-    powers: one integer exponent for each of BASE, in its order.
+    The unit is `factor` times the product of the base units, each raised to its power. powers: the
+    integer exponents, in the order of BASE.
     """
 
     factor: float
     powers: tuple[int, ...]
 
     def times(self, other: Meaning, power: int) -> Meaning:
-        """Return the product of this unit and another one to an integer power."""
+        """Return the product of this unit and `other` raised to the integer `power`."""
         powers = (a + power * b for a, b in zip(self.powers, other.powers, strict=True))
         return Meaning(self.factor * other.factor**power, tuple(powers))
 
     @property
     def attributes(self) -> tuple[tuple[str, str], ...]:
-        """Names and values of the attributes of FMI's XML element BaseUnit for this unit."""
+        """The attributes of FMI's XML element BaseUnit for this unit, as pairs (name, value).
+
+        There is one for each base unit with an exponent other than 0, and "factor" unless it is 1.
+        """
         named = [(b, str(n)) for b, n in zip(BASE, self.powers, strict=True) if n]
         return (*named, *([("factor", repr(self.factor))] if self.factor != 1 else []))
 
@@ -75,7 +79,9 @@ ONE = Meaning(1.0, _NONE)
 
 
 def parsed(text: str) -> Meaning | None:
-    """Return the meaning of a unit such as "N m/rad" or "kg*m^2"; None if it is not clear.
+    """Return the meaning of a unit written as text, such as "N m/rad" or "kg*m^2".
+
+    None if the text is empty or is not a known unit.
 
     >>> parsed("N m/rad").attributes
     (('kg', '1'), ('m', '2'), ('s', '-2'), ('rad', '-1'))
@@ -153,9 +159,10 @@ def _word(word: str) -> Meaning:
 
 
 def rate(text: str, times: int) -> str:
-    """Return the unit of the first or second time derivative of a quantity with the unit `text`.
+    """Return the unit of a time derivative of a quantity, as text.
 
-    times: 1 or 2. "" if the quantity has no unit.
+    text: the unit of the quantity; for "", the result is "" too. times: 1 for the first derivative,
+    2 for the second.
 
     >>> rate("m", 2), rate("N m", 1)
     ('m/s^2', '(N m)/s')

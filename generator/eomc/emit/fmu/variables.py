@@ -18,12 +18,12 @@ TIME_NAME = "t"  # no scene can use this name for anything else
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of modelDescription.xml.
+    """A variable of an FMU, as modelDescription.xml lists it.
 
     Attributes
     ----------
     reference
-        Value reference, by which importers access the variable.
+        Value reference: the number by which simulation tools access the variable.
     causality, variability, initial
         As in the FMI standard; "" for no attribute.
     unit, words
@@ -54,8 +54,17 @@ class Variable:
 class Variables:
     """All variables of an FMU, by kind, in the order of their value references.
 
-    der_q, der_qd: the time derivatives of q and q̇. indicators: one for each event function.
-    switches: the variable that makes the scene's signals replace the inputs, if there are signals.
+    Value references are the numbers by which FMI identifies variables.
+
+    Attributes
+    ----------
+    der_q, der_qd
+        The time derivatives of q and q̇.
+    indicators
+        The event functions, one variable for each event.
+    switches
+        The truth value that makes the scene's signals (formulas) replace the inputs; empty if the
+        scene has no signals.
     """
 
     time: Variable
@@ -79,14 +88,15 @@ class Variables:
 
 
 def has_signals(target: Target) -> bool:
-    """Return True if the scene defines signals, which give its inputs values of their own."""
+    """Return True if the scene defines signals: formulas that give its inputs values by default."""
     return any(i.signal != 0 for i in target.system.inputs)
 
 
 def input_starts(target: Target) -> list[float]:
-    """Return the initial value of each input: its signal at the start, or 0 if that has no value.
+    """Return the initial value of each input of a scene.
 
-    A value outside of the input's numeric limits is replaced by the limit.
+    It is the value of the input's signal (the scene's formula for it) at the start, limited to the
+    numeric limits of the input. If signals can't be evaluated there, it is 0, limited likewise.
     """
     inputs = target.system.inputs
     if not inputs:
@@ -102,9 +112,9 @@ def input_starts(target: Target) -> list[float]:
 
 
 def numeric_limits(one: Input) -> tuple[float | None, float | None]:
-    """Return the lower and the upper limit of an input; None for one that is not a number.
+    """Return the lower and the upper limit of an input as numbers.
 
-    Limits that are formulas of parameters are not numbers.
+    None stands for a limit that is missing, or that is a formula of parameters.
     """
     low, high = (float(x) if x is not None and x.is_number else None for x in one.limits)
     return low, high

@@ -14,8 +14,9 @@ Attributes = tuple[tuple[str, FreeText], ...]
 class SceneEvent:
     """An event of the scene, for the C header of an FMU.
 
-    direction: -1 if the event triggers when its function falls through zero, 1 when it rises, 0 for
-    both. action: 0 for record (the motion goes on), 1 for stop, 2 for a jump of the state.
+    An event triggers when its event function crosses zero. direction: -1 if it triggers when the
+    function falls, 1 when it rises, 0 for both. action: 0 for record (the motion goes on), 1 for
+    stop, 2 for a jump of the state.
     """
 
     name: str
@@ -25,10 +26,10 @@ class SceneEvent:
 
 @dataclass(frozen=True)
 class Start:
-    """An initial value that is a formula of parameters, for the C header of an FMU.
+    """An initial value that the scene gives as a formula of parameters, for the C header of an FMU.
 
-    state: index of the coordinate or velocity in [q; q̇]. element, value: C expressions of the
-    array element and of its value.
+    state: index of the coordinate or velocity in [q; q̇]. element: C expression of the array element
+    to which the value is assigned. value: C expression of the value.
     """
 
     state: int
@@ -115,10 +116,12 @@ class SceneCalls:
 
 @dataclass(frozen=True)
 class Described:
-    """An XML element of the model description: a variable or a unit.
+    """An XML element of modelDescription.xml for a variable or a unit.
 
-    element: the element's name. attributes: its attributes, as (name, value). inner: the attributes
-    of the one element inside it.
+    element: for a unit, the name of the element, "Unit"; for a variable, its type, such as "Real".
+    attributes: the main attributes as pairs (name, value), such as the name. inner: pairs for
+    further attributes, such as base units of a unit or the start of a variable; in FMI 2, and for
+    units, they belong to an element inside.
     """
 
     element: str
@@ -149,7 +152,7 @@ class Description:
         Name of the model, text that identifies the build, name and version of eomc, and attributes
         with title and version of the scene.
     exchange
-        Whether an importer may integrate the model itself (model exchange).
+        Whether a simulation tool may integrate the model itself (model exchange).
     derivatives
         "true" if the FMU provides directional derivatives, else "false".
     experiment
@@ -178,7 +181,7 @@ class Description:
 class Description2(Description):
     """Data for the template fmu/fmi2.xml: modelDescription.xml of FMI 2.
 
-    indicators: the number of event functions. sources: the C files to be compiled.
+    indicators: the number of event functions. sources: names of the C files to be compiled.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/fmi2.xml"
@@ -190,7 +193,7 @@ class Description2(Description):
 class Description3(Description):
     """Data for the template fmu/fmi3.xml: modelDescription.xml of FMI 3.
 
-    crossings: dependencies of the event functions.
+    crossings: the event functions, each with the variables that it depends on.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/fmi3.xml"
