@@ -15,9 +15,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of all entries: the earliest date that zip allo
 def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None:
     """Write a zip archive to `file`, replacing an older file only when the new one is complete.
 
-    contents: bytes by path in the archive. programs: the folder in the archive whose files are
-    executable; "" for none. Missing folders on disk are created; equal contents give equal bytes.
-    Raises EomcError if the archive can't be written.
+    Equal contents give archives with equal bytes. Missing folders on disk are created.
+
+    contents: the bytes of each file, by its path in the archive. programs: the folder in the
+    archive whose files are marked as executable; "" for none. Raises EomcError if the archive can't
+    be written.
     """
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -59,8 +59,8 @@ class Built:
     fresh
         Whether the module was built just now rather than found on disk.
     key
-        Key of the build, see the function `key`; "" if `load` may import whatever build is in
-        `folder`.
+        Key of the build, a text that changes with the scene, eomc and the compiler; see the
+        function `key`. "" if any build in `folder` may be imported.
     """
 
     name: str
@@ -70,12 +70,12 @@ class Built:
 
 
 class ReplacedError(EomcError):
-    """Another build replaced the module before it was loaded."""
+    """Error: another build replaced the compiled module on disk before it was loaded."""
 
 
 @lru_cache(maxsize=1)
 def generator_digest() -> str:
-    """Return the SHA-256, in hexadecimal, of eomc's version and of all its files."""
+    """Return the SHA-256, in hexadecimal, of the version and the source files of eomc."""
     total = hashlib.sha256(__version__.encode())
     for name, file in resources.parts():
         total.update(name.encode() + file.read_bytes())
@@ -85,9 +85,11 @@ def generator_digest() -> str:
 def key(scene_digest: str, form: str = "fast") -> str:
     """Return the key of a build: text that changes if anything changes that the build depends on.
 
+    The first half of the text is a digest of scene, eomc, Python, compiler flags, processor and
+    compiler. The second half is a digest of the same without the compiler.
+
     scene_digest: digest of the scene's text. form: "fast" for optimised C, "plain" for portable C.
-    The first half is a digest of scene, eomc, compiler flags, processor and compiler, the second
-    half the same without the compiler. Raises EomcError if there is no compiler.
+    Raises EomcError if there is no compiler.
     """
     small, large = compiler_for(0), compiler_for(MANY_OPERATIONS + 1)
     parts = _parts(scene_digest, form)
@@ -98,10 +100,12 @@ def key(scene_digest: str, form: str = "fast") -> str:
 
 
 def key_there(folder: Path, scene_digest: str, form: str = "fast") -> str:
-    """Return the key of the complete build in `folder` if it is of this scene; otherwise "".
+    """Return the key of the build in `folder` if it is complete and up to date; otherwise "".
 
-    The compiler need not be the same, so that machines without a compiler can use the build.
-    Arguments as in `key`.
+    It is up to date if scene, eomc, Python, flags and processor are the same as now. The compiler
+    may differ, so that machines without a compiler can use the build.
+
+    scene_digest: digest of the scene's text. form: "fast" for optimised C, "plain" for portable C.
     """
     try:
         there = _key(folder)
@@ -129,7 +133,8 @@ def _digest_of_parts(*parts: str) -> str:
 def is_built(folder: Path, build_key: str) -> bool:
     """Return True if `folder` contains the complete build with the key `build_key`.
 
-    The digests of all files are compared, since loading a corrupt extension may crash the process.
+    The files are compared with the digests stored at the build, since loading a corrupt extension
+    module may crash the process.
     """
     try:
         manifest = _manifest(folder)
@@ -176,14 +181,16 @@ def build(
     form: str = "fast",
     scene_digest: str = "",
 ) -> Built:
-    """Return the module of a scene in a folder below `root`; build it if it is not there yet.
+    """Build the module of a scene in a folder below `root`, unless that build is there already.
+
+    Return where the module is on disk; it is not imported.
 
     Parameters
     ----------
     name
         Name of the scene.
     build_key
-        The result of `key`.
+        Text that identifies the build, as returned by `key`.
     sources
         Function that returns the generated files, given the name of the extension module; it is
         called only if the module must be built.
@@ -192,8 +199,8 @@ def build(
     form
         "fast" to compile the optimised C, "plain" for the portable C.
     scene_digest
-        Digest of the scene's text. A build with another digest is archived, so that values that it
-        has pickled can still be loaded.
+        Digest of the scene's text. If an older build in the folder has another digest, it is
+        archived, so that values pickled by its module can still be loaded.
 
     Raises
     ------
@@ -224,7 +231,8 @@ def build(
 def place(name: str, root: Path, form: str = "fast") -> Path:
     """Return the folder below `root` for the module of the scene `name`.
 
-    form: "fast" for optimised C; "plain" for portable C, whose folder lies inside the other one.
+    form: "fast" for the module of optimised C; "plain" for that of portable C, whose folder is a
+    subfolder of the former.
     """
     return root / name if form == "fast" else root / name / ".plain"
 
@@ -357,11 +365,13 @@ def _date_later(new: Path, old: Path) -> None:
 
 
 def load(built: Built, home: str = "") -> ModuleType:
-    """Import a built module, under a name that differs for each build; return the module.
+    """Import a built module and return it.
 
-    The same build always gives the same module object. home: the folder of builds of this scene, if
-    the build lies elsewhere, such as in the archive. Raises ReplacedError if another build has
-    replaced it on disk.
+    Each build is imported under a name of its own in `sys.modules`. Loading the same build again
+    returns the same module object.
+
+    home: the scene's folder of builds, if the build lies elsewhere, such as in the archive; ""
+    otherwise. Raises ReplacedError if another build has replaced this one on disk.
     """
     folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
     key = _key(folder)

@@ -25,16 +25,21 @@ MANY_OPERATIONS = 60_000
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler: the words of its command, and a text that identifies its version."""
+    """A C compiler.
+
+    command: the words of the command that runs it. identity: text that changes if another compiler
+    or version is installed.
+    """
 
     command: tuple[str, ...]
     identity: str
 
 
 def find_compiler() -> Compiler:
-    """Return the first of $CC, cc, gcc, clang and ziglang (from pip) that exists.
+    """Return the C compiler in $CC, or if CC is not set, the first of the known ones that exists.
 
-    Raises EomcError if there is none, or if $CC is set but does not exist.
+    The known ones are cc, gcc, clang, and the Python package ziglang. Raises EomcError if there is
+    none, or if $CC does not exist.
     """
     requested = os.environ.get("CC")
     for candidate in [requested] if requested else ["cc", "gcc", "clang"]:
@@ -54,9 +59,10 @@ def find_compiler() -> Compiler:
 
 
 def first_call_note() -> str:
-    """Return a message that the first call of ziglang takes a minute; "" if this does not apply.
+    """Return a message for the user if the first build will be slow; otherwise "".
 
-    It does not apply to other compilers, and not if ziglang was called before.
+    The first build takes a minute or two if the compiler is the Python package ziglang and has not
+    been called before, since it prepares its libraries then.
     """
     if not find_compiler().identity.startswith("ziglang"):
         return ""
@@ -77,10 +83,10 @@ def _split_words(variable: str, text: str) -> list[str]:
 
 
 def compiler_for(operations: int) -> Compiler:
-    """Return the compiler for a scene whose generated C has this number of arithmetic operations.
+    """Return the C compiler for generated code with this number of arithmetic operations.
 
-    It is the one of `find_compiler`, but clang for more than MANY_OPERATIONS, if clang exists and
-    $CC is not set. Raises EomcError if there is no compiler.
+    It is clang if the code has more than MANY_OPERATIONS, clang exists and $CC is not set.
+    Otherwise it is the compiler that `find_compiler` returns. Raises EomcError if there is none.
     """
     default = find_compiler()
     if (
@@ -99,11 +105,14 @@ def _identity(path: str) -> str:
 
 
 def flags(form: str = "fast") -> tuple[str, ...]:
-    """Return the optimisation flags for the generated C: $EOMC_CFLAGS, or those of the form.
+    """Return the compiler's optimisation flags for the generated C.
 
-    form: "fast" for optimised C, "plain" for portable C. With AVX-512, compilers vectorise in
-    registers of half width, which is faster here: a chain of five links takes 0.85 of the time.
-    Explicit vectors in the generated C use the full width.
+    They are the words of $EOMC_CFLAGS if it is set; otherwise they depend on `form`: "fast" for
+    optimised C, "plain" for portable C.
+
+    On processors with AVX-512, the flags for "fast" make compilers vectorise in registers of half
+    width. This is faster: a chain of five links takes 0.85 of the time. Explicit vectors in the
+    generated C still use the full width.
     """
     chosen = user_flags()
     if chosen is not None:
@@ -128,7 +137,7 @@ def user_flags() -> tuple[str, ...] | None:
 
 
 def standard(form: str) -> str:
-    """Return the compiler flag that selects the C standard.
+    """Return the compiler flag that selects the C standard, such as "-std=c99".
 
     form: "fast" for optimised C, "plain" for portable C.
     """

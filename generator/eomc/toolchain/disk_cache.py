@@ -16,7 +16,9 @@ from eomc.toolchain.cache import generator_digest
 def cached_texts(
     root: Path, name: str, kind: str, scene_digest: str, make: Callable[[], dict[str, str]]
 ) -> dict[str, str]:
-    """Return the texts that `make` returns, from a cache on disk if they are up to date.
+    """Return the texts that `make` produces, from a cache on disk if they are up to date.
+
+    They are up to date if the scene, eomc and the version of SymPy have not changed since.
 
     Parameters
     ----------
@@ -25,7 +27,7 @@ def cached_texts(
     name : str
         Name of the scene; "" disables the cache.
     kind : str
-        What the texts are; part of the file name.
+        Kind of texts; it is part of the name of the cache's file.
     scene_digest : str
         Digest of the scene's text.
     make : callable
@@ -34,7 +36,7 @@ def cached_texts(
     Returns
     -------
     dict
-        The texts by name. They are not stored if the folder can't be written.
+        The texts by name. They are returned without being cached if the folder can't be written.
     """
     file = root / ".shown" / f"{name}.{kind}.json"
     parts = (scene_digest, kind, generator_digest(), version("sympy"))

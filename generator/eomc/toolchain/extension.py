@@ -38,7 +38,7 @@ def build(
     form
         "fast" to compile the optimised C, "plain" for the portable C.
     optimised
-        Optimisation flags instead of those of the form.
+        Optimisation flags of the compiler for the generated C; by default those of `form`.
 
     Raises
     ------
@@ -81,10 +81,11 @@ def build(
 
 
 def python_library(library: str) -> str:
-    """Return the path of the library of Python against which extensions are linked on Windows.
+    """Return the path of the Python library that an extension module is linked with on Windows.
 
-    library: file name of the extension. The library is that of any Python 3, unless the name
-    contains the version of this Python.
+    library: file name of the extension module. If it contains the version of the running Python,
+    such as "311", the library is the one of that version; otherwise it is the one for all versions
+    of Python 3 (stable ABI).
     """
     version = f"{sys.version_info[0]}{sys.version_info[1]}"
     name = f"python{version if version in library else 3}.lib"

@@ -23,10 +23,11 @@ _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
 @dataclass(frozen=True)
 class Exported:
-    """An FMU (FMI unit) on disk.
+    """An FMU (FMI unit) that was written to disk.
 
-    file: its path. binary: the folder in it that contains the binary, or "" without one. why: the
-    reason why there is no binary, or "".
+    file: path of the FMU, a zip archive. binary: the name of the archive's folder with the compiled
+    binary, such as "linux64"; "" if there is no binary. why: the message that explains a missing
+    binary; "" otherwise.
     """
 
     file: Path
@@ -35,11 +36,11 @@ class Exported:
 
 
 def export(unit: Unit, file: Path, binary: bool = True) -> Exported:
-    """Write an FMU to `file`, replacing an older one.
+    """Write an FMU to `file`, replacing an older one. Return a description of what was written.
 
-    binary: whether it includes a binary for this machine, besides its sources. If there is no
-    compiler, the binary is left out. Raises EomcError with the compiler's message if it fails, or
-    if the file can't be written.
+    unit: the texts of the FMU. binary: whether the FMU includes, besides its C sources, a binary
+    compiled for this machine; if there is no compiler, the binary is left out. Raises EomcError
+    with the compiler's message if it fails, or if the file can't be written.
     """
     if file.is_dir():
         raise EomcError(f"{file}: is a folder: name a file, --out {unit.name}.fmu")
@@ -58,9 +59,9 @@ def export(unit: Unit, file: Path, binary: bool = True) -> Exported:
 
 
 def binary_folder(version: int) -> str:
-    """Return the name that the FMI standard gives to the folder of binaries for this platform.
+    """Return the name of an FMU's folder for binaries of this platform, such as "linux64".
 
-    version: of FMI, 2 or 3.
+    The FMI standard defines the names. version: version of FMI, 2 or 3.
     """
     system = {"win32": "windows", "cygwin": "windows"}.get(sys.platform, sys.platform)
     machine = _MACHINES.get(platform.machine().lower(), platform.machine().lower())

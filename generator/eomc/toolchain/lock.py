@@ -20,9 +20,9 @@ _FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not needed, o
 def locked(path: Path) -> Iterator[None]:
     """Hold an exclusive lock on the file `path` while the block of the with statement runs.
 
-    Other processes that lock the same file wait. It is created if needed; nothing is written to it.
-    Raises EomcError if the path is not a regular file; links are not followed and pipes not waited
-    for.
+    Other processes that lock the same file wait until the block ends. If the file does not exist,
+    an empty one is created. Raises EomcError if `path` is a symbolic link, a folder, a pipe or
+    anything else that is not a regular file.
     """
     try:
         flags = os.O_RDWR | os.O_CREAT

@@ -34,15 +34,17 @@ _SYMBOLS, _WRITE, _ALLOCATED, _EXECUTED, _FUNCTION = 2, 1, 2, 4, 2  # constants 
 
 @dataclass(frozen=True)
 class FunctionSize:
-    """Sizes of a C function in bytes.
+    """Size of the machine code and of the stack of a compiled C function, in bytes.
 
     Attributes
     ----------
+    name
+        Name of the function.
     code
-        Machine code.
+        Size of the machine code.
     stack, total_stack
-        Stack of the function alone, and together with the functions that it calls; None if the
-        compiler does not report it, or if it has no bound.
+        Size of the stack of the function itself, and of this together with the functions that it
+        calls; None if the compiler does not report the size, or if the size has no bound.
     calls
         Names of the functions that it calls, including library functions, whose stack is unknown
         and counts as 0.
@@ -90,10 +92,11 @@ class _Graph:
 
 
 def measure(files: Mapping[str, str], name: str, compiler: Compiler) -> ObjectSizes:
-    """Compile the portable C of a scene and return its sizes, without linking.
+    """Compile the portable C of a scene, and return the sizes of its code, data and stack.
 
-    files: texts by file name, among them name.c and name.h. Raises EomcError if the compiler fails,
-    or if its output is not an ELF object.
+    The object file is not linked. files: the text of each file by its name; they include the source
+    and the header, `name` + ".c" and `name` + ".h". Raises EomcError if the compiler fails, or if
+    it does not write an object file in the ELF format.
     """
     chosen = user_flags()
     flags = (

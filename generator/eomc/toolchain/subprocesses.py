@@ -17,9 +17,9 @@ from eomc.base.errors import EomcError
 def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
     """Run commands in parallel in `folder`, and wait until all have ended.
 
-    name: the scene's name, for messages. If one command fails, or on Ctrl-C, the others are
-    terminated. Raises EomcError with the output of the first that fails, or if one can't be
-    started.
+    If one command fails, or the user presses Ctrl-C, the others are terminated. name: the scene's
+    name, for messages. commands: the words of each command. Raises EomcError with the output of the
+    first command that fails, or if a command can't be started.
     """
     running: list[subprocess.Popen[str]] = []
     try:
@@ -34,9 +34,10 @@ def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
 
 
 def write_files(files: Mapping[str, str], folder: Path) -> None:
-    """Write texts into a folder; `files` has them by file name, and missing folders are created.
+    """Write text files into a folder, and create missing folders.
 
-    Characters that are not valid Unicode, as a scene's file name may contain, are escaped.
+    files: the text of each file, by its path relative to `folder`. Characters that are not valid
+    Unicode, which names of scene files may contain, are escaped.
     """
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +47,7 @@ def write_files(files: Mapping[str, str], folder: Path) -> None:
 def try_load(
     name: str, command: Sequence[str], code: str, arguments: Sequence[str], remedy: str
 ) -> None:
-    """Test in a separate process that the output of a compiler can be loaded (some 10 ms).
+    """Test in a separate process that a compiled library can be loaded; this takes some 10 ms.
 
     Parameters
     ----------
@@ -55,9 +56,9 @@ def try_load(
     command
         The compiler's command, for messages.
     code, arguments
-        Python code that loads the output, and its command-line arguments.
+        Python code that loads the library, and the command-line arguments of this code.
     remedy
-        End of the message that tells what to do.
+        Text at the end of the error message, which says what the user can do.
 
     Raises
     ------

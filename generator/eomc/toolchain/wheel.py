@@ -58,8 +58,8 @@ def generations() -> tuple[_Generation, ...]:
     """Return the processor generations for which a wheel has an extension, the newest first.
 
     A generation is a set of processor features, such as AVX2, with compiler flags for them. The
-    generations are those of this machine's architecture. If $EOMC_CFLAGS is set, there is one
-    only, with those flags.
+    result contains all generations of this machine's architecture. If $EOMC_CFLAGS is set, it
+    contains a single generation, with the flags in that variable.
     """
     chosen = user_flags()
     if chosen is not None:
@@ -70,7 +70,7 @@ def generations() -> tuple[_Generation, ...]:
 
 
 def build(sources: Sources, scene: bytes, digest: str, title: str, folder: Path) -> Path:
-    """Compile the sources and write their wheel into `folder`; return its path.
+    """Compile the sources of a scene, write a wheel into `folder`, and return the wheel's path.
 
     Parameters
     ----------
