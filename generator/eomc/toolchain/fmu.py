@@ -25,9 +25,9 @@ _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 class Exported:
     """An FMU (FMI unit) that was written to disk.
 
-    file: path of the FMU, a zip archive. binary: the name of the archive's folder with the compiled
-    binary, such as "linux64"; "" if there is no binary. why: the message that explains a missing
-    binary; "" otherwise.
+    file: path of the FMU, a zip archive. binary: name of the platform whose compiled binary it
+    contains, such as "linux64"; "" if there is no binary. why: the message that explains why a
+    requested binary is missing; "" otherwise.
     """
 
     file: Path

@@ -110,7 +110,10 @@ class LibraryText(Prefixed, Laned):
 
 @dataclass(frozen=True)
 class LaneText(Laned):
-    """Data for the template c/fast/lane.c: the accelerations for one lane type, see `Laned`.
+    """Data for the template c/fast/lane.c: C functions for the accelerations.
+
+    The template is printed for each *lane* type: one number, or a vector register with one value of
+    each of several instances. Angles are those whose sines and cosines the accelerations read.
 
     Attributes
     ----------

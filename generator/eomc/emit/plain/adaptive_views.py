@@ -310,7 +310,7 @@ class InitialEvents(Named):
     Attributes
     ----------
     function
-        Prototype of the static C function that detects these events.
+        Prototype of the static C function that makes the jumps of these events.
     values
         C call that computes one value for each event, which is positive if the event triggers.
     restart

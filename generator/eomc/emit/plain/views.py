@@ -231,7 +231,10 @@ class Slopes(Named):
 
 @dataclass(frozen=True)
 class Derivative(Tableau):
-    """Data for the template c/derivative.c: derivatives of one step by q, q̇ and u.
+    """Data for the template c/derivative.c: a C function for the derivatives of one step.
+
+    They are the derivatives of q and q̇ at the end of the step with respect to q, q̇ and u at its
+    start.
 
     Attributes
     ----------
