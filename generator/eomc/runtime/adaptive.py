@@ -171,10 +171,10 @@ class SteppedRun(AdaptiveRun):
     """Run with fixed steps of a scene that has events.
 
     There is one row after each step and two rows at each state jump, before and after it. A step
-    ends at a state jump; a shorter step then leads to the next multiple of the step size h. The
-    attributes `events`, `stopped` and `limit` have the same meaning as in `AdaptiveRun`.
-    `evaluations` is the number of evaluations of the accelerations; an iteration of an implicit
-    method counts once for each stage.
+    that reaches a state jump ends there. The next step is shorter and leads to the next multiple of
+    the step size h. The attributes `events`, `stopped` and `limit` have the same meaning as in
+    `AdaptiveRun`. `evaluations` is the number of evaluations of the accelerations; an iteration of
+    an implicit method counts once for each stage.
     """
 
     @property

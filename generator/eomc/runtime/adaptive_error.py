@@ -84,7 +84,11 @@ def error_by_tighter_tolerance(
     base = again.curve()
 
     def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
-        """Return the change of the states that results from a perturbation of the start."""
+        """Return the change of the states along the run that a perturbation of its start causes.
+
+        nudge: perturbation of the initial state [q; qd]. tol: tolerance of the new run. base:
+        states [q; qd], (m, 2 nq), that are subtracted from those of the new run.
+        """
         # the perturbed motion may differ, so its steps are limited
         most = _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
         return again.states(tol, begin + nudge, own._h_most, most) - base
@@ -189,10 +193,10 @@ class _Rerun:
 
     @property
     def times(self) -> Array:
-        """Return the times at which `curve` and `states` compute states, (m,), s.
+        """Return the times (m,), s, at which `curve` and `states` compute the states of a run.
 
-        They are the times of the rows that are not next to a jump, and additional equidistant times
-        if these rows are few.
+        They are the times of the rows that are not next to a state jump. If these rows are few,
+        equidistant times are added.
         """
         between = np.linspace(self.own.t0, self.own.t[-1], _MIN_CURVE_ROWS + 1)[1:-1]
         own = self.own.t[self.kept].astype(float)

@@ -26,10 +26,11 @@ _READ = 1 << 16  # bytes of an existing file that are looked at
 
 
 def check_replaceable(file: File) -> None:
-    """Raise FileExistsError if the existing `file` must not be overwritten.
+    """Raise FileExistsError if `file` exists and must not be overwritten.
 
-    This is the case if it is a scene (a TOML file of eomc) without the suffix .toml, or if its
-    first bytes do not match its suffix. A missing or empty file, a device or a pipe may be written.
+    A file must not be overwritten if it is a scene (a TOML file of eomc) without the suffix .toml,
+    or if its first bytes do not match its suffix. A missing or empty file, a device or a pipe may
+    be written.
     """
     path = Path(file)
     if not path.is_file():

@@ -196,10 +196,24 @@ def simulate(
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """Check the arguments of `BatchModel.simulate_batch` and simulate with adaptive steps.
 
-    fixed: the caller's values of the arguments in FIXED_STEP_DEFAULTS, which are for fixed steps
-    only and must have their default values. The other arguments are those of `simulate_batch`.
-    Return (run, completed); completed is False if Ctrl-C interrupted the run. Raises ValueError for
-    invalid arguments.
+    Parameters
+    ----------
+    fixed : tuple
+        The values that the caller gave for the arguments in `FIXED_STEP_DEFAULTS`, which only fixed
+        steps use. Each must have its default value.
+
+    The other arguments are those of `simulate_batch`.
+
+    Returns
+    -------
+    run : AdaptiveBatchRun
+    completed : bool
+        False if Ctrl-C interrupted the run.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
     """
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     limit = 0
@@ -246,8 +260,8 @@ def stepped(
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """Check the arguments of `BatchModel.simulate_batch`; simulate with fixed steps and events.
 
-    Return (run, completed); completed is False if Ctrl-C interrupted the run. Raises ValueError for
-    invalid arguments.
+    Return (run, completed); completed is False if Ctrl-C interrupted the run. The arguments are
+    those of `simulate_batch`. Raises ValueError if an argument is invalid.
     """
     h = model.h if h is None else as_step_size(h, model.dtype)
     method, t0 = model._method(method), as_number(t0, "t0")
@@ -357,18 +371,20 @@ class _Work:
             memory.max_evaluations = evaluations
 
     def leave(self, codes: Array | None) -> None:
-        """Set the status of each instance to `codes` (batch,), unless None.
+        """Set the status number of each instance before the simulation begins.
 
-        Instances whose status is not 0 make no step.
+        codes: status numbers (batch,); None: leave them unchanged. Instances whose number is not 0
+        make no step, since their initial state is already known to fail.
         """
         if codes is not None:
             self.status[:] = codes
 
     @property
     def counts(self) -> dict[str, Array]:
-        """Return the counters of each instance, such as "steps", as a dict from name to (batch,).
+        """Return the counters of the simulation, such as "steps", for each instance.
 
-        The names are those of the members of the C struct `adaptive_memory`.
+        The result is a dict from the counter's name to an array (batch,). The names are those of
+        the members of the C struct `adaptive_memory`.
         """
         ffi, memory = self.model._ffi, "adaptive_memory"
         kinds = dict.fromkeys(_COUNTERS, "l")
@@ -389,8 +405,8 @@ class _Work:
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """Simulate all instances to their end; return False if Ctrl-C interrupted the run.
 
-        threads: number of threads; None: one for each processor. progress: called with the numbers
-        of finished and of all instances.
+        threads: number of threads; None: one for each processor. progress: called with the number
+        of instances that are finished and the number of all instances.
         """
         count = len(self.q)
         group = _GROUP_SIZE if count > 8 * _GROUP_SIZE else _SMALL_GROUP_SIZE

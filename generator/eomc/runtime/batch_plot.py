@@ -113,7 +113,10 @@ def fan(
     run: Any, names: Sequence[str], quantiles: Iterable[float], lines: int | None, over: Any,
     wrap: bool | Collection[str], ax: Any, axes: Any, file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
-    """Draw the plot of a batch and return its Axes; implements `Fans.plot` with its arguments."""
+    """Draw the distribution of a batch over time with matplotlib and return the Axes.
+
+    run: the batch. The other arguments are those of `BatchRun.plot`.
+    """
     no_files(names)
     source = Source(run, wrap)
     curves = [source.curve(name) for name in ([*names] or source.coordinates)]

@@ -63,7 +63,8 @@ class Values:
     def constraints(self) -> Mapping[str, Array]:
         """Return the residual of each constraint equation as a dict from name to array (batch, n).
 
-        Residuals are in the units of the constraint equations. Raises KeyError for unknown names.
+        A residual is 0 if the equation is satisfied; its unit is that of the equation. Raises
+        KeyError for unknown names.
         """
         model, names = self._model, self._model.constraint_names
         return _by_name(

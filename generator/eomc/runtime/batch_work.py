@@ -96,7 +96,7 @@ class Work:
         """Simulate all instances through all steps; return False if Ctrl-C interrupted the run.
 
         threads: number of threads; None: one for each processor. progress: called with the numbers
-        of completed and of all steps of all instances.
+        of completed and of all steps, each summed over all instances.
         """
         count = self.count
         threads = as_threads(threads)
@@ -257,9 +257,9 @@ class BatchStepper:
 
 
 class Grouped(Protocol):
-    """Interface of work that `run_groups` distributes over threads.
+    """Interface of a computation on many instances that `run_groups` distributes over threads.
 
-    The method `_group` processes one group of instances and returns early if `stop` is set.
+    The method `_group` processes one group of instances. It returns early if `stop` is set.
     """
 
     stop: bool
@@ -272,9 +272,9 @@ def run_groups(
 ) -> bool:
     """Process all groups of instances in threads; return False if Ctrl-C interrupted them.
 
-    groups: (index of the first instance, number of instances) of each group. threads: number of
-    threads. look: function without arguments that is called at regular intervals, such as to
-    update a progress bar.
+    work: the computation, whose method `_group` processes a group. groups: (index of the first
+    instance, number of instances) of each group. threads: number of threads. look: function
+    without arguments that is called at regular intervals, for example to update a progress bar.
     """
     if threads == 1 or len(groups) == 1:
         try:

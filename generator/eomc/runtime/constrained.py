@@ -149,10 +149,11 @@ class Constrained(Frames):
     def tangent(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Array:
-        """Return an orthonormal basis of the changes of the state that satisfy the constraints.
+        """Return an orthonormal basis T of the changes of a state that the constraints allow.
 
-        The state is x = [q; qd]. Near an equilibrium x0, with A and B of `linearize`, the reduced
-        model dz/dt = T^T A T z + T^T B u, x - x0 = T z, has only independent states z.
+        The state is x = [q; qd]. With such a basis the linearised motion near an equilibrium x0
+        reduces to independent states z, where x - x0 = T z and dz/dt = T^T A T z + T^T B u. The
+        matrices A and B are those of `linearize`.
 
         Parameters
         ----------

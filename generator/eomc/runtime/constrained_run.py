@@ -42,9 +42,10 @@ class ConstrainedRun:
 
     @property
     def constraints(self) -> Mapping[str, Array]:
-        """Return the residual of each constraint at all rows as a dict from name to array (n,).
+        """Return the residual of each constraint equation as a dict from name to array (n,).
 
-        Residuals are in the units of the constraint equations. Raises KeyError for unknown names.
+        The array has a value for each row. A residual is 0 if the equation is satisfied; its unit
+        is that of the equation. Raises KeyError for unknown names.
         """
         names = self._model.constraint_names
         return ByName(

@@ -15,9 +15,10 @@ _STEP_TOLERANCE = 1e-12  # times closer to a step than this fraction of h coinci
 
 
 def within(run: Any, t: ArrayLike) -> Array:
-    """Return the times t, s, as an array of the same shape, limited to the interval of the run.
+    """Check that times lie within a run; return them, s, as an array of the same shape.
 
-    Raises ValueError if a time is outside of the run by more than rounding.
+    A time that is outside of the run by no more than rounding is set to the start or end of the
+    run. Raises ValueError if a time is further outside.
     """
     times = as_numbers(t, "t", np.dtype(float))
     begin, end = run.t0, float(run.t[-1])

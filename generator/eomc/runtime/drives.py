@@ -34,8 +34,8 @@ def actuated_coordinates(model: Constrained, drives: Sequence[str] | None) -> li
 class Motion(NamedTuple):
     """States of a motion and the generalized forces that it requires.
 
-    The shapes are those for one state; for n states all arrays have n as an additional first axis.
-    All arrays but q and qd are of type float64.
+    The shapes are those for one state; for n states all arrays have a first axis n. All arrays but
+    q and qd are of type float64.
 
     Attributes
     ----------
@@ -48,8 +48,8 @@ class Motion(NamedTuple):
     A : (nc, nq) array
         Jacobian of the constraint equations; (0, nq) without constraints.
     free : (nq,) array
-        Accelerations by `Constrained.acceleration`, which satisfy the constraint equations; qdd for
-        scenes without constraints.
+        The accelerations that `Constrained.acceleration` computes at the states; they satisfy the
+        constraint equations. For scenes without constraints they are qdd.
     """
 
     q: Array

@@ -94,10 +94,11 @@ class Model(Stepping):
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Any = None, method: str | None = None, *, control_period: float | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return the derivatives (Phi, Gamma) of one step: dx' = Phi dx + Gamma du.
+        """Return the derivatives Phi and Gamma of one step: dx' = Phi dx + Gamma du.
 
-        x = [q; qd] is the state before the step and x' the state after it. The derivatives are
-        those of the step itself, not of the exact motion, and are exact to rounding.
+        x = [q; qd] is the state before the step, x' the state after it, and u are the inputs. The
+        derivatives are those of the step itself, not of the exact motion, and are exact to
+        rounding.
 
         Parameters
         ----------
@@ -108,15 +109,16 @@ class Model(Stepping):
         t : float
             Time at the start of the step, s.
         u : (nu,) or (n, nu) array_like or mapping, optional
-            Inputs, constant over the step. By default the step follows the scene's signals, and
-            Gamma belongs to constant inputs that are added to them.
+            Inputs, constant over the step. By default the step follows the scene's signals
+            (formulas for the inputs), and Gamma belongs to constant inputs that are added to them.
         params : mapping or array_like, optional
             Parameters that differ from those of the scene; each value may be (n,).
         method : str, optional
             Name in `methods`; by default the first.
         control_period : float, optional
-            Differentiate all steps of this period, s, with constant inputs: `u`, or the scene's
-            signals at the start of the period.
+            Period, s, of several steps that are differentiated together. The inputs are constant
+            over
+            it: `u`, or the scene's signals at its start.
 
         Returns
         -------

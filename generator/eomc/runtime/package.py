@@ -288,7 +288,10 @@ _CONSTRAINED = (*CONSTRAINED, "constraint_names", "loops", "reactions")
 
 
 class Package(ModuleType):
-    """Class of a built package (module): explains missing names and refuses assignments."""
+    """Class of a built package (a Python module of a compiled scene).
+
+    It explains missing names in error messages and refuses assignments.
+    """
 
     def __getattr__(self, name: str) -> Any:
         """Raise AttributeError; for names that exist only with constraints, the message says so."""

@@ -171,7 +171,10 @@ def plot(
     labels: Sequence[str] | None, wrap: bool | Collection[str], ax: Any, axes: Any,
     file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
-    """Draw a run with matplotlib and return the Axes; the arguments are those of `Run.plot`."""
+    """Draw a run, and others to compare, with matplotlib; return the Axes.
+
+    The arguments are those of `Run.plot`.
+    """
     no_files(names)
     others = [other] if hasattr(other, "_model") else [*(other or ())]
     sources = [Source(each, wrap) for each in (run, *others)]

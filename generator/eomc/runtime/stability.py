@@ -70,7 +70,10 @@ def _fastest_modes(
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
 
     def spectrum(ways: Array) -> tuple[float, float]:
-        """Return (largest |Im|, fastest decay) of the linearisation in the directions `ways`."""
+        """Return (largest |Im|, fastest decay) of the linearised motion's eigenvalues, 1/s.
+
+        ways: (2 nq, k), orthonormal columns; the motion is linearised in these directions only.
+        """
         moved = near[:, None] * ways
         if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
             rates = model.linearize(q, qd, t=t, u=u, params=params)[0].astype(float) @ moved

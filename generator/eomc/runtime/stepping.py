@@ -27,7 +27,7 @@ _MOST = 2**60  # steps, so that C can return four times as many
 
 
 class Stepping(ModelInfo):
-    """A compiled scene with the functions for single steps."""
+    """A compiled scene with methods that compute single steps."""
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,

@@ -39,14 +39,14 @@ class _Half:
 
 @dataclass(eq=False, repr=False)
 class Trajectory(ConstrainedRun, Columns):
-    """Data of a run by fixed steps, and quantities that follow from them.
+    """Data of a run by fixed steps, and quantities that are computed from the data.
 
     Attributes
     ----------
     t0, h : float
         Initial time and step size, s.
     q, qd : (n, nq) arrays
-        Positions and velocities at the rows.
+        Positions and velocities at the rows (stored states).
     steps, every : int
         Number of completed steps, and of steps from one row to the next.
     status : str
