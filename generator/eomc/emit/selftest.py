@@ -63,10 +63,10 @@ Happening = tuple[float, int]  # when, and which event
 
 
 class NoCaseError(Exception):
-    """No expected result can be computed for a test case of selftest.c.
+    """Error: no expected result can be computed for a test case of selftest.c.
 
-    The accelerations are singular or not finite, an iteration does not converge, or the results are
-    not accurate enough.
+    The reason is that accelerations are singular or not finite, that an iteration does not
+    converge, or that the results are not accurate enough.
     """
 
 
@@ -135,10 +135,10 @@ class _Cases:
     # values in Python
 
     def evaluate(self, name: str, values: Mapping[str, float]) -> Vector:
-        """Return the results of a function of the program, evaluated at `values` (by name).
+        """Return the results of the program's function `name`, computed in Python.
 
-        Raises NoCaseError if they are not finite, or if a pivot of a matrix to be factored is not
-        positive.
+        `values` are the arguments (state, time, parameters, ...) by name. Raises NoCaseError if the
+        results are not finite, or if a pivot of a matrix to be factored is not positive.
         """
         try:
             found, regular = self.evaluator(name)(values)
@@ -149,10 +149,10 @@ class _Cases:
         return found
 
     def evaluator(self, name: str) -> Callable[[Mapping[str, float]], tuple[Vector, bool]]:
-        """Return the Python evaluator of a function of the program, made once and then cached.
+        """Return a Python function that evaluates the program's function `name`.
 
-        The evaluator takes values by name. It returns the results, and False if a matrix is
-        singular.
+        It takes a mapping from names to values. It returns the results, and False if a matrix is
+        singular, otherwise True. The Python function is cached.
         """
         if name not in self.known:
             unit = 2.0**-52 if self.double else 2.0**-20  # eight times a float's
@@ -160,9 +160,10 @@ class _Cases:
         return self.known[name]
 
     def value(self, name: str, point: Point) -> Vector:
-        """Return the results of the generated C function `name` at a point, computed in Python.
+        """Return the results that the generated C function `name` should give, computed in Python.
 
-        The scene's signals supply the inputs if the point specifies no inputs. Raises NoCaseError.
+        `point` has the arguments of the C function. If it specifies no inputs, the scene's signals
+        (functions of time and state) supply them. Raises NoCaseError.
         """
         values = self.complete(point)
         if name in self.program:
@@ -175,9 +176,10 @@ class _Cases:
         raise NoCaseError
 
     def ordered(self, name: str, values: Vector) -> Vector:
-        """Return results of the program's function `name` in the order of the C function.
+        """Return the results of the program's function `name` in the order in which C stores them.
 
-        Only the linearization differs: C stores its matrices A_q, A_qd and B one after the other.
+        The order differs only for the linearization: C stores its matrices A_q, A_qd and B one
+        after the other.
         """
         if name != "linearization":
             return values
@@ -193,9 +195,10 @@ class _Cases:
         return [x for a, b in parts for row in rows for x in row[a:b]]
 
     def by_columns(self, name: str, values: Mapping[str, float]) -> Vector:
-        """Return a matrix such as D or the linearization, as C stores it, from its columns.
+        """Return a matrix such as D or the linearization, as C stores it.
 
-        Column k is the product of the matrix and unit vector k, which the program computes.
+        It is computed by columns: the program has a function for the product of the matrix and a
+        vector, and column k is the product with unit vector k. `values` are the arguments by name.
         """
         names = [x.name for x in (*self.system.q, *self.system.qd, *self.system.u)]
         zero = {f"{n}{ALONG}": 0.0 for n in names}
@@ -207,9 +210,10 @@ class _Cases:
         return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
 
     def complete(self, point: Point) -> Values:
-        """Return the values of a point by name, with inputs from the scene's signals.
+        """Return the values of a point by name, including the inputs.
 
-        Inputs that the point specifies are kept.
+        Inputs that the point does not specify are computed by the scene's signals, the functions of
+        time and state that define inputs.
         """
         values = dict(point.values)
         if point.signals and "signal" in self.program:
@@ -230,7 +234,10 @@ class _Cases:
     # steps in Python
 
     def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return qdd at the state x = [q; qd] and time t (s); `point` supplies the rest."""
+        """Return the accelerations qdd at the state x = [q; qd] and time t (s).
+
+        `point` supplies the inputs and the parameters.
+        """
         return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
 
     def shifted(self, point: Point, x: Vector, t: float) -> Point:
@@ -240,14 +247,14 @@ class _Cases:
         return Point(values, point.signals, point.other, point.span)
 
     def states(self, point: Point) -> Vector:
-        """Return the state [q; qd] of a point as one list."""
+        """Return the state [q; qd] in a point's values as one list."""
         return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
 
     def step(self, m: Method, point: Point, x: Vector, t: float, h: float) -> Vector:
-        """Return the state [q; qd] after a step of size h (s) of method m from the state x at time
-        t.
+        """Return the state [q; qd] after one step of the integration method m.
 
-        Raises NoCaseError if the iteration over the stages of an implicit method does not converge.
+        The step of size h (s) begins at time t (s) in the state x. `point` supplies the inputs and
+        the parameters. Raises NoCaseError if the iteration over the stages does not converge.
         """
         n, a = self.nq, [[0.0] * self.nq for _ in m.b]
         A, AA, (c, b, b_a) = _floats(m.a), _floats(m.a_squared), _floats((m.c, m.b, m.b_a))
@@ -290,9 +297,10 @@ class _Cases:
         return self.projected(point, end, t + h)
 
     def projected(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return the state x = [q; qd], projected onto the constraints at time t by iteration.
+        """Return the state x = [q; qd], projected onto the constraints at time t (s).
 
-        Without constraints, return x. Raises NoCaseError if the iteration does not converge.
+        The projection iterates. `point` supplies the parameters. Without constraints, x is returned
+        unchanged. Raises NoCaseError if the iteration does not converge.
         """
         if not self.system.constraints:
             return x
@@ -304,9 +312,10 @@ class _Cases:
         raise NoCaseError
 
     def flow(self, point: Point, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
-        """Return the state [q; qd] that follows the state x at time t after the time `span` (s).
+        """Return the state [q; qd] at time t + span (s), by integration from the state x at time t.
 
-        The integration takes `steps` equal steps of order 8; `span` may be negative.
+        The integration takes `steps` equal steps of order 8; `span` may be negative. `point`
+        supplies the inputs and the parameters.
         """
         for k in range(steps):
             x = self.step(DP8, point, x, t + span * k / steps, span / steps)
@@ -329,9 +338,9 @@ class _Cases:
 
     @cached_property
     def near(self) -> tuple[Point, ...]:
-        """Test points near the initial state, about three in number.
+        """About three points near the initial state, at which functions are tested.
 
-        The inputs come from the scene's signals, except in the last ones, which specify inputs. One
+        In the last ones, the inputs are specified; otherwise the scene's signals supply them. One
         point has the second set of parameters. Expensive systems have two points only.
         """
         found = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
@@ -369,10 +378,10 @@ class _Cases:
         )
 
     def driven(self, point: Point, beyond: float) -> Point:
-        """Return the point with inputs specified rather than supplied by the scene's signals.
+        """Return a copy of the point in which the inputs are specified.
 
-        beyond: 0 for inputs within their saturation limits; 1 or -1 for inputs above the upper or
-        below the lower limits.
+        In other points the scene's signals supply them. beyond: 0 for inputs within their
+        saturation limits; 1 or -1 for inputs above the upper or below the lower limits.
         """
         names = self.target.input_names
         u = [0.6 + 0.25 * math.cos(1.3 * i) for i in range(len(names))]
@@ -393,7 +402,10 @@ class _Cases:
         return replace(point, values={**point.values, **values}, signals=False)
 
     def index(self, point: Point) -> int:
-        """Return the index of a point in `points`, to which it is appended if it is new."""
+        """Return the index of a point in the list of all test points.
+
+        A point that is not yet in the list is appended to it.
+        """
         if point not in self.points:
             self.points.append(point)
         self.uses_other |= point.other
@@ -401,12 +413,12 @@ class _Cases:
 
     @property
     def arrays(self) -> tuple[tuple[str, str], ...]:
-        """Name and size (C text) of each array of a test state besides q and qd."""
+        """Name and size (C text) of each array that C test functions take besides q and qd."""
         found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
         return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
 
     def state(self, point: Point) -> State:
-        """Return the arguments of a test call with numbers as C literals."""
+        """Return the arguments of a test call at a point, with numbers as C literals."""
         s, literal = self.system, self.target.literal
         names = {"qdd": [x.name for x in s.qdd], "lambda": self.target.multipliers}
         names["wrenches"] = [x.name for x in self.target.wrenches]
@@ -421,7 +433,10 @@ class _Cases:
         )
 
     def input_names(self, point: Point) -> list[str]:
-        """Return the names of the inputs that a point specifies; none if signals supply them."""
+        """Return the names of the inputs that a point specifies.
+
+        The list is empty if the scene's signals supply the inputs.
+        """
         return [] if point.signals else self.target.input_names
 
     # cases
@@ -430,11 +445,12 @@ class _Cases:
         self, point: Point, compute: Callable[[Point], Vector], allowed: float = 0.0,
         sharp: bool = False,
     ) -> Case | None:  # fmt: skip
-        """Return the expected results at a point with their error limit, as a test case.
+        """Return a test case: the expected results at a point, with their error limit.
 
-        The limit is relative to the largest result: 1000 times the effect of perturbing the state
-        by one ulp, but at least `allowed` and a basic tolerance. With `sharp`, it is exactly
-        `allowed`. Returns None if the results cannot be computed or the limit would be too large.
+        `compute` returns the results at a point. The limit is relative to the largest result. It is
+        1000 times the effect of perturbing the state by one ulp, but at least `allowed` and a basic
+        tolerance. With `sharp`, it is exactly `allowed`. Returns None if the results cannot be
+        computed or the limit would be too large.
         """
         try:
             expected = compute(point)
@@ -450,9 +466,10 @@ class _Cases:
         return Case(self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}"))
 
     def nudged(self, point: Point, turn: int) -> Point:
-        """Return the point with each coordinate and velocity changed by about one ulp.
+        """Return a copy of the point with each coordinate and velocity changed by about one ulp.
 
-        turn: 0 or 1, for two different patterns of signs.
+        An ulp is the distance to the next floating-point number. turn: 0 or 1, for two different
+        patterns of signs.
         """
         ulp = self.target.real.epsilon
         names = [x.name for x in (*self.system.q, *self.system.qd)]
@@ -487,15 +504,15 @@ class _Cases:
     def written(
         self, name: str, kind: str, call: str, cases: Sequence[Case | None], type: str = ""
     ) -> Tested:
-        """Return a test of the C function `name`, without those cases that are None.
+        """Return the data of a test of the C function `name`; cases that are None are left out.
 
         call: the tested C call. kind: form of the test's body in the template, see `views.Tested`.
-        type: C type of the workspace of an adaptive run.
+        type: C type of the workspace of an adaptive run, "" for other tests.
         """
         return Tested(name, kind, call, type, tuple(filter(None, cases)))
 
     def call(self, f: CFunction, **passed: str) -> str:
-        """Return a C call of f with members of the test state s as arguments.
+        """Return a C call of f in which the arguments are members of the struct s, the test state.
 
         passed: C expressions of other arguments, by name.
         """
@@ -518,16 +535,16 @@ class _Cases:
 
     @cached_property
     def large(self) -> list[dict[str, float]]:
-        """States (values by name) with large angles at which double precision suffices.
+        """States with large angles, each as values by name, that are suitable for tests.
 
-        Bias and accelerations, computed in doubles, agree there with the exact results.
+        At these states, bias and accelerations computed in doubles agree with the exact results.
         """
         return [x for x in _large(self.target) if self.is_sharp(x)]
 
     def is_sharp(self, x: Mapping[str, float]) -> bool:
-        """Return True if bias and accelerations in doubles agree with those of 40 digits.
+        """Return True if bias and accelerations computed in doubles agree with those of 40 digits.
 
-        x: state, time and parameters by name.
+        x: state, time and parameters, as values by name.
         """
         known = self.complete(Point({n: v if self.double else _single(v) for n, v in x.items()}))
         room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
@@ -586,9 +603,9 @@ class _Cases:
 
     @cached_property
     def starts(self) -> tuple[Point, ...]:
-        """Initial points of steps: points near the initial state.
+        """Points near the initial state at which tested steps begin.
 
-        With constraints, it is only the initial state itself, which satisfies them.
+        With constraints, the only point is the initial state itself, which satisfies them.
         """
         if not self.system.constraints:
             return tuple(replace(p, span=1.0) for p in self.near if not p.other)
@@ -597,10 +614,10 @@ class _Cases:
         return (replace(point, span=1.0),)
 
     def spanned(self, m: Method, point: Point) -> Point | None:
-        """Return the point with a step size for method m as its `span`; None if none is suitable.
+        """Return a copy of the point with a step size for the integration method m as its `span`.
 
         It is the largest of some step sizes with which a few steps can be tested accurately and the
-        state does not grow much.
+        state does not grow much. Returns None if no step size is suitable.
         """
         h = self.system.run.h
         most = 1 if m.sweeps else 2 if m.implicit else 4
@@ -613,8 +630,9 @@ class _Cases:
         return None
 
     def stepped(self, m: Method, steps: int, point: Point) -> Vector:
-        """Return, in one list, the state [q; qd] after each of `steps` steps of size
-        `point.span`.
+        """Return, in one list, the state [q; qd] after each of several steps of method m.
+
+        The first step begins at `point`. There are `steps` steps of size `point.span` (s).
         """
         x, found, t, h = self.states(point), Vector(), point.values[TIME], point.span
         for n in range(steps):
@@ -623,7 +641,7 @@ class _Cases:
         return found
 
     def rows(self, m: Method, point: Point) -> Vector:
-        """Return the results of a run of three steps as C stores them.
+        """Return the results of a run of three steps of method m from a point, as C stores them.
 
         These are the last state [q; qd], then q after each step, then qd after each step.
         """
@@ -633,9 +651,10 @@ class _Cases:
         return [*states[-1], *q, *qd]
 
     def twice(self, m: Method, point: Point) -> Vector:
-        """Return the final states of two instances in a batch that have equal initial states.
+        """Return the final states of a batch of two instances of the system, by method m.
 
-        The order is that of C: q of both instances, then qd of both.
+        Both instances start at `point`. The order is that of C: q of both instances, then qd of
+        both.
         """
         end = self.stepped(m, STEPS, point)[-2 * self.nq :]
         return [*end[: self.nq] * 2, *end[self.nq :] * 2]
@@ -645,9 +664,7 @@ class _Cases:
         return self.projected(point, self.states(point), point.values[TIME])
 
     def run_call(self, name: str) -> str:
-        """Return the C call of a run of three steps of method `name`, which stores the state of
-        each step.
-        """
+        """Return the C call of a run of three steps of method `name`; it stores each state."""
         return self.call(
             self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(STEPS),
             u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + STEPS}*NQ",
@@ -655,8 +672,9 @@ class _Cases:
         )  # fmt: skip
 
     def batch_call(self, name: str) -> str:
-        """Return the C call of a batch of two instances with equal initial states, by method
-        `name`.
+        """Return the C call that steps a batch of two instances of the system by method `name`.
+
+        The instances have equal initial states.
         """
         return self.call(
             self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
@@ -676,10 +694,11 @@ class _Cases:
         )  # fmt: skip
 
     def derivative(self, m: Method, point: Point) -> Case | None:
-        """Return the test case for the derivative of a step of method m along a fixed direction.
+        """Return the test case for the derivative of a step of method m along a direction.
 
-        The direction has components 1, 2, 3, 1, 2, ... in q, qd and the specified inputs. The
-        derivative is a central difference. Returns None if it is not accurate enough.
+        The step begins at `point`. The direction is constant: it has the components 1, 2, 3, 1, 2,
+        ... in q, qd and the specified inputs. The expected derivative is a central difference.
+        Returns None if it is not accurate enough.
         """
         names = [x.name for x in (*self.system.q, *self.system.qd)]
         names += self.input_names(point)
@@ -706,10 +725,11 @@ class _Cases:
     # adaptive runs and events
 
     def adaptive_runs(self) -> Iterator[Tested]:
-        """Yield one test of adaptive runs: runs without events, and runs across each event.
+        """Yield a single test, which covers adaptive runs.
 
-        Events are crossed in both directions. With constraints or friction modes, there are only
-        the runs without events.
+        Its cases are runs without events, and runs in which an event function crosses zero, for
+        each event in both directions. With constraints or friction modes, there are only the runs
+        without events.
         """
         cases = [self.quiet(p) for p in self.starts]
         if not (self.system.constraints or self.system.modes):
@@ -723,8 +743,9 @@ class _Cases:
         return tuple(self.short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
 
     def quiet(self, point: Point) -> Case | None:
-        """Return the case of an adaptive run from a point in which no event occurs; None if there
-        is none.
+        """Return the case of an adaptive run that starts at a point and in which no event occurs.
+
+        The longest suitable run is used. Returns None if no run is suitable.
         """
         for span in self.spans():
             tried = replace(point, span=span)
@@ -740,15 +761,15 @@ class _Cases:
 
     @property
     def of_runs(self) -> float:
-        """Error limit of adaptive runs, relative to the largest result."""
+        """The error limit of test cases for adaptive runs, relative to the largest result."""
         return 1e-8 if self.double else 2e-3
 
     def ended(self, event: Happening | None, point: Point) -> Vector:
-        """Return the results of an adaptive run as C stores them.
+        """Return the results of an adaptive run from a point, as C stores them.
 
-        These are the final [q; qd] and time and, if the scene has events, the number of events and
-        the number (from 1), time and state of the first event. event: time and index of the event
-        in this run; None for none.
+        These are the final [q; qd] and time. If the scene has events, the number of events follows,
+        and then the number (from 1), time and state of the first event. event: time and index of
+        the event in this run; None for none.
         """
         x, t, span = self.states(point), point.values[TIME], point.span
         none = [0.0] * (3 + 2 * self.nq) if self.system.events else []
@@ -766,8 +787,9 @@ class _Cases:
         return [*self.sure(point, x, at, t + span - at), t + span, *found]
 
     def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
-        """Return the state after `span` as `flow` does; raise NoCaseError if shorter steps do not
-        agree.
+        """Return the state at time t + span (s), by integration from the state x at time t.
+
+        Raises NoCaseError if integration with shorter steps gives a different result.
         """
         found, finer = (self.flow(point, x, t, span, n) for n in (4, 6))
         if _off(found, finer) > self.of_runs / 10:
@@ -775,12 +797,17 @@ class _Cases:
         return finer
 
     def events(self, point: Point, x: Vector, t: float) -> Vector:
-        """Return the values of the event functions at the state x = [q; qd] and time t."""
+        """Return the values of the event functions at the state x = [q; qd] and time t (s).
+
+        `point` supplies the inputs and the parameters.
+        """
         return self.value("events", self.shifted(point, x, t))
 
     def refuse_events(self, point: Point, x: Vector, t: float, span: float) -> None:
-        """Raise NoCaseError if an event function changes sign, or nearly does, within `span` from
-        time t.
+        """Raise NoCaseError if an event function changes sign, or nearly does, in a run.
+
+        The run begins in the state x = [q; qd] at time t (s) and has the length `span` (s). `point`
+        supplies the inputs and the parameters.
         """
         first = self.events(point, x, t) if self.system.events else []
         for k in range(8) if first else ():
@@ -791,8 +818,9 @@ class _Cases:
                     raise NoCaseError
 
     def crossings(self, k: int) -> list[Case | None]:
-        """Return the cases of runs across event k: at most one with a rising and one with a falling
-        sign.
+        """Return test cases of runs in which the event function k crosses zero.
+
+        There is at most one case in which the function rises, and one in which it falls.
         """
         found: dict[bool, Case] = {}
         for point in self.candidates(k):
@@ -826,10 +854,10 @@ class _Cases:
                         continue
 
     def solved(self, k: int, point: Point, name: str) -> Point:
-        """Return the point with `name` changed such that event function k is zero, by the secant
-        method.
+        """Return a copy of the point at which the event function k is zero.
 
-        Raises NoCaseError if the iteration does not converge or the value is too large.
+        The value of `name` (the time, a coordinate or a velocity) is changed by the secant method.
+        Raises NoCaseError if the iteration does not converge or the value becomes too large.
         """
 
         def g(x: float) -> float:
@@ -851,10 +879,10 @@ class _Cases:
         return replace(point, values={**point.values, name: b})
 
     def crossing(self, k: int, on: Point, span: float) -> tuple[bool, Case | None]:
-        """Return whether event function k rises, and the test case of a run across its zero.
+        """Return whether event function k rises at its zero, and a test case of a run across it.
 
-        on: a point at which the function is zero. The run starts half a `span` (s) before it.
-        Raises NoCaseError if other events occur in the run.
+        on: a point at which the function is zero. The run starts half a `span` (s) before this
+        point. Raises NoCaseError if other events occur in the run.
         """
         x, t, half = self.states(on), on.values[TIME], span / 2
         others = [i for i in range(len(self.system.events)) if i != k]
