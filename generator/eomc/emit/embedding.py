@@ -21,10 +21,10 @@ def pkg_config(target: Target) -> PkgConfig:
 
 
 def costs(target: Target) -> Costs:
-    """Return the data for costs.txt, a table with the operation counts of one call of each C
-    function.
+    """Return the data for costs.txt, a table of operation counts of the C functions.
 
-    The functions are in the order of the header; the steps of the integration methods follow.
+    Each count is for one call. The functions are in the order of the header; the steps of the
+    integration methods follow.
     """
     names = (*KINDS, "acceleration", "linearization")
     functions = tuple(Counted(f.name, f.cost) for name in names if (f := source(target, name)))

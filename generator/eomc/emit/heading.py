@@ -12,7 +12,8 @@ from eomc.emit.c_names import Target
 def stamp(target: Target) -> list[FreeText]:
     """Return comment lines that state the origin of generated files.
 
-    They are the version of eomc, the scene file with its digest, and the command; there is no date.
+    They have the version of eomc, the name and the digest of the scene's file, and the command.
+    They have no date.
     """
     s = target.system
     source = s.file.replace("\\", "/").rsplit("/", 1)[-1]
@@ -56,7 +57,8 @@ def words(unit: str, note: str) -> FreeText:
 
 
 def solved(target: Target) -> list[str]:
-    """Return comment lines that state how D qdd = tau - bias is solved for the accelerations
-    qdd.
+    """Return comment lines that state how the equations of motion are solved.
+
+    The equations D qdd = tau - bias are solved for the accelerations qdd.
     """
     return textwrap.wrap(target.program.solved, 92)

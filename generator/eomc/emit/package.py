@@ -44,8 +44,9 @@ OPTIONAL = {  # functions by the option that brings them
 
 
 def main(target: Target) -> Main:
-    """Return the data for main.c, an example program that simulates the scene and prints about 200
-    lines.
+    """Return the data for main.c, an example program that simulates the scene.
+
+    The program prints about 200 lines.
     """
     s, public = target.system, Public(target)
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
@@ -198,8 +199,9 @@ def _derivative(target: Target, method: str) -> tuple[str, str, str]:
 
 
 def binding(target: Target) -> Binding:
-    """Return the data for the Python binding: C functions with one signature, for many states
-    each.
+    """Return the data for the Python binding, C functions that Python calls.
+
+    All functions have the same signature, and each evaluates many states in one call.
     """
     public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
     linear = public.linearization
@@ -227,7 +229,7 @@ def _linearized(target: Target) -> bool:
 
 
 def declarations(bound: Binding) -> Declarations:
-    """Return the data for the declarations by which cffi reads the Python binding."""
+    """Return the data for the C declarations from which cffi makes the Python binding."""
     return Declarations(
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
         bound.methods, bound.adaptive,
@@ -250,10 +252,9 @@ def stub(target: Target) -> Stub:
 
 
 def start_formulas(target: Target) -> dict[str, str]:
-    """Return the initial values that depend on parameters, as formulas by name of the state
-    variable.
+    """Return the formulas of those initial values that depend on parameters.
 
-    The names are those of coordinates (`theta`) and velocities (`theta_dot`) in the scene.
+    They are given by the name of a coordinate (`theta`) or velocity (`theta_dot`) in the scene.
     Parameters that state jumps change are replaced by their values.
     """
     s, written = target.system, target.as_written

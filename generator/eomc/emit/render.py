@@ -100,7 +100,10 @@ def _bytecode() -> jinja2.BytecodeCache | None:
 
 
 def show(view: views.View | plain_views.View | fast_views.View | fmu_views.View) -> str:
-    """Return the text of a file, printed from data by the template that belongs to their class."""
+    """Return the text of a generated file.
+
+    `view` has the data of the file. Its class attribute TEMPLATE names the Jinja template.
+    """
     context = {field.name: getattr(view, field.name) for field in fields(view)}
     return environment().get_template(view.TEMPLATE + ".jinja").render(context)
 
@@ -113,9 +116,10 @@ def _plain_names(program: Program) -> None:
 
 
 def render(program: Program, extension: str) -> Sources:
-    """Return all generated files of a program; the same program gives the same text.
+    """Return all generated files of a program, the list of functions derived from a scene.
 
-    extension: name of the compiled extension module, which the Python package imports.
+    The same program always gives the same text. extension: name of the compiled extension module,
+    which the Python package imports.
     """
     _plain_names(program)
     program, written = rename_for_c(program)
@@ -145,6 +149,9 @@ def render(program: Program, extension: str) -> Sources:
 
 
 def unit(program: Program, version: int) -> fmu.Unit:
-    """Return the functional mock-up unit (FMU) of a program, in FMI version 2 or 3."""
+    """Return the functional mock-up unit (FMU) of a program: its C code and model description.
+
+    version: version of the FMI standard, 2 or 3.
+    """
     _plain_names(program)
     return fmu.unit(program, version, show, show)

@@ -206,7 +206,7 @@ class PkgConfig:
 
 @dataclass(frozen=True)
 class Counted:
-    """A generated C function by name, with the number of operations of one call."""
+    """The name of a generated C function, and the operation counts of one call."""
 
     name: str
     cost: Cost
@@ -214,7 +214,10 @@ class Counted:
 
 @dataclass(frozen=True)
 class Stepped:
-    """A step function by name, with a text (`words`) on how many accelerations a step computes."""
+    """The name of a C function that makes a step of an integration method.
+
+    `words` states how often a step computes the accelerations.
+    """
 
     name: str
     words: str
