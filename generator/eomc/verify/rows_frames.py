@@ -165,9 +165,10 @@ class _Frames:
         return self.off(twists, exact, s, least=least)
 
     def twist_scale(self, s: State, rates: Vector) -> float:
-        """Return the largest component of the frames' velocities for given coordinate velocities.
+        """Return the largest entry of |J| rates, a bound of the frames' velocities at a state.
 
-        rates: the coordinate velocities, (nq,), used in place of those of `s`.
+        J are the module's Jacobians of the frames. rates: coordinate velocities, (nq,), used in
+        place of those of `s`.
         """
         J = np.abs(self.module.jacobian(s.q, **self.arguments(s)))
         return float(np.max(J @ rates, initial=0))
