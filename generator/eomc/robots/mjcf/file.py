@@ -320,7 +320,8 @@ def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
 def settings_of(root: Tag, report: Report) -> Settings:
     """Return the settings in the elements <compiler> and <option> of a file.
 
-    If a setting is repeated, the last value counts. Settings that are not modelled are reported.
+    If a setting is repeated, the last value applies. Settings that are not modelled are noted in
+    `report`.
     """
     s = Settings()
     disabled = dict.fromkeys(EFFECTS, False)  # by flag; flags accumulate over all <option> elements
@@ -379,10 +380,11 @@ def _compiler(s: Settings, a: AttributeReader) -> Settings:
 
 
 def classes_of(root: Tag, report: Report) -> Classes:
-    """Return the default classes: for each class, the attributes of each kind of element.
+    """Return the default classes of a file: attribute values that its elements can inherit.
 
-    Inherited attributes are included. All actuators of a class share one entry, "actuator".
-    Elements of a class apply to its nested classes, wherever they occur in it.
+    The result maps the name of each class and the kind of element to the attributes. Attributes
+    that a class inherits from an outer class are included. All actuators of a class share one
+    entry, "actuator". Faults are added to `report`.
     """
     classes: Classes = {"main": {}}
     for top in root.each("default"):
@@ -411,10 +413,11 @@ def classes_of(root: Tag, report: Report) -> Classes:
 
 
 def merged(base: Attributes, tag: Tag) -> Attributes:
-    """Return the attributes of an element, completed by those of its default class, `base`.
+    """Return the attributes of the element `tag`, completed by those of its default class.
 
-    An orientation replaces an inherited one of any kind, and `fromto` an inherited pose. A shortcut
-    such as <position> is converted to the attributes of <general>; the key " law" has its name.
+    `base` has the attributes of the class. An orientation replaces an inherited one of any kind,
+    and `fromto` replaces an inherited pose. A shortcut such as <position> is converted to the
+    attributes of <general>, and its name is stored under the key " law".
     """
     own = {k: v for k, v in tag.attributes.items() if k not in {"class", "childclass"}}
     over = dict(base)
