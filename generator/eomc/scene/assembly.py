@@ -18,7 +18,10 @@ Vector = tuple[Formula, Formula, Formula]
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by `angle` (rad) about an axis, "x", "y" or "z", of the frame rotated so far."""
+    """One rotation in a sequence: by `angle` (rad) about an axis "x", "y" or "z".
+
+    The axis is that of the frame as rotated by the preceding rotations.
+    """
 
     axis: str
     angle: Formula
@@ -40,20 +43,28 @@ class Body:
     axes : tuple of vectors
         Unit vectors in the joint's frame.
     offset, rotation : vector in m, and tuple of Turn
-        Pose of the joint's frame in the parent's frame. The body's frame is the joint's frame,
-        moved by the coordinates. For a body placed by formulas, the rotation of its frame in the
-        world.
+        Position and rotation of the joint's frame in the parent's frame. The body's frame is the
+        joint's frame, moved by the coordinates. For a body placed by formulas, `rotation` is the
+        rotation of the body's frame in the world.
     position : vector or None
-        Centre of mass in the world, m, of a body placed by formulas. It and the rotation may then
-        depend on coordinates, t and definitions.
-    mass, center, inertia : Formula, vector and six Formulas
-        kg; centre of mass in the body's frame, m; Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of
-        mass along the body's axes, kg m^2. Off-diagonal elements are those of the tensor, -sum m x
-        y.
-    armature, damping, friction, actuator : tuple of Formula
-        Empty, or one for each coordinate: kg or kg m^2; N s/m or N m s/rad; N or N m (Coulomb
-        friction, smoothed as friction*tanh(rate/friction_width)); a force along the coordinate,
-        which may use all names.
+        Position of the centre of mass in the world in m, for a body placed by formulas. `position`
+        and `rotation` of such a body may depend on coordinates, t and definitions.
+    mass : Formula
+        Mass in kg.
+    center : vector
+        Centre of mass in the body's frame in m.
+    inertia : six Formulas
+        Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass along the body's axes, in kg m^2.
+        Off-diagonal elements are those of the tensor, such as Ixy = -sum m x y.
+    armature : tuple of Formula
+        Rotor inertia of the joint, in kg or kg m^2. This tuple and those below are empty or have
+        one formula for each coordinate.
+    damping : tuple of Formula
+        Damping constant in N s/m or N m s/rad.
+    friction : tuple of Formula
+        Coulomb friction in N or N m, smoothed as friction*tanh(rate/friction_width).
+    actuator : tuple of Formula
+        Force or moment along the coordinate, as a formula that may use all names of the scene.
     point : bool
         True for a [[point]], a massless body on a fixed joint.
     """
@@ -80,12 +91,12 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Where a spring or damper acts: along a coordinate, between two points, or between two angles.
+    """The place where a spring or damper acts: a coordinate, two points, or two angles.
 
-    coordinate: name of the coordinate, "" if the element acts between two bodies. bodies: names of
-    the two bodies. points: end of the element in the frame of each body, m. turning: True if the
-    element acts on the angle of the second body minus that of the first, in the plane; then there
-    are no points.
+    coordinate: name of the coordinate along which the element acts, "" if it acts between two
+    bodies. bodies: names of the two bodies. points: position in m of each end of the element, in
+    the frame of its body. turning: True, in the plane only, if the element acts on the angle of the
+    second body minus the angle of the first; `points` is then empty.
     """
 
     coordinate: str = ""
@@ -96,9 +107,10 @@ class Between:
 
 @dataclass(frozen=True, kw_only=True)
 class Spring(Between):
-    """A linear spring.
+    """A linear spring, whose force is -stiffness times its extension.
 
-    stiffness: N/m or N m/rad. length: rest length or rest position (m), or rest angle (rad).
+    stiffness: in N/m, or N m/rad for a spring on an angle. length: the rest length or rest position
+    in m, or the rest angle in rad.
     """
 
     stiffness: Formula
@@ -107,16 +119,21 @@ class Spring(Between):
 
 @dataclass(frozen=True, kw_only=True)
 class Damper(Between):
-    """A linear damper, whose force is -damping times the rate. damping: N s/m or N m s/rad."""
+    """A linear damper, whose force is -damping times the rate of change of its length or angle.
+
+    damping: damping constant in N s/m, or N m s/rad for a damper on an angle.
+    """
 
     damping: Formula
 
 
 @dataclass(frozen=True)
 class Force:
-    """A force (N) at a `point` (m, in the body's frame) and a torque (N m) on a body.
+    """A force and a torque that act on a body.
 
-    Their components are formulas of all names, along the world's axes or, if `in_body`, the body's.
+    point: position in m, in the body's frame, of the point at which the force acts. force, torque:
+    components in N and N m, as formulas that may use all names of the scene. in_body: True if the
+    components are along the body's axes, False if they are along the world's axes.
     """
 
     body: str
@@ -130,11 +147,22 @@ class Force:
 class Loop:
     """A joint that closes a loop in a tree of bodies, or a gear between two coordinates.
 
-    joint: key of joints.CLOSINGS. bodies: names of the two bodies, one of which may be "world".
-    points: position of the joint in the frame of each body, m. axes: unit vector of its axis in the
-    frame of each body. rotation: rotation of the second body's frame relative to the first one's.
-    length: distance in m that a joint of kind "distance" keeps. coordinates, ratio, offset: a gear
-    keeps the second coordinate at ratio times the first plus offset.
+    Attributes
+    ----------
+    joint
+        Kind of the joint, a key of joints.CLOSINGS.
+    bodies
+        Names of the two bodies, one of which may be "world".
+    points
+        Position of the joint in the frame of each body, in m.
+    axes
+        Unit vector of the joint's axis in the frame of each body.
+    rotation
+        Rotation of the second body's frame relative to the first body's frame.
+    length
+        Distance in m that a joint of the kind "distance" keeps constant.
+    coordinates, ratio, offset
+        Data of a gear: second coordinate = ratio * first coordinate + offset.
     """
 
     name: str
@@ -150,11 +178,11 @@ class Loop:
     note: str = ""
 
     def rows(self, plane: bool) -> dict[str, str]:
-        """Return the names of the constraint equations of the joint, by kind of equation.
+        """Return a dict from the kind of each constraint equation of the joint to its name.
 
-        The kinds, such as "x" or "rz", are those of `joints.Closing`. plane: True for a plane
-        scene, False for a scene in space. A single equation has the name of the loop, several have
-        names such as "<loop>_x".
+        The kinds, such as "x" or "rz", are explained in `joints.Closing`. If the joint has one
+        equation, its name is that of the loop; several equations have names such as "<loop>_x".
+        plane: True for a plane scene, False for a scene in space.
         """
         kinds = CLOSINGS[self.joint].rows(plane)
         if len(kinds) == 1:

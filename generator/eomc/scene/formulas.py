@@ -114,7 +114,8 @@ _TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
 class FormulaError(ValueError):
     """An error in a formula.
 
-    It is in the `width` characters of the formula's text that begin at index `column`.
+    column: index of the first faulty character in the text of the formula. width: number of faulty
+    characters.
     """
 
     def __init__(self, message: str, column: int = 0, width: int = 1) -> None:
@@ -385,9 +386,10 @@ def _number(formula: Formula, node: ast.expr) -> float | None:
 def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str], Any]) -> Any:
     """Evaluate a formula with the given functions and values, and return its value.
 
-    algebra: maps the name of each function to a callable, "pi" to a value, and "number" to a
-    callable that converts the text of a number. With `NUMERIC` the values are floats. lookup:
-    returns the value of any other name. Exceptions of these callables are not caught.
+    algebra: dict from the name of each function to a callable. It also maps "pi" to a value and
+    "number" to a callable that converts the text of a number. Use `NUMERIC` to compute with floats.
+    lookup: function that returns the value of any other name. Exceptions that these callables raise
+    are not caught.
     """
     return _walk(formula, formula.tree, algebra, lookup)
 

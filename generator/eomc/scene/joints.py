@@ -18,11 +18,22 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 class Joint:
     """A kind of joint, as a sequence of elementary motions with one coordinate each.
 
-    motions: a letter for each motion, "r" for a rotation or "t" for a translation, in the order of
-    the coordinates in the scene. axes: the axis of each motion, or the index (0 or 1) of the axis
-    in the scene that the motion takes. defaults: axes for a scene that gives none; empty if the
-    scene must give them. plane: True if the joint can be used in plane scenes. order: explanation
-    of the order of the coordinates. aliases: names of the joint in other programs and textbooks.
+    Attributes
+    ----------
+    motions
+        A letter for each motion, "r" for a rotation or "t" for a translation, in the order of the
+        coordinates in the scene.
+    axes
+        The axis of each motion: a fixed vector, or an index (0 or 1) into the axes that the scene
+        gives for the joint.
+    defaults
+        Axes for a scene that gives none; empty if the scene must give axes.
+    plane
+        True if the joint can be used in plane scenes.
+    order
+        Text that explains the order of the coordinates.
+    aliases
+        Names of the joint in other programs and textbooks.
     """
 
     motions: str
@@ -38,9 +49,9 @@ class Joint:
         return max((axis + 1 for axis in self.axes if isinstance(axis, int)), default=0)
 
     def motion_axes(self, scene_axes: Sequence[Axis]) -> tuple[Axis, ...]:
-        """Return the axis of each elementary motion.
+        """Return the axis of each elementary motion of the joint.
 
-        scene_axes: the axes that the scene gives for the joint; if empty, the defaults are taken.
+        scene_axes: the axes that the scene gives for the joint; if empty, `defaults` is used.
         """
         chosen = scene_axes or self.defaults
         return tuple(chosen[a] if isinstance(a, int) else a for a in self.axes)
@@ -81,11 +92,12 @@ class Closing:
 
     Each kind of constraint equation keeps a quantity at zero or constant:
 
-    - x, y, z: vector from the first body's point to the second body's point, along the axes of
-      their common ancestor.
-    - u, v: the same vector along two directions perpendicular to the first axis.
-    - ru, rv: tilt of the second axis from the first, about u and v.
-    - rx, ry, rz: rotation of the second frame relative to the first.
+    - x, y, z: components of the vector from the first body's point to the second body's point,
+      along the axes of the bodies' common ancestor.
+    - u, v: components of the same vector along two directions perpendicular to the axis on the
+      first body.
+    - ru, rv: tilt of the axis on the second body from the axis on the first body, about u and v.
+    - rx, ry, rz: rotation of the second body's frame relative to the first body's frame.
     - cross: cosine of the angle between two axes.
     - length, ratio: the only constraint equation of a distance or of a gear.
     """
@@ -97,7 +109,10 @@ class Closing:
     aliases: tuple[str, ...] = ()
 
     def rows(self, plane: bool) -> tuple[str, ...]:
-        """Return the kinds of constraint equations, in plane scenes (True) or in space (False)."""
+        """Return the kinds of the joint's constraint equations, such as "x" or "ru".
+
+        plane: True for plane scenes, False for scenes in space.
+        """
         return self.plane if plane else self.space
 
 

@@ -48,11 +48,11 @@ _OF_FORCES = {"body", "point", "force", "torque", "frame"}
 
 
 def merge_array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
-    """Convert an array of tables that a scene should write as one table, such as [[parameter]].
+    """Convert an array of tables, such as [[parameter]], that should be one table [parameters].
 
     name: the name of the array as written. entries: its value in the TOML tree. Returns the name of
-    the intended table, such as "parameters", and its entries by name; None if no single table is
-    meant.
+    the intended table, such as "parameters", and a dict from the name of each entry to the entry.
+    Returns None if the array does not stand for one table.
     """
     table = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
     if table is None or not isinstance(entries, list) or not entries:
@@ -98,10 +98,10 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([^\s\d.+\-−].*?)\s*")
 
 
 def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
-    """Return the remedy to show for a number that is written with a unit, such as `30 deg`.
+    """Return advice, for an error message, on a number that is written with a unit (`30 deg`).
 
-    declared: names of the scene; `2 m` is a product, not a quantity, if m is declared. Returns None
-    if the text is not a number with a unit.
+    declared: names that the scene declares. A declared name is not read as a unit, so that `2 m`
+    is taken for a product if m is declared. Returns None if the text is not a number with a unit.
     """
     match = _QUANTITY.fullmatch(text) if len(text) <= MAX_QUANTITY_LENGTH else None
     if match is None or match[2] in declared:
@@ -125,7 +125,10 @@ _UNIT_OF_DEGREES = re.compile(
 
 
 def is_in_degrees(unit: str) -> bool:
-    """Return True if a unit contains angular degrees, such as `deg/s`; not for temperatures."""
+    """Return True if a unit contains angular degrees, such as `deg/s`.
+
+    Returns False for units of temperature.
+    """
     return bool(_UNIT_OF_DEGREES.search(unit))
 
 
@@ -135,9 +138,10 @@ def degrees_formula(number: str) -> str:
 
 
 def number_remedy(text: object) -> str:
-    """Return the remedy for a number that is written as text, such as "1 ms", in SI units.
+    """Return advice, for an error message, on a number that is written as a text.
 
-    An example is ": write 0.001, without quotes". Returns "" if the text is not a number.
+    For "1 ms" the advice is ": write 0.001, without quotes", with the number converted to SI units.
+    Returns "" if the text is not a number.
     """
     if not isinstance(text, str) or not (
         match := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
@@ -155,10 +159,10 @@ def _scaled(number: str, power: int) -> str:
 
 
 def toml_remedy(line: str) -> str | None:
-    """Return the remedy for a line that is not valid TOML, or None if its error is not common.
+    """Return advice, for an error message, on a line that is not valid TOML.
 
-    Known errors are a dash in place of a minus sign, a colon in place of "=", and a number followed
-    by a unit.
+    Three common errors are recognised: a dash in place of a minus sign, a colon in place of "=",
+    and a number followed by a unit. Returns None for any other error.
     """
     line = line[:200]
     if re.search(r"[=,[]\s*−", line):

@@ -42,10 +42,10 @@ _WRITTEN = 'is written repeat = "i = 1..n"'
 
 
 def expand(tree: dict[str, Any], check: Checker) -> bool:
-    """Expand all repeated entries and indexed names in the tree of a scene, which is changed.
+    """Expand all repeated entries and indexed names of a scene, in place.
 
-    tree: the scene as parsed from TOML. check: collects the errors. Returns False if there were
-    errors that prevent further checks.
+    tree: the scene as parsed from TOML, which is changed. check: object that collects the errors.
+    Returns False if there were errors that prevent further checks, else True.
     """
     return _Expansion(tree, check).run()
 

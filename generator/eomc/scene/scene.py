@@ -17,10 +17,10 @@ from eomc.scene.source_map import SourceMap
 class Coordinate:
     """A generalized coordinate of a scene.
 
-    start: initial value in `unit`. rate: initial velocity in unit/s; formulas call the velocity
-    `<name>_dot`. start_fixed, rate_fixed: True if the initial value or velocity must not be changed
-    to satisfy the constraints. friction: Coulomb friction, N or N m. friction_width: velocity
-    within which the friction is smoothed.
+    start: initial value in `unit`. rate: initial velocity in unit/s. The velocity has the name
+    `<name>_dot` in formulas. start_fixed, rate_fixed: True if the initial value or velocity must
+    not be changed to satisfy the constraints. friction: Coulomb friction in N or N m.
+    friction_width: width w of the smoothed friction, friction*tanh(velocity/w).
     """
 
     name: str
@@ -52,8 +52,8 @@ class Quantity:
 class Input:
     """An input, whose value can be given at every step.
 
-    signal: formula of its value if none is given. limits: formulas of the smallest and the largest
-    value to which the input is clipped, None if unbounded.
+    signal: formula that determines the input if no value is given. limits: formulas of the smallest
+    and the largest value of the input, beyond which it is clipped; None if unbounded.
     """
 
     name: str
@@ -65,7 +65,10 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """An output: a named quantity that is computed by a formula of any quantities of the motion."""
+    """An output: a named quantity that is computed from the motion by a formula.
+
+    The formula may use all quantities of the scene, accelerations and constraint forces too.
+    """
 
     name: str
     unit: str
@@ -157,12 +160,24 @@ class Run:
 class Scene:
     """A checked scene: the mechanical system and the settings that a TOML file describes.
 
-    All names in its formulas are declared, and no definition is circular. file: name of the file.
-    digest: SHA-256 of its text. kinetic, potential, dissipation: formulas of the energies in J and
-    of the dissipation function. forces: formulas of generalized forces, by coordinate. assembly:
-    bodies and what acts on them, None if there are none. places: lines of all keys in the file.
-    warnings: problems that are not errors. used: for each name, the keys of the formulas that use
-    it.
+    All names in the formulas are declared, and no definition is circular.
+
+    Attributes
+    ----------
+    file, digest
+        Name of the file, and SHA-256 digest of its text.
+    kinetic, potential, dissipation
+        Formulas of the energies in J and of Rayleigh's dissipation function.
+    forces
+        Formulas of generalized forces, by coordinate.
+    assembly
+        Bodies, joints, springs, dampers, forces and loops; None if there are none.
+    places
+        Lines of all keys in the file.
+    warnings
+        Problems that are not errors.
+    used
+        For each name, the keys of the formulas that use it.
     """
 
     name: str

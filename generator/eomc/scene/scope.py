@@ -30,9 +30,10 @@ Path = tuple[str, ...]
 
 
 def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
-    """Evaluate a formula with the values in `known`, by name.
+    """Evaluate a formula and return a pair (value, reason).
 
-    Returns the value and "", or nan and the reason why the formula has no real, finite value.
+    known: dict from each name that the formula may use to its value. The reason is "" if the value
+    is real and finite. Otherwise the value is nan and the reason states what is wrong.
     """
     try:
         value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
@@ -51,9 +52,10 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
 
 
 def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
-    """Yield each cycle of names that depend on one another, its first name repeated at the end.
+    """Yield each cycle of names whose definitions depend on one another.
 
-    `graph` maps each name to those it depends on; the cycles found are removed from it.
+    A cycle is a list of names in which the first name is repeated at the end. graph: dict from each
+    name to the names on which it depends. The dict is changed: cycles that were found are removed.
     """
     while True:
         try:
@@ -121,8 +123,8 @@ class Checker:
     ) -> None:
         """Add a problem with the entry at `path` to `problems`.
 
-        at: the faulty part of the formula `text`. severity: "error" or "warning". A problem that
-        several copies of a repeated entry have is added once.
+        text: text of the faulty formula. at: the faulty part of this text. severity: "error" or
+        "warning". If several copies of a repeated entry have the same problem, it is added once.
         """
         self.faults += severity == "error"
         origin = self.places.origin(path)
@@ -132,9 +134,10 @@ class Checker:
             self.problems.append(self.places.problem(path, message, at, text, severity))
 
     def parse(self, path: Path, value: float | str) -> Formula | None:
-        """Parse the number or formula at `path` and return the formula; its names are not checked.
+        """Parse an entry of the scene and return its formula, without checking its names.
 
-        If its syntax is not permitted, report the error and return None.
+        path: keys of the entry. value: the entry, a number or the text of a formula. If the syntax
+        of the formula is not permitted, report the error and return None.
         """
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
@@ -158,9 +161,10 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> Formula | None:
-        """Parse the number or formula at `path`, check its names, and return the formula.
+        """Parse an entry of the scene, check the names in its formula, and return the formula.
 
-        allowed: the names that it may use, by default all names known so far. rule: describes these
+        path: keys of the entry. value: the entry, a number or the text of a formula. allowed: the
+        names that the formula may use, by default all names known so far. rule: describes these
         names in the message of an error. After an error, report it and return None.
         """
         formula = self.parse(path, value)
@@ -173,9 +177,11 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> bool:
-        """Return True if the formula at `path` uses only permitted names, else report the errors.
+        """Return True if a formula uses only permitted names; else report the errors.
 
-        allowed, rule: as in `formula`. Calls dot(...) must also have a rate that can be computed.
+        path: keys of the formula's entry in the scene. allowed: the permitted names, by default all
+        names known so far. rule: describes these names in the message of an error. It is also an
+        error if the time derivative dot(...) of an expression can't be computed.
         """
         before = self.faults
         for node in formula.names():
@@ -265,10 +271,11 @@ class Checker:
         return min(parts_of_kind, key=lambda part: part.col_offset, default=formula.tree)
 
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
-        """Return the value of the formula at `path`, for the values in `known` by name.
+        """Return the value of a formula.
 
-        If it has no finite value, report this and return nan. The result is also nan if the formula
-        is None or uses a value that is nan; nothing is reported then.
+        path: keys of the formula's entry in the scene. known: dict from each name that the formula
+        may use to its value. If the formula has no finite value, report this and return nan. If the
+        formula is None or uses a value that is nan, return nan without a report.
         """
         if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
             return math.nan  # reported already
@@ -278,10 +285,10 @@ class Checker:
         return value
 
     def check_smooth(self, path: Path, formula: Formula) -> None:
-        """Report calls of sign and heaviside in a formula that is going to be differentiated.
+        """Report calls of sign and heaviside in a formula that will be differentiated.
 
-        The definitions that the formula uses are checked too. Arguments that do not depend on time
-        or on the state are permitted.
+        These functions are discontinuous. Calls whose arguments depend neither on time nor on the
+        state are permitted. The definitions that the formula uses are checked too.
         """
         queue = [(path, formula)]
         visited: set[str] = set()

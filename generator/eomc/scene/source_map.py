@@ -86,18 +86,20 @@ class SourceMap:
         return start, {}
 
     def rename(self, written: Path, intended: Path) -> None:
-        """Make the lines of a misspelt key `written` also those of the key `intended`.
+        """Record that a key was misspelt, so that errors at the intended key show its line.
 
-        This includes all keys below it. Both arguments are paths.
+        written: path of the misspelt key in the file. intended: path of the intended key. All keys
+        below the misspelt one are included.
         """
         for path in list(self._under.get(written[:2], ())):
             if path[: len(written)] == written:
                 self._place_like(intended + path[len(written) :], path)
 
     def repeat(self, entry: Path, copies: Sequence[Path]) -> None:
-        """Make the lines of a repeated entry, and of all keys below it, those of its copies.
+        """Record the copies of a repeated entry, so that errors in a copy show the entry's line.
 
-        entry: path of the entry as written. copies: paths of the entries that repetition made.
+        entry: path of the entry as written in the file. copies: paths of the entries into which it
+        was expanded. All keys below the entry are included.
         """
         under = list(self._under.get(entry, ()))
         name_path = (*entry, "name")
@@ -115,13 +117,18 @@ class SourceMap:
         self._key.setdefault(new, self._key.get(written, written[-1]))
 
     def rewrite(self, text: str, written: str) -> None:
-        """Record that a text produced by repetition stands in the file as `written`."""
+        """Record the text in the file from which repetition made another text.
+
+        text: a formula in a copy of a repeated entry. written: the formula in the file, before
+        indices were inserted.
+        """
         self._text.setdefault(text, written)
 
     def origin(self, path: Path) -> Path:
-        """Return the path of the entry in the file from which repetition made the entry `path`.
+        """Return the path of the entry in the file of which an entry is a copy.
 
-        An entry that is not a copy has its own path as origin.
+        path: path of an entry after repeated entries were expanded. It is returned unchanged if the
+        entry is not a copy.
         """
         return self._from.get(path[:2], path[:2]) + path[2:]
 

@@ -11,7 +11,8 @@ from eomc.scene.scope import Checker
 def repair(tree: dict[str, Any], check: Checker) -> None:
     """Report unknown tables that newcomers often write, and remove them from the tree of a scene.
 
-    If a valid table was probably meant, their entries are moved there, so that they can be checked.
+    If an unknown table probably stands for a valid one, its entries are moved to the valid table,
+    so that they can be checked. check: object that collects the errors.
     """
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
         if match := messages.merge_array(name, tree[name]):
