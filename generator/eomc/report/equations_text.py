@@ -220,10 +220,11 @@ def environment_bodies(equations: Derived) -> list[str]:
 
 
 def latex_lines(equations: Derived) -> tuple[list[str], list[str]]:
-    """Return LaTeX lines: those of the equations of motion, and those of all other formulas.
+    """Return the equations as a pair of lists of LaTeX lines.
 
-    The equations of motion include constraints and abbreviations; the other formulas are energies,
-    matrices and outputs. A line that continues the previous one begins with CONTINUATION.
+    The first list contains the equations of motion with constraints and abbreviations. The second
+    contains all other formulas: energies, matrices and outputs. A line that continues the previous
+    one begins with CONTINUATION.
     """
     system, write = equations.system, Typesetter(equations.system)
     motion = []

@@ -71,8 +71,9 @@ def check_width(
 ) -> None:
     """Report an error if the entry `friction_width` is not positive or has no `friction` with it.
 
-    path: keys of the coordinate or body. value: value of the width (rad/s or m/s). width: its
-    formula. friction: the entry `friction`, None if it is missing.
+    The width is the velocity within which Coulomb friction is smoothed. path: keys of the
+    coordinate or body. value: value of the width in rad/s or m/s. width: formula of the width.
+    friction: the entry `friction`, None if it is missing.
     """
     path = (*path, "friction_width")
     if value <= 0:

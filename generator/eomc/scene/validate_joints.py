@@ -182,9 +182,10 @@ class JointChecker:
     def per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
         """Check an entry with one value for each coordinate of a joint, such as `damping`.
 
-        joint: kind of the joint. written: a number or formula for all coordinates, a tuple with one
-        for each, or None. Returns a formula for each coordinate, or () if there is no entry or
-        after an error, which is reported.
+        path: keys of the entry. joint: kind of the joint. written: the entry; one number or formula
+        for all coordinates, a tuple with one for each, or None if it is missing. Returns a tuple of
+        one formula for each coordinate. Returns () if the entry is missing. After an error, report
+        it and return ().
         """
         count, key = len(JOINTS[joint].motions), path[-1]
         if written is None:
