@@ -21,24 +21,26 @@ MAX_ERROR_RATIO = 2  # a route with more than twice the rounding error of anothe
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to compute a function: its results as atoms of `tape`, the result of one route.
+    """One way to compute a function of the generated code, as derived by one route.
 
-    A route is a method of derivation, see routes.py.
+    A route is a method of derivation, such as Lagrange's or Newton and Euler's. All expressions are
+    defined on the attribute `tape`, a list of elementary operations with named results.
 
     Attributes
     ----------
     outputs
-        The results.
+        The results of the function.
     checks
-        Pairs (pivot, diagonal entry); every pivot must be positive.
+        Pairs (pivot, diagonal entry) of a matrix factorization; every pivot must be positive.
     labels
         Names for the outputs, then for pivots and diagonal entries.
     order
-        Coordinates in order of elimination.
+        Indices of the coordinates in order of elimination.
     multipliers
         Lagrange multipliers of the constraints; for accelerations only.
     parts
-        For constraints that modes switch, see `Solution.parts`.
+        For each constraint that is active in some contact or friction modes only: the numerator and
+        the denominator of its multiplier.
     """
 
     tape: Tape
@@ -51,10 +53,10 @@ class Candidate:
 
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
-    """Return the function `name` by the route with the fewest operations.
+    """Return the function with the given name, computed by the route with the fewest operations.
 
-    Routes with significantly larger rounding errors than another are excluded. `routes` maps the
-    name of each route to its candidate.
+    A route is a method of derivation. `routes` maps the name of each route to the function that it
+    gives. Routes with significantly larger rounding errors than another are excluded.
     """
     lowered = {
         way: lower(name, r.tape, r.outputs, system.names, checks=r.checks, labels=r.labels)

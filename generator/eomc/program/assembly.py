@@ -46,14 +46,14 @@ class Start:
     Attributes
     ----------
     configuration : Configuration
-        Constraints and their derivatives at the initial coordinates.
+        The constraint equations, their Jacobian and the mass matrix at the initial coordinates.
     q : (nq,)
-        The coordinates in forty digits.
+        The initial coordinates, in forty digits.
     qd : (nq,)
-        The velocities.
+        The initial velocities.
     may_have_changed_branch : bool
-        Whether small steps from the guess did not converge but longer ones did, so that the loops
-        may be closed on another branch than that of the guess.
+        Whether the iteration converged with long steps only. The loops may then be closed in
+        another of their possible arrangements (branches) than near the given initial values.
     """
 
     configuration: Configuration
@@ -63,11 +63,11 @@ class Start:
 
 
 def assembled(system: System) -> System:
-    """Return the system with initial values that satisfy its constraints.
+    """Return a copy of the system whose initial values satisfy its constraints.
 
-    In the result, constraints that others imply are marked as redundant, and `closure` summarises
-    the assembly. A system without constraints, or one that is assembled already, is returned
-    unchanged.
+    In the copy, constraints that others imply are marked as redundant. Its attribute `closure`
+    summarises the constraints and the changes of initial values. A system without constraints, or
+    one that is assembled already, is returned unchanged.
 
     Raises
     ------

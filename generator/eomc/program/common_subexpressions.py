@@ -21,8 +21,8 @@ _Pair = tuple[str, str, Expr]  # (name, name, ratio of the second weight to the 
 def reduce_operations(d: ScheduleBuilder, ends: list[Operand]) -> None:
     """Rewrite the assignments of `d` so that the function needs fewer operations.
 
-    The results of the function are unchanged. `ends` lists them as operands, which are rewritten
-    in place.
+    `d` contains the assignments of one function, `ends` the results of the function. Both are
+    modified in place; the values of the results stay the same except for rounding.
     """
     _scale(d, ends)
     d.drop(ends)

@@ -22,10 +22,10 @@ from eomc.program.lower import lower
 
 
 def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
-    """Yield the functions that a system with constraints has in addition, if it has constraints.
+    """Yield the additional functions of a system with constraints; none without constraints.
 
-    `taken` is the candidate that was selected for the accelerations; the multipliers are computed
-    with it.
+    `derived` contains the equations of motion. `taken` is the selected computation of the
+    accelerations, which also gives the Lagrange multipliers.
     """
     system = derived.system
     if not system.constraints:
@@ -61,7 +61,8 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
 def of_rows(derived: Derivation) -> Iterator[Function]:
     """Yield the functions for residuals, Jacobian and rates of the constraint equations.
 
-    The assembly of initial values evaluates them.
+    They are used to find initial values that satisfy the constraints. `derived` contains the
+    equations of motion.
     """
     system, e = derived.system, _equations(derived)
     assert e.rows is not None
@@ -112,10 +113,22 @@ def _reactions(system: System) -> Function:
 def weighted(
     functions: Mapping[str, Function], system: System, values: Mapping[str, float]
 ) -> list[tuple[float, list[float]]]:
-    """Return (weight, gradient) of each constraint equation that is added to make D regular.
+    """Return the pairs (weight w_k, gradient a_k) with which D + sum_k w_k a_k a_k^T is regular.
 
-    With a weight w and gradient a, D + sum_k w_k a_k a_k^T is regular. The list is empty where D is
-    regular by itself. `values` contains coordinates and parameters by name. Raises as `evaluate`.
+    There is one pair for each constraint equation that is not redundant. The list is empty if the
+    mass matrix D is regular by itself.
+
+    Parameters
+    ----------
+    functions
+        Functions of the generated code by name, among them "constraint_jacobian".
+    values
+        Coordinates and parameters by name.
+
+    Raises
+    ------
+    ArithmeticError, ValueError
+        If an entry of the Jacobian is not a finite real number.
     """
     closure = system.closure
     if closure is None or not closure.weights:

@@ -36,21 +36,26 @@ SAMPLE_DISTANCE = 0.1  # of these configurations, relative to the largest coordi
 
 
 def key(row: Constraint) -> str:
-    """Return the key of a constraint in its scene (TOML file), such as "loop.knee"."""
+    """Return the key under which a constraint stands in the scene, such as "loop.knee".
+
+    The scene is the TOML file that describes the system.
+    """
     return f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
 
 
 def of_positions(
     manifold: Manifold, free: Flags, configuration: Configuration
 ) -> Iterator[Problem]:
-    """Yield the problem that explains why no positions satisfy the constraints.
+    """Yield error messages that explain why no positions satisfy the constraints.
 
     Parameters
     ----------
+    manifold
+        The constraint equations of the system, for evaluation.
     free
         For each coordinate, whether its initial value may change.
     configuration
-        Where the assembly of initial values ended.
+        The last configuration of the search for consistent initial values, which failed.
     """
     system = manifold.system
     step = TangentSpace(configuration, free, manifold.holonomic).truncated_correction(
@@ -112,16 +117,20 @@ def of_positions(
 def of_rates(
     manifold: Manifold, free: Flags, place: Configuration, q: Sequence[Any], rates: Vector
 ) -> Iterator[Problem]:
-    """Yield the problem that explains why the initial velocities violate the constraints.
+    """Yield error messages that explain why no initial velocities satisfy the constraints.
 
     Parameters
     ----------
+    manifold
+        The constraint equations of the system, for evaluation.
     free
         For each coordinate, whether its initial velocity may change.
     place
-        The configuration at the start, with the coordinates `q` in forty digits.
+        The initial configuration.
+    q
+        The initial coordinates in forty digits.
     rates
-        Velocities with the smallest residual.
+        The velocities for which the residual of the velocity constraints is smallest.
     """
     system = manifold.system
     if clash := _inconsistent_set(manifold, place):
@@ -258,8 +267,8 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Configuration) -> boo
 def powers(system: System) -> list[int]:
     """Return the indices of constraints whose gradient vanishes wherever they are satisfied.
 
-    They are recognised by their formulas: powers above 1, sums of even powers with coefficients of
-    one sign, and expanded powers.
+    An example is x^2 = 0. Such constraints are recognised by their formulas: powers above 1, sums
+    of even powers with coefficients of one sign, and expanded powers.
     """
     indices, coordinates = [], {*system.q}
     for k, c in enumerate(system.constraints):
@@ -278,9 +287,10 @@ def powers(system: System) -> list[int]:
 
 
 def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
-    """Yield a problem for each constraint in `flat`, whose gradient vanishes where it holds.
+    """Yield an error message for each constraint whose gradient vanishes where it is satisfied.
 
-    If `flat` is empty, one problem covers all constraints.
+    `flat` contains the indices of these constraints. If `flat` is empty, a single message about all
+    constraints is yielded.
     """
     for row in [system.constraints[k] for k in flat]:
         base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
@@ -301,9 +311,9 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
 
 
 def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration) -> Problem:
-    """Return a problem for coordinates that move without inertia and without a constraint on them.
+    """Return an error message about coordinates that neither inertia nor a constraint determines.
 
-    `massless` contains the indices of the coordinates.
+    `massless` contains the indices of the coordinates, `start` is the initial configuration.
     """
     system, random = manifold.system, np.random.default_rng(7)
     names = [system.coordinates[k].name for k in massless]
@@ -327,7 +337,10 @@ def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration
 
 
 def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
-    """Yield a problem for each constraint or energy that has no value, or no gradient, at `q`."""
+    """Yield an error message for each constraint or energy that is not finite at `q`, (nq,).
+
+    A message is also yielded if its gradient is not finite.
+    """
     system, count = manifold.system, 0
     for k, c in enumerate(system.constraints):
         manifold_of_one = Manifold(replace(system, constraints=(c,)))

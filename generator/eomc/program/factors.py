@@ -13,12 +13,12 @@ MAX_DEGREE = 60  # of a polynomial that is factored
 
 
 def has_only_repeated_factors(formula: Expr, moving: Set[Expr]) -> bool:
-    """Return True if every factor of a formula that depends on `moving` occurs at least twice.
+    """Return True if every factor of a polynomial occurs at least twice, as in (x - y)^2.
 
-    The formula is restricted to a random line through the space of its variables and function
-    values. Different factors remain different there with probability 1 (Hilbert's irreducibility
-    theorem), and square-free decomposition of a polynomial in one variable is cheap. Expanded sums
-    of squares and polynomials of high degree are not detected.
+    Factors that do not depend on the variables `moving` are ignored. The variables are replaced by
+    points of a random line, which gives a polynomial in one variable. Different factors remain
+    different with probability 1 (Hilbert's irreducibility theorem). Expanded sums of squares and
+    polynomials of high degree are not detected.
     """
     try:
         _, factors = _Line(moving).restrict(formula).sqf_list()

@@ -49,23 +49,26 @@ def _many_digits() -> Mapping[str, Callable[..., Any]]:
 def evaluate(
     function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
 ) -> tuple[list[float], bool]:
-    """Return the results of a function at one state, and whether its matrix is regular there.
+    """Return the results of a function of the generated code at one state, computed in Python.
 
     Parameters
     ----------
+    function
+        The function, as a list of assignments.
     values
         Coordinates, velocities, parameters, inputs and t by name.
     exact
-        Compute in 40 digits and round the results, instead of in doubles.
+        If True, compute in 40 digits and round the results to doubles; else compute in doubles.
     unit
-        Unit of rounding, from which the tolerance of the pivots follows.
+        Unit of rounding, such as 2^-52 for doubles. The tolerance of the pivots is a multiple of
+        it.
 
     Returns
     -------
     results : list of float
         The outputs.
     regular : bool
-        Whether all pivots are positive beyond rounding errors.
+        Whether all pivots of the matrix that the function factors exceed their rounding errors.
 
     Raises
     ------
@@ -78,10 +81,10 @@ def evaluate(
 def evaluator(
     function: Function, exact: bool = False, unit: float = 2.0**-52
 ) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
-    """Return a function of `values` with the results of `evaluate`.
+    """Return a Python function that maps `values` to the results of `evaluate(function, values)`.
 
-    It is faster than `evaluate` for many states, since the numbers in `function` are converted
-    once.
+    For many states this is faster than `evaluate`, since the numbers in `function` are converted
+    only once. The arguments are those of `evaluate`.
     """
     run, atom = _steps(function, _many_digits() if exact else _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
@@ -89,7 +92,10 @@ def evaluator(
     tolerance = 8 * unit * max(1, len(checks))
 
     def evaluate_at(values: Mapping[str, float]) -> tuple[list[float], bool]:
-        """Return the results at one state, and whether all pivots are positive beyond rounding."""
+        """Return the results of `function` at one state, and whether all its pivots are positive.
+
+        A pivot of the matrix that `function` factors must exceed its rounding error.
+        """
         known = run(values)
         try:
             results = [float(c * known[n]) for c, n in outputs]
@@ -106,17 +112,17 @@ def evaluator(
 
 
 def exact_evaluator(function: Function) -> Callable[[Mapping[str, Any]], list[Any]]:
-    """Return a function that computes the results of `function` in 40 digits, not rounded.
+    """Return a Python function that computes the results of `function` in 40 digits, not rounded.
 
-    It takes values by name, which are floats or mpmath numbers. It raises ArithmeticError or
-    ValueError if a result is not a finite real number.
+    The argument of the returned function maps names to values, floats or mpmath numbers. It raises
+    ArithmeticError or ValueError if a result is not a finite real number.
     """
     mp = context()
     run, atom = _steps(function, _many_digits())
     outputs = [atom(o) for o in function.outputs]
 
     def evaluate_at(values: Mapping[str, Any]) -> list[Any]:
-        """Return the results at one state, in 40 digits."""
+        """Return the results of `function` at the state `values`, as numbers of 40 digits."""
         known = run(values)
         results = [mp.mpmathify(c * known[n]) for c, n in outputs]
         if not all(isinstance(x, mp.mpf) and mp.isfinite(x) for x in results):
@@ -173,18 +179,23 @@ def _call(known: Mapping[str, Any], operation: Callable[..., Any], args: Sequenc
 
 
 def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], list[float]]:
-    """Return a function that bounds the rounding error of each result, in units of rounding.
+    """Return a Python function that bounds the rounding errors of the results of `function`.
 
-    It takes values by name. To first order, the bound is sum |d result/d v| |v| over all inputs,
-    numbers, terms of sums and intermediate values v (Higham, *Accuracy and Stability of Numerical
-    Algorithms*, sec. 3.1), computed by one reverse pass per result. It raises as `evaluate`.
+    The argument of the returned function maps names to values. It returns one bound for each
+    result, in units of rounding (2^-52 for doubles). To first order, the bound is the sum of
+    |d result/d v| |v| over all inputs, numbers, terms of sums and intermediate values v (Higham,
+    *Accuracy and Stability of Numerical Algorithms*, sec. 3.1). It raises ArithmeticError or
+    ValueError if a result is not a finite real number.
     """
     run, atom = _steps(function, _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
     steps = [(a.name, *_linearize(a.value)) for a in (*function.early, *function.body)]
 
     def bound(known: Mapping[str, float], coefficient: float, name: str) -> float:
-        """Return the bound of the rounding error of the result coefficient * (value of `name`)."""
+        """Return a bound of the rounding error of a result, in units of rounding.
+
+        The result is `coefficient` times the value `name`; `known` contains all values by name.
+        """
         slopes, total = {name: coefficient}, 0.0
         for value, size, partials in reversed(steps):
             slope = slopes.pop(value, 0.0)
@@ -195,7 +206,10 @@ def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], li
         return total + sum(abs(slope * known[n]) for n, slope in slopes.items())
 
     def evaluate_at(values: Mapping[str, float]) -> list[float]:
-        """Return the bound of each result's rounding error at one state, in units of rounding."""
+        """Return a bound of the rounding error of each result of `function` at the state `values`.
+
+        The bounds are in units of rounding.
+        """
         known = run(values)
         bounds = [bound(known, c, n) for c, n in outputs]
         if not all(map(math.isfinite, bounds)):
@@ -253,8 +267,8 @@ def _linearize(
 def nearby(system: System, k: int) -> dict[str, float]:
     """Return the values of parameters, coordinates, velocities and t at the k-th test state.
 
-    The keys are their names. State 0 is the start; the others lie around it, farther away for
-    larger k.
+    The keys are the names of these quantities. State 0 is the initial state. The other states lie
+    around it, farther away for larger k; parameters and t are the same in all of them.
     """
     out = {p.name: p.value for p in system.parameters} | {t.name: 0.0}
     for i, c in enumerate(system.coordinates):
