@@ -13,9 +13,10 @@ MAX_DEGREE = 60  # of a polynomial that is factored
 
 
 def has_only_repeated_factors(formula: Expr, moving: Set[Expr]) -> bool:
-    """Return True if every factor of a polynomial occurs at least twice, as in (x - y)^2.
+    """Return True if every factor of a formula occurs at least twice, as in (x - y)^2.
 
-    Factors that do not depend on the variables `moving` are ignored. The variables are replaced by
+    Factors that do not depend on the variables `moving` are ignored. The formula is a polynomial in
+    the variables and in function values such as sin(x), which count as variables. All are set to
     points of a random line, which gives a polynomial in one variable. Different factors remain
     different with probability 1 (Hilbert's irreducibility theorem). Expanded sums of squares and
     polynomials of high degree are not detected.

@@ -182,10 +182,10 @@ def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], li
     """Return a Python function that bounds the rounding errors of the results of `function`.
 
     The argument of the returned function maps names to values. It returns one bound for each
-    result, in units of rounding (2^-52 for doubles). To first order, the bound is the sum of
-    |d result/d v| |v| over all inputs, numbers, terms of sums and intermediate values v (Higham,
-    *Accuracy and Stability of Numerical Algorithms*, sec. 3.1). It raises ArithmeticError or
-    ValueError if a result is not a finite real number.
+    result, in units of rounding. To first order, the bound is the sum of |d result/d v| |v| over
+    all inputs, numbers, terms of sums and intermediate values v (Higham, *Accuracy and Stability of
+    Numerical Algorithms*, sec. 3.1). The function raises ArithmeticError or ValueError if a result
+    is not a finite real number.
     """
     run, atom = _steps(function, _DOUBLES)
     outputs = [atom(o) for o in function.outputs]

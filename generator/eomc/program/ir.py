@@ -16,9 +16,9 @@ from eomc.derive.tape import Stage
 
 @dataclass(frozen=True)
 class Sum:
-    """A right-hand side: a constant plus a sum of products of a coefficient and a name.
+    """The right-hand side of an assignment: constant + sum of coefficient * value.
 
-    `terms` contains the pairs (coefficient, name).
+    `terms` contains a pair (coefficient, name of the value) for each term.
     """
 
     terms: tuple[tuple[Expr, str], ...]
@@ -26,15 +26,15 @@ class Sum:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names in the sum, repeated as often as they occur."""
+        """The names of the values in the sum, repeated as often as they occur."""
         return tuple([n for _, n in self.terms])
 
 
 @dataclass(frozen=True)
 class Product:
-    """A right-hand side: coefficient times a product of names.
+    """The right-hand side of an assignment: coefficient * product of values.
 
-    Integer powers are written as repeated names.
+    `factors` contains the names of the values. For an integer power, the name is repeated.
     """
 
     coefficient: Expr
@@ -42,15 +42,17 @@ class Product:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names in the product, repeated as often as they occur."""
+        """The names of the values in the product, repeated as often as they occur."""
         return self.factors
 
 
 @dataclass(frozen=True)
 class Call:
-    """A right-hand side: a function of operands.
+    """The right-hand side of an assignment: a function of operands.
 
-    `function` is "reciprocal", "sqrt", "pow", "pivot_inverse" or one of the functions of scenes.
+    `function` is "reciprocal", "sqrt", "pow", "pivot_inverse" (1/pivot, or 0 for a pivot that is
+    too small), or a function that formulas of scenes may contain, such as "sin". `args` contains
+    the operands.
     """
 
     function: str
@@ -64,7 +66,11 @@ class Call:
 
 @dataclass(frozen=True)
 class Operand:
-    """A coefficient times a name, as an argument or a result. A number alone has an empty name."""
+    """A coefficient times a value, as an argument or a result of a function.
+
+    `name` is the name of the value. If the operand is a number, `name` is empty and the coefficient
+    is the number.
+    """
 
     coefficient: Expr
     name: str = ""
@@ -75,14 +81,17 @@ Value = Sum | Product | Call
 
 @dataclass(frozen=True)
 class Assignment:
-    """A statement "name = value" of a function.
+    """A statement "name = value" of a generated function.
 
     Attributes
     ----------
+    value
+        The right-hand side.
     stage
-        The binding time: when the value can be computed, see `Stage`.
+        The binding time: when the value can be computed, for example once for each set of
+        parameters, or from q.
     named
-        Whether the name is meaningful to a reader.
+        Whether the name is meaningful to a reader, unlike w1, w2, ...
     """
 
     name: str
@@ -95,8 +104,9 @@ class Assignment:
 class Cost:
     """Number of operations of one call of a function.
 
-    Operations that depend on parameters only are not counted, since they are precomputed. `calls`
-    counts square roots and other functions of the mathematics library.
+    Operations that depend on parameters only are precomputed and not counted. `sincos` counts
+    pairs of sine and cosine of the same angle, `calls` counts square roots and other functions of
+    the mathematics library.
     """
 
     adds: int = 0
@@ -135,11 +145,14 @@ class Function:
     outputs
         The results; matrices by rows.
     checks
-        Pairs (pivot, diagonal entry); all pivots must be positive.
+        Pairs (pivot, diagonal entry) of a matrix factorization; the function fails unless all
+        pivots are positive.
     cost
         Number of operations of one call.
-    route, routes
-        The method of derivation (route) that was selected, and the cost with each route.
+    route
+        The method of derivation (route) that was selected.
+    routes
+        The name of each possible route, with the cost of the function that it gives.
     """
 
     name: str
@@ -161,7 +174,10 @@ class Function:
 
 
 def rename(function: Function, new_names: Mapping[str, str]) -> Function:
-    """Return the function with its values renamed: `new_names` maps old names to new ones."""
+    """Return a copy of the function in which values have other names.
+
+    `new_names` maps old names to new ones. Names that are absent from it are unchanged.
+    """
 
     def new_name(name: str) -> str:
         return new_names.get(name, name)
@@ -185,7 +201,7 @@ def rename(function: Function, new_names: Mapping[str, str]) -> Function:
 
 
 def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
-    """Return a right-hand side with each of its names replaced by `real(name)`."""
+    """Return a copy of a right-hand side in which each name is replaced by `real(name)`."""
     if isinstance(value, Sum):
         return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
     if isinstance(value, Product):

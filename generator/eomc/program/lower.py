@@ -24,19 +24,25 @@ def lower(
     checks: Sequence[tuple[Expr, Expr]] = (),
     labels: Sequence[str] = (),
 ) -> Function:
-    """Return the function that computes `outputs`, the atoms of a tape, as a list of assignments.
+    """Return a function of the generated code, as the list of assignments that compute its results.
 
     Parameters
     ----------
     name
         Name of the function.
+    tape
+        The elementary operations from which the assignments are made.
+    outputs
+        The results: numbers, names on the tape, or numbers times names.
     reserved
-        Names that no value may have. They include names that the function does not read, since
-        values of several functions may share a struct with parameters.
+        Names that no value may have. Names that the function does not read are included, since
+        values of several functions may be members of the same struct as parameters.
     checks
-        Pairs (pivot, diagonal entry) of atoms; the function fails unless all pivots are positive.
+        Pairs (pivot, diagonal entry), in the form of `outputs`. The function fails unless all
+        pivots are positive.
     labels
-        Names for the outputs, then for pivots and diagonal entries, where they have none.
+        Preferred names for the outputs, then for pivots and diagonal entries. They are used for
+        values that have no name in the scene.
     """
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
     work = _Reader(tape)

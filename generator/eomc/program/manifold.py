@@ -49,7 +49,7 @@ def _max_abs(x: Vector) -> float:
 
 @dataclass(frozen=True)
 class Configuration:
-    """The constraint equations of a system at the coordinates `q` and the time `t`.
+    """The constraint equations of a system, evaluated at the coordinates `q` and the time `t`.
 
     Attributes
     ----------
@@ -89,7 +89,10 @@ class Configuration:
 
     @property
     def weights(self) -> Vector:
-        """Weight (m,) of each constraint equation in `metric` if D is singular, a power of 2."""
+        """Weight of each constraint equation in the property `metric`, (m,); powers of 2.
+
+        The weights are used if D is singular.
+        """
         diagonal, size = np.diag(self.D), np.sum(self.A**2, axis=1)
         known = diagonal > 0
         mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
@@ -99,15 +102,17 @@ class Configuration:
     def metric(self) -> Vector:
         """The matrix (nq, nq) that defines lengths of directions in coordinate space.
 
-        It is D, or D + sum_r weights[r] A_r^T A_r where D is singular.
+        The metric is the mass matrix D. If D is singular, it is D + sum_r weights[r] A_r^T A_r with
+        the row A_r of the Jacobian for constraint r.
         """
         return self.metric_of(range(len(self.A)))
 
     def metric_of(self, rows: Sequence[int]) -> Vector:
-        """Return `metric` with the weights of the constraint equations `rows` only.
+        """Return the matrix `metric` (nq, nq) with the weights of some constraint equations only.
 
-        The minimum-norm direction d with prescribed A d for these equations does not depend on
-        their weights; weights of other equations would change it.
+        `rows` contains the indices of these equations. The shortest direction d with a prescribed
+        A d for the equations does not depend on their weights. It would depend on the weights of
+        other equations.
         """
         D, A = (self.D + self.D.T) / 2, self.A[rows]
         if not self.singular:
@@ -119,9 +124,10 @@ class Configuration:
 
     @cached_property
     def sizes(self) -> Vector:
-        """The scale sqrt(A D^-1 A^T) (m,) of each constraint equation; 1 where that is 0.
+        """The scale sqrt(a D^-1 a^T) of each constraint equation with the gradient a, (m,).
 
-        It is the inverse of the root of the equation's effective mass.
+        It is the inverse square root of the effective mass of the constraint. The scale is 1 if the
+        gradient is 0. If D is singular, `metric` takes its place.
         """
         B = np.linalg.solve(np.linalg.cholesky(self.metric), self.A.T)
         sizes = np.sqrt(np.sum(B**2, axis=0))
@@ -129,12 +135,15 @@ class Configuration:
 
     @property
     def slopes(self) -> Vector:
-        """The norm sqrt(A D^-1 A^T) (m,) of each constraint equation's gradient."""
+        """The norm sqrt(a D^-1 a^T) of the gradient a of each constraint equation, (m,).
+
+        If D is singular, `metric` takes its place.
+        """
         return np.where(np.any(self.A != 0, axis=1), self.sizes, 0.0)
 
     @cached_property
     def levels(self) -> Vector:
-        """The change (m,) of each residual if every coordinate changes by its own magnitude."""
+        """The order of magnitude of each constraint's change if each q_i changes by |q_i|, (m,)."""
         scale = np.sqrt(np.diag(self.metric))
         return self.sizes * float(np.linalg.norm(scale * self.q) + 1e-3 * np.max(scale))
 
@@ -145,9 +154,11 @@ class Configuration:
 
 
 class TangentSpace:
-    """Directions of the `free` coordinates along which the constraints `rows` stay satisfied.
+    """The directions of motion along which the given constraints stay satisfied to first order.
 
-    Lengths are in the metric of the configuration.
+    `configuration` is the point of the space of coordinates, `free` marks the coordinates that may
+    change, and `rows` contains the indices of the constraints. The length of a direction d is
+    sqrt(d^T M d), where M is the `metric` of the configuration.
     """
 
     def __init__(self, configuration: Configuration, free: Flags, rows: Sequence[int]) -> None:
@@ -161,7 +172,8 @@ class TangentSpace:
     def parts(self) -> tuple[Vector, Vector, Vector]:
         """The singular value decomposition (U, s, V^T) of B = U diag(s) V^T.
 
-        B is the Jacobian of the scaled constraint equations, in an orthonormal basis of the metric.
+        B is the Jacobian of the constraint equations, each divided by its scale, with respect to
+        coordinates in which the metric is the identity.
         """
         U, s, V = np.linalg.svd(self.B, full_matrices=False)
         return np.asarray(U), np.asarray(s), np.asarray(V)
@@ -180,38 +192,46 @@ class TangentSpace:
     def correction(self, values: Vector, damping: float = 0.0) -> Vector:
         """Return the minimum-norm direction (nq,) along which the residuals change by -values.
 
-        `values` contains a residual for each constraint equation of the system. A positive damping
-        shortens the direction where the gradients are nearly dependent.
+        `values` contains a residual for each constraint equation of the system. A positive
+        `damping` makes the direction shorter if the gradients are nearly dependent.
         """
         aim = values[self.rows] / self.configuration.sizes[self.rows]
         return -self._from_metric(self.B.T @ self._inverse(aim, damping))
 
     def truncated_correction(self, values: Vector) -> Vector:
-        """Return the minimum-norm direction (nq,) along which the residuals change best by -values.
+        """Return the direction (nq,) along which residuals change by -values, by least squares.
 
-        `values` contains a residual for each constraint equation of the system. The least-squares
-        solution is found by a singular value decomposition, without its smallest singular values.
+        `values` contains a residual for each constraint equation of the system. Of all
+        least-squares solutions the shortest is returned. It is computed by a singular value
+        decomposition in which the smallest singular values are left out.
         """
         U, s, V = self.parts
         aim = values[self.rows] / self.configuration.sizes[self.rows]
         return -self._from_metric(V.T @ (U.T @ aim / np.where(s > RANK_TOLERANCE, s, np.inf)))
 
     def projected(self, direction: Vector) -> Vector:
-        """Return the projection (nq,) of a direction onto the tangent space, in the metric."""
+        """Return the direction (nq,) in the tangent space that is closest to `direction`, (nq,).
+
+        Distances are lengths in the metric of the configuration.
+        """
         y = self.L.T @ direction[self.free]
         for _ in range(2):
             y = y - self.B.T @ self._inverse(self.B @ y, 0.0)
         return self._from_metric(y)
 
     def length(self, direction: Vector) -> float:
-        """Return the length of a direction (nq,), in the metric; only free coordinates count."""
+        """Return the length of a direction (nq,) in the metric of the configuration.
+
+        Components along coordinates that are not free are ignored.
+        """
         return float(np.linalg.norm(self.L.T @ direction[self.free]))
 
 
 class Manifold:
-    """The constraint equations of a system, evaluated at the default values of its parameters.
+    """Methods that evaluate and solve the constraint equations of a system.
 
-    The set of coordinates that satisfy them is the constraint manifold.
+    The parameters have their default values. The set of all coordinates that satisfy the equations
+    is the constraint manifold.
     """
 
     def __init__(self, system: System) -> None:
@@ -237,7 +257,7 @@ class Manifold:
 
     @cached_property
     def reads(self) -> Flags:
-        """Whether each constraint depends on each coordinate or its velocity, (m, nq)."""
+        """Flags (m, nq): whether constraint i depends on coordinate j or its velocity."""
         outputs = self.functions["constraint_jacobian"].outputs
         return np.array([o.coefficient != 0 for o in outputs]).reshape(len(self.rows), -1)
 
@@ -246,9 +266,10 @@ class Manifold:
         return {**self._fixed, t.name: time, **moving}
 
     def value(self, name: str, q: Vector, qd: Vector, time: float) -> Vector:
-        """Return the results of the function `name` at a state, in doubles.
+        """Return the results of the generated function with the given name at a state, in doubles.
 
-        They are NaN if the function has no value there.
+        `name` is that of a function such as "constraints" or "D". All results are NaN if the
+        function cannot be evaluated at the state.
         """
         if name not in self._plain:
             self._plain[name] = evaluator(self.functions[name])
@@ -258,9 +279,10 @@ class Manifold:
             return np.full(len(self.functions[name].outputs), np.nan)
 
     def exact_value(self, name: str, q: Sequence[Any], qd: Sequence[Any], time: float) -> list[Any]:
-        """Return the results of the function `name` at a state, in forty digits.
+        """Return the results of the generated function with the given name, in forty digits.
 
-        Raises ArithmeticError or ValueError if the function has no value there.
+        `name` is that of a function such as "constraints". Raises ArithmeticError or ValueError if
+        the function cannot be evaluated at the state.
         """
         if name not in self._exact:
             self._exact[name] = exact_evaluator(self.functions[name])
@@ -268,12 +290,15 @@ class Manifold:
         return values
 
     def has_values(self, q: Vector, time: float = 0.0) -> bool:
-        """Return True if the constraints, their Jacobian and D are finite at q and a time."""
+        """Return True if constraints, their Jacobian and the mass matrix are finite at q and t."""
         names = ("constraints", "constraint_jacobian", "D")
         return all(np.all(np.isfinite(self.value(name, q, 0 * q, time))) for name in names)
 
     def configuration(self, q: Vector, time: float = 0.0) -> Configuration | None:
-        """Return the constraint equations at q and a time; None where a function has no value."""
+        """Return the constraint equations, their Jacobian and the mass matrix at `q` and `time`.
+
+        None is returned if one of them is not finite.
+        """
         n, rest, phi = len(q), np.zeros(len(q)), self._residuals(q, time)
         A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
         for rows, vector, slopes in self._rotation_vectors(q, time):
@@ -294,7 +319,10 @@ class Manifold:
 
     @cached_property
     def typical_gradients(self) -> Vector:
-        """Largest Euclidean norm (m,) of each constraint's gradient at states near the start."""
+        """The typical norm of the gradient of each constraint, (m,).
+
+        It is the largest Euclidean norm of the gradient at several random positions near the start.
+        """
         random, n = np.random.default_rng(3), len(self.system.q)
         start = np.array([c.start for c in self.system.coordinates])
         norms = np.zeros((NEARBY_SAMPLES, len(self.rows)))
@@ -339,10 +367,10 @@ class Manifold:
             yield list(rows), e, J
 
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
-        """Return the first-order rounding error (m,) of each result of the function `name`.
+        """Return first-order rounding errors of the constraint residuals at a state, (m,).
 
-        These are the residuals of the constraints, or their rates for "constraint_rates". All
-        errors are 0 if the function has no value there.
+        `name` is the generated function whose results are considered: "constraints" for residuals,
+        "constraint_rates" for their rates. All errors are 0 if the function cannot be evaluated.
         """
         if name not in self._rounding:
             self._rounding[name] = rounding_evaluator(self.functions[name])
@@ -357,7 +385,7 @@ class Manifold:
     ) -> tuple[Configuration | None, bool]:
         """Solve the holonomic constraints for the free coordinates by a damped Gauss-Newton method.
 
-        Steps are of minimum norm in the metric of D.
+        Each step is the shortest one, where D defines lengths.
 
         Parameters
         ----------
@@ -366,13 +394,14 @@ class Manifold:
         free : (nq,)
             For each coordinate, whether it may change.
         strict : bool
-            Shorten steps until the residuals follow their tangent to MAX_NONLINEARITY, so that the
-            iteration stays on the branch of `q`; otherwise only until the residuals decrease.
+            If True, steps are shortened until the residuals change nearly linearly along them, so
+            that the iteration stays on the branch of solutions near `q`. If False, steps are
+            shortened only until the residuals decrease.
 
         Returns
         -------
         configuration : Configuration or None
-            The last configuration; None without values at q.
+            The last configuration; None if the constraints cannot be evaluated at q.
         converged : bool
             Whether the iteration converged.
         """
@@ -407,7 +436,7 @@ class Manifold:
         return configuration, False
 
     def rounded(self, configuration: Configuration) -> bool:
-        """Return True if the residuals are within the rounding errors of doubles."""
+        """Return True if the residuals of a configuration do not exceed their rounding errors."""
         off, limit = np.abs(configuration.phi), EPS * configuration.levels
         if not np.all(off <= ROUNDING_FACTOR * limit):
             limit = np.maximum(
@@ -438,10 +467,11 @@ class Manifold:
     def closest_configuration(
         self, configuration: Configuration, guess: Vector, free: Flags
     ) -> Configuration:
-        """Return the configuration on the manifold that is locally closest to a guess.
+        """Return the configuration locally closest to a guess that satisfies the constraints.
 
-        Steps go in the tangent space towards the guess, each corrected onto the manifold, until the
-        distance no longer decreases. Only the free coordinates change.
+        `configuration` satisfies the constraints, and `guess` (nq,) are the desired coordinates.
+        From the configuration, steps are made towards the guess along the constraint manifold until
+        the distance no longer decreases. Only the coordinates marked in `free` change.
         """
         for _ in range(100):
             frame = TangentSpace(configuration, free, self.holonomic)
@@ -464,9 +494,10 @@ class Manifold:
         return configuration
 
     def refine(self, configuration: Configuration, free: Flags) -> tuple[list[Any], bool]:
-        """Return q in forty digits and whether the iteration converged, from a solution in doubles.
+        """Return coordinates that satisfy the holonomic constraints to forty digits.
 
-        The free coordinates are changed so that the holonomic constraints are satisfied.
+        The iteration starts at `configuration`, a solution in doubles, and changes the coordinates
+        marked in `free`. Returns the coordinates, and whether the iteration converged.
         """
         rest = [0] * len(configuration.q)
 
@@ -484,10 +515,11 @@ class Manifold:
     def rates(
         self, configuration: Configuration, q: list[Any], qd: Vector, free: Flags
     ) -> tuple[list[Any], bool]:
-        """Return qd in forty digits, and whether the iteration converged.
+        """Return velocities that satisfy the constraints to forty digits.
 
-        The free velocities change as little as possible so that the constraints are satisfied at
-        the coordinates `q`, which are given in forty digits.
+        The velocities marked in `free` differ from `qd` as little as possible. `q` are the
+        coordinates of the configuration in forty digits. Returns the velocities, and whether the
+        iteration converged.
         """
 
         def rates(qd: list[Any]) -> list[Any]:
