@@ -18,8 +18,8 @@ def random_walk(
 ) -> Iterator[Configuration]:
     """Yield configurations that satisfy the constraints, by small steps in random directions.
 
-    At most `positions` configurations are yielded, fewer if the system cannot move. Time advances
-    too, if the constraints depend on it.
+    The walk begins at `start`. At most `positions` configurations are yielded, fewer if the system
+    cannot move. If the constraints depend on time, the time of the configurations increases.
     """
     random = np.random.default_rng(17)
     free = np.ones(len(start.q), dtype=bool)
@@ -69,10 +69,10 @@ def random_walk(
 def trace_branch(
     manifold: Manifold, start: Configuration, max_step: float = MAX_STEP, sign: int = 1
 ) -> Iterator[Configuration]:
-    """Yield configurations along a branch of the manifold, each a small step from the last.
+    """Yield configurations that satisfy the constraints, along a curve from `start`.
 
-    `sign` (1 or -1) selects the direction from the start. `max_step` limits the steps, in the units
-    of the coordinates.
+    Each configuration is a small step from the last. No coordinate changes by more than about
+    `max_step` in a step. `sign` (1 or -1) selects one of the two directions at the start.
     """
     free, configuration, step = np.ones(len(start.q), dtype=bool), start, INITIAL_STEP
     tangent = np.random.default_rng(17).normal(size=len(start.q)) / np.sqrt(np.diag(start.metric))
@@ -95,10 +95,11 @@ def trace_branch(
 def step_on_manifold(
     manifold: Manifold, place: Configuration, tangent: Vector, drift: float, free: Flags
 ) -> Configuration | None:
-    """Return the configuration after one step along `tangent`, corrected onto the manifold.
+    """Return the configuration after the step `tangent` (nq,), corrected to satisfy constraints.
 
-    None if the step may be too long to stay on the same branch. `place` is where the step begins,
-    `drift` the increase of time (s), and `free` marks the coordinates that may change.
+    The step begins at the configuration `place`. `drift` is the increase of time (s), and `free`
+    marks the coordinates that the correction may change. None is returned if the step may be too
+    long to stay on the same branch of solutions.
     """
     predicted = manifold.configuration(place.q + tangent, place.t + drift)
     if predicted is None:

@@ -63,8 +63,9 @@ def _weight(a: Assignment) -> int:
 def split(function: Function, piece: int) -> tuple[Piece, ...]:
     """Split a function into outlined functions of about `piece` operations.
 
-    Their assignments in order are those of `function`, so results are identical to the last bit.
-    Values that are passed from one to another count as named.
+    The outlined functions are called one after the other. Together they have the same assignments
+    as `function`, so that results are identical to the last bit. Values that are passed from one
+    outlined function to another are marked as named.
     """
     assignments = _paired((*function.early, *function.body))
     ends = _cuts(assignments, piece)

@@ -44,10 +44,10 @@ class Expander:
         self.symbols: dict[str, Symbol] = {}
 
     def expand(self, outputs: Sequence[Expr]) -> list[Expr] | None:
-        """Return the outputs expanded to polynomials in leaves and functions.
+        """Return the outputs, expanded to polynomials in variables and function values.
 
-        None if the polynomials become too large. sin^2 + cos^2 = 1 is applied wherever it shortens
-        a sum.
+        The identity sin^2 + cos^2 = 1 is applied wherever it shortens a sum. None is returned if
+        the polynomials become too large.
         """
         try:
             polynomials = [self.atom(output) for output in outputs]
@@ -58,7 +58,10 @@ class Expander:
         return [self.built(polynomial) for polynomial in polynomials]
 
     def short(self, atom: Expr) -> Expr:
-        """Return an atom, expanded if that leaves few terms, so that terms cancel."""
+        """Return a value on the tape in expanded form, in which terms cancel, if that is short.
+
+        Otherwise return `atom` unchanged.
+        """
         if (out := self.expand([atom])) is not None and len(self.atom(atom)) <= 8:
             return out[0]
         return atom

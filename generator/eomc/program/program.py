@@ -120,14 +120,16 @@ def build(derived: Derivation) -> Program:
 
 
 def accelerations(material: RouteInputs) -> tuple[Function, Candidate, dict[str, str]]:
-    """Return the function for the accelerations by its cheapest route.
+    """Return the function that computes the accelerations with the fewest operations.
+
+    It is selected from the routes, the methods of derivation.
 
     Returns
     -------
     function
         The function "acceleration".
     candidate
-        Its results on the tape, for functions that are derived from it.
+        The same computation as expressions on a tape, from which other functions are derived.
     passed_over
         For each route that was not used, the reason.
     """
@@ -379,7 +381,7 @@ def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[lis
     """Return the mass matrix D or the Coriolis matrix C, (nq, nq), at one state, in Python floats.
 
     `name` is "D" or "C"; `values` contains coordinates, velocities and parameters by name. Raises
-    as `evaluate`.
+    ArithmeticError or ValueError if an entry is not a finite real number.
     """
     names = [c.name for c in program.system.coordinates]
     n = len(names)

@@ -48,7 +48,7 @@ MAX_SETS = 4000  # sets that are compared; with more, constraints are dropped on
 
 @dataclass(frozen=True)
 class Ranks:
-    """The rank of a system's constraints, and the equations to solve with.
+    """The rank of a system's constraint equations, and which of them are independent.
 
     Attributes
     ----------
@@ -95,9 +95,10 @@ class Ranks:
 
 
 def ranks(manifold: Manifold, start: Configuration) -> Ranks:
-    """Return the rank of the constraints, and the equations to solve with.
+    """Return the rank of the constraint equations, and which of them are independent.
 
-    They are computed at configurations on a random walk from the assembled start.
+    The equations are evaluated at configurations on a random walk from `start`, which satisfies the
+    constraints.
     """
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)

@@ -38,9 +38,9 @@ class RouteInputs:
 
     @cached_property
     def expanded(self) -> tuple[Tape, Rows, Sequence[Expr]] | None:
-        """D and b of D qdd = b by Lagrange's method, expanded to polynomials on the tape.
+        """The tuple (tape, D by rows, b) of the equations D qdd = b by Lagrange's method.
 
-        The tape, D by rows, and b; None if they become too large.
+        D and b are expanded to polynomials. None if the polynomials become too large.
         """
         if self.lagrange is None or self.expander is None:
             return None
@@ -95,10 +95,11 @@ class Route:
     sentence
         A description for users.
     accelerations
-        Returns the solution for qdd, a str with the reason why the route is not used, or None where
-        it does not apply.
+        Function that returns the solution for qdd, a str with the reason why the route is not used,
+        or None if the route does not apply.
     functions
-        Returns the other functions; None where the route does not apply.
+        Function that returns the other functions of the motion, or None if the route does not
+        apply.
     solved
         Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system
         and the names of the coordinates in order of elimination.

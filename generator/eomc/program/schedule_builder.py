@@ -19,9 +19,9 @@ class ScheduleBuilder:
     stages
         The binding time (see `Stage`) of each name.
     hints
-        A preferred name for some of the names.
+        For some of the names: a preferred name in the generated code.
     known
-        The name of each right-hand side.
+        The name of each right-hand side; the inverse of `values`.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class ScheduleBuilder:
         self.made = 0
 
     def new(self, value: Value) -> str:
-        """Return the name of a right-hand side, adding it under a new name if it has none."""
+        """Return the name of a right-hand side. If it has none, add it under a new name."""
         if value not in self.known:
             self.made += 1
             self.put(f"_n{self.made:06d}", value)

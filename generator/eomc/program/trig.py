@@ -30,10 +30,10 @@ class Angle:
 def separate_angles(
     function: Function, coordinates: Collection[str]
 ) -> tuple[tuple[Angle, ...], Function]:
-    """Remove the sines and cosines of angles that depend on coordinates only from a function.
+    """Turn the sines and cosines of angles of a function into values that it reads.
 
-    `coordinates` are the names of the coordinates. Returns the angles, and the function, which then
-    reads the sines and cosines.
+    The angles are those that are linear in the coordinates, whose names are `coordinates`. Returns
+    the angles, and the function without the computation of their sines and cosines.
     """
     values = {a.name: a.value for a in function.body}
     by_argument: dict[tuple[Operand, ...], dict[str, str]] = {}
@@ -54,7 +54,8 @@ def separate_angles(
 def names_of_pair(names: Mapping[str, str]) -> tuple[str, str]:
     """Return the names of the sine and of the cosine of an angle.
 
-    `names` maps "sin" and "cos" to names that exist; the other one is derived from it.
+    `names` maps "sin", "cos" or both to existing names. If one of the two is missing, its name is
+    derived from the other one, as cos_theta_ from sin_theta.
     """
     sine = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
     return sine, names.get("cos") or names["sin"].replace("sin", "cos") + "_"

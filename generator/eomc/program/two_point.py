@@ -29,7 +29,9 @@ MAX_INLINED_OPERATIONS = 400  # of a step, up to which its parts are inlined
 
 @dataclass(frozen=True)
 class Parts:
-    """An acceleration split into two functions, each without assignments of parameters only.
+    """The computation of accelerations, split into position-dependent and other operations.
+
+    Operations that depend on parameters only belong to neither of the two functions.
 
     Attributes
     ----------
@@ -47,13 +49,15 @@ class Parts:
 
     @property
     def short(self) -> bool:
-        """Whether both functions are short enough to be inlined in a step."""
+        """Whether `configuration` and `velocity` are short enough to be inlined in a time step."""
         weight = 2 * outline.weight(self.configuration) + 4 * outline.weight(self.velocity)
         return weight <= MAX_INLINED_OPERATIONS
 
 
 def split(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
-    """Return an acceleration split into its parts; None where a split has no advantage.
+    """Split the computation of accelerations into a position-dependent part and the rest.
+
+    None is returned if the split has no advantage.
 
     Parameters
     ----------
