@@ -459,8 +459,8 @@ def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
 
 def test_a_function_prints_itself() -> None:
     given = (
-        c_function.filled("double", "x", "N"),
-        c_function.given("double", "y"),
+        c_function.output_array("double", "x", "N"),
+        c_function.input_array("double", "y"),
         CArgument("int", "n"),
     )
     f = CFunction(
