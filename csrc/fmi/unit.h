@@ -181,7 +181,8 @@ static UnitResult unitGet(UnitInstance *a, unsigned reference, UnitValues *v, do
         v->indicators = 1;
         *value = (double)v->z[r - unitZ];
     } else {
-        snprintf(a->message, sizeof a->message, "there is no real variable of the value reference %u",
+        snprintf(a->message, sizeof a->message,
+            "there is no real variable of the value reference %u",
             reference);
         return unitRefused;
     }
@@ -429,7 +430,8 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback r
 #endif
 
 /* A communication step. */
-static UnitResult unitCommunicate(UnitInstance *a, double t, double size, UnitEventCallback report, void *who)
+static UnitResult unitCommunicate(
+    UnitInstance *a, double t, double size, UnitEventCallback report, void *who)
 {
     const Unit *const x = &a->x;
 

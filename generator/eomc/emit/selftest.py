@@ -343,17 +343,17 @@ class _Cases:
         In the last ones, the inputs are specified; otherwise the scene's signals supply them. One
         point has the second set of parameters. Expensive systems have two points only.
         """
-        found = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
+        points = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
         if self.other_parameters:
-            found[1] = replace(
-                found[1], other=True,
-                values={**found[1].values, **{p.name: p.value for p in self.other_parameters}},
+            points[1] = replace(
+                points[1], other=True,
+                values={**points[1].values, **{p.name: p.value for p in self.other_parameters}},
             )  # fmt: skip
         if self.system.inputs:
-            found[2] = self.driven(found[2], 0.0)
+            points[2] = self.driven(points[2], 0.0)
         if "applied" in self.program:
-            found += [self.driven(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))]
-        return tuple(found) if self.is_short else (found[1], found[2])
+            points += [self.driven(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))]
+        return tuple(points) if self.is_short else (points[1], points[2])
 
     def point(self, k: int, t: float) -> Point:
         """Return the k-th test point around the initial state, at time t (s).
@@ -414,8 +414,8 @@ class _Cases:
     @property
     def arrays(self) -> tuple[tuple[str, str], ...]:
         """Name and size (C text) of each array that C test functions take besides q and qd."""
-        found = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
-        return tuple((n, found[n]) for n in ("qdd", "wrenches", "lambda") if n in found)
+        sizes = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
+        return tuple((n, sizes[n]) for n in ("qdd", "wrenches", "lambda") if n in sizes)
 
     def state(self, point: Point) -> State:
         """Return the arguments of a test call at a point, with numbers as C literals."""
@@ -523,15 +523,15 @@ class _Cases:
 
     def far(self, name: str) -> list[Case | None]:
         """Return up to three test cases of function `name` with large angles."""
-        found: list[Case | None] = []
+        cases: list[Case | None] = []
         for values in islice(self.large, FAR):
             allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
             point = Point({n: x if self.double else _single(x) for n, x in values.items()})
             point = replace(point, values={**self.point(1, 0.0).values, **point.values})
-            made = self.case(point, partial(self.value, name), allowed, sharp=True)
-            self.has_large |= made is not None
-            found.append(made)
-        return found
+            case = self.case(point, partial(self.value, name), allowed, sharp=True)
+            self.has_large |= case is not None
+            cases.append(case)
+        return cases
 
     @cached_property
     def large(self) -> list[dict[str, float]]:
@@ -550,11 +550,11 @@ class _Cases:
         room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
         for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
             try:
-                found = self.evaluate(name, known)
+                results = self.evaluate(name, known)
                 exact, _ = evaluator(self.program[name], exact=True)(known)
             except (NoCaseError, ArithmeticError, ValueError):
                 return False
-            if room * _off(found, exact) > limit:
+            if room * _off(results, exact) > limit:
                 return False
         return True
 
@@ -704,14 +704,15 @@ class _Cases:
         names += self.input_names(point)
 
         def difference(x: Point, width: float) -> Vector:
-            found = [0.0] * (2 * self.nq)
+            derivative = [0.0] * (2 * self.nq)
             for k, w in STENCIL:
                 for sign in (-1, 1):
                     moved = {n: x.values[n] + sign * k * width * (1 + i % 3)
                              for i, n in enumerate(names)}  # fmt: skip
                     end = self.stepped(m, 1, replace(x, values={**x.values, **moved}))
-                    found = [f + sign * w / width * e for f, e in zip(found, end, strict=True)]
-            return found
+                    part = sign * w / width
+                    derivative = [d + part * e for d, e in zip(derivative, end, strict=True)]
+            return derivative
 
         try:
             wide, close = difference(point, 0.01), difference(point, 0.0025)
@@ -754,9 +755,9 @@ class _Cases:
                 self.refuse_events(tried, x, t, span)
             except NoCaseError:
                 continue
-            made = self.case(tried, partial(self.ended, None), self.of_runs)
-            if made:
-                return made
+            case = self.case(tried, partial(self.ended, None), self.of_runs)
+            if case:
+                return case
         return None
 
     @property
@@ -777,14 +778,14 @@ class _Cases:
             return [*self.sure(point, x, t, span), t + span, *none]
         at, first = event
         x = self.sure(point, x, t, at - t)
-        found = [1.0, first + 1.0, at, *x]
+        numbers = [1.0, first + 1.0, at, *x]
         e = self.system.own_events[first]
         if e.action == "stop":
-            return [*x, at, *found]
+            return [*x, at, *numbers]
         if e.action == "jump":
             after = self.value("jumps", self.shifted(point, x, at))
             x = after[2 * self.nq * first : 2 * self.nq * (first + 1)]
-        return [*self.sure(point, x, at, t + span - at), t + span, *found]
+        return [*self.sure(point, x, at, t + span - at), t + span, *numbers]
 
     def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
         """Return the state at time t + span (s), by integration from the state x at time t.
@@ -812,8 +813,8 @@ class _Cases:
         first = self.events(point, x, t) if self.system.events else []
         for k in range(8) if first else ():
             x = self.flow(point, x, t + span * k / 8, span / 8, 1)
-            found = self.events(point, x, t + span * (k + 1) / 8)
-            for a, b in zip(first, found, strict=True):
+            events = self.events(point, x, t + span * (k + 1) / 8)
+            for a, b in zip(first, events, strict=True):
                 if a * b <= 0 or abs(b) < 0.02 * abs(a):
                     raise NoCaseError
 
@@ -822,7 +823,7 @@ class _Cases:
 
         There is at most one case in which the function rises, and one in which it falls.
         """
-        found: dict[bool, Case] = {}
+        cases: dict[bool, Case] = {}
         for point in self.candidates(k):
             for span in self.spans():
                 try:
@@ -830,11 +831,11 @@ class _Cases:
                 except NoCaseError:
                     continue
                 if case is not None:
-                    found.setdefault(rising, case)
+                    cases.setdefault(rising, case)
                     break
-            if len(found) == 2:
+            if len(cases) == 2:
                 break
-        return [*found.values()]
+        return [*cases.values()]
 
     def candidates(self, k: int) -> Iterator[Point]:
         """Yield points near the initial state at which the event function k is zero.
@@ -897,14 +898,14 @@ class _Cases:
         if [s[k] for s in sides] != [not rising, not rising, rising, rising]:
             raise NoCaseError
         e = self.system.own_events[k]
-        seen = e.direction in ("both", "rising" if rising else "falling")
+        is_detected = e.direction in ("both", "rising" if rising else "falling")
         start = self.shifted(on, [self.short(v) if not self.double else v for v in begin], t - half)
         start = replace(start, span=span)
-        if seen and e.action == "jump":
+        if is_detected and e.action == "jump":
             after = self.value("jumps", on)[2 * self.nq * k : 2 * self.nq * (k + 1)]
             near = self.flow(on, after, t, half / 8, 1)
             self.refuse_events(on, near, t + half / 8, half * 7 / 8)
-        event = (t, k) if seen else None
+        event = (t, k) if is_detected else None
         return rising, self.case(start, partial(self.ended, event), self.of_runs)
 
 
@@ -927,10 +928,10 @@ def _large(target: Target) -> Iterator[dict[str, float]]:
     """States in which every angle of coordinates alone is large, up to the limit of sincos.h."""
     program, limit = target.program, LIMIT[target.real is DOUBLE]
     coordinates = {c.name: i for i, c in enumerate(program.system.coordinates)}
-    found = chain.from_iterable(
+    groups = chain.from_iterable(
         separate_angles(program[name], coordinates)[0] for name in ("bias", "acceleration")
     )
-    angles = [a for a in found if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)]
+    angles = [a for a in groups if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)]
     if not angles:
         return
     most = limit / max(float(sum(abs(c) for c, _ in a.terms)) for a in angles)

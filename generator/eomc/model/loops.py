@@ -36,7 +36,7 @@ from eomc.scene.assembly import Loop
 
 @dataclass(frozen=True)
 class End:
-    """One of the two bodies of a joint that closes a loop: the joint's point and the rotation.
+    """The end of a loop joint on one of its two bodies: the joint's point and the rotation.
 
     point: position in m of the point of the body at which the joint is attached. R: rotation matrix
     of the body's frame. Both are in the frame of the closest common ancestor of the two bodies,

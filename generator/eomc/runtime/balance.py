@@ -207,8 +207,8 @@ def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
             return unknown
         first = np.arange(0, min(run.steps, len(values)), run._hold)
         starts, values = run.t0 + run.h * first, values[first]
-    has_begun = starts < last
-    return np.append(starts[has_begun], last), values[has_begun]
+    started = starts < last
+    return np.append(starts[started], last), values[started]
 
 
 def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
