@@ -108,11 +108,12 @@ def test_something_else_where_the_module_would_lie(what: str, scene: Path, root:
 
 def test_a_package_of_somebody_else_is_not_replaced(scene: Path, root: Path) -> None:
     folder = root / "simple_pendulum"
-    folder.mkdir(parents=True)
-    (folder / "__init__.py").write_text("mine = 1", encoding="utf-8")
+    (folder / "_runtime").mkdir(parents=True)
+    for file in ("__init__.py", "build.json"):  # both are names of files of a build
+        (folder / file).write_text("mine = 1", encoding="utf-8")
     with pytest.raises(eomc.EomcError, match="a package that eomc did not build"):
         eomc.build(scene, root)
-    assert [f.name for f in folder.iterdir()] == ["__init__.py"]
+    assert sorted(f.name for f in folder.iterdir()) == ["__init__.py", "_runtime", "build.json"]
     assert (folder / "__init__.py").read_text(encoding="utf-8") == "mine = 1"
 
 

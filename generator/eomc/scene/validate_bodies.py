@@ -116,6 +116,7 @@ class _Bodies:
         return self.values.vector(("gravity",), entries)
 
     def _check_names(self) -> None:
+        """Store the place of each body and point by its name; report names that can't be used."""
         entries = [(("body", label), entry.name) for label, entry in self.doc.body.items()]
         entries += [(("point", label), entry.name) for label, entry in self.doc.point.items()]
         for place, name in entries:

@@ -242,8 +242,9 @@ def _check_folder_is_free(folder: Path) -> None:
     if folder.is_symlink() or folder.exists():
         if not folder.is_dir():
             raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
-        ours = (folder / "_runtime").is_dir() or (folder / MANIFEST).exists()
-        if (folder / "__init__.py").exists() and not ours:
+        # files that builds of this version and of the first one have, and moved before __init__.py
+        is_build = any((folder / file).exists() for file in ("_runtime/package.py", "slices.py"))
+        if (folder / "__init__.py").exists() and not is_build:
             raise EomcError(
                 f"{folder}: is a package that eomc did not build, and stays as it is: "
                 "rename the scene, or use --build DIR"
