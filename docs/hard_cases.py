@@ -40,7 +40,7 @@ is larger, runs left out that half the step makes much worse. Error: max |q - q_
 |q_ref|) at the end, against 30 digits. Floor: what rounding of the start alone makes of it in
 doubles (`double_floor`). Evaluations: of accelerations, those of every sweep of an iteration
 counted. Computing: of one run on two shared cores, x86-64. Which cases come within ten times the
-floor, which do not and why, is in `tests/test_refs.py`.
+floor, which do not and why, is in `tests/physics/test_refs.py`.
 
 `python docs/hard_cases.py` writes this file.
 
