@@ -35,9 +35,9 @@ import work
 import eomc
 from eomc.derive import link_multipliers
 from eomc.emit import adaptive, c_expression
-from eomc.emit.fast import accelerations, files
-from eomc.emit.fast.accelerations import Accelerations
-from eomc.emit.fast.steppers import Steppers
+from eomc.emit.optimised import accelerations, files
+from eomc.emit.optimised.accelerations import Accelerations
+from eomc.emit.optimised.steppers import Steppers
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SPAN = 5.0  # s, of the runs for an error

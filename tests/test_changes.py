@@ -93,7 +93,7 @@ def test_a_sample_is_noticed(tmp_path: Path) -> None:
     """A third at least by four scenes alone; the whole tool asks forty, and the tests."""
     pytest.importorskip("coverage")
     tool = ROOT / "tests" / "generator_mutants.py"
-    only = ["derive/ldl", "c/plain/rk4", "fast/rk4", "lanes/rotate.h"]
+    only = ["derive/ldl", "c/portable/rk4", "optimised/rk4", "lanes/rotate.h"]
     done = subprocess.run(
         [sys.executable, tool, "--brief", "--count", "6", "--seed", "4", "--only", *only],
         env=os.environ | {"EOMC_MUTANTS": str(tmp_path)}, capture_output=True, text=True,

@@ -46,8 +46,8 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.emit import package, render, selftest
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast import files
-from eomc.emit.plain import steppers
+from eomc.emit.optimised import files
+from eomc.emit.portable import steppers
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text

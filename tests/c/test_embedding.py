@@ -19,7 +19,7 @@ from conftest import EVERYTHING, MODULES, ROOT, Modules, needs, tiers
 import eomc
 from eomc import pipeline
 from eomc.emit import c_names
-from eomc.emit.fast.files import PLACEHOLDERS
+from eomc.emit.optimised.files import PLACEHOLDERS
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene

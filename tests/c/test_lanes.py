@@ -15,7 +15,7 @@ from conftest import ROOT, tiers
 from lane_source import BUILDS, EXPONENTIALS, LANES, MOST, VECTORS, built, call, of_lane
 from sincos_bench import LARGEST_ERROR, bench, nearest_multiples
 
-from eomc.emit.fast.lanes import interleaved
+from eomc.emit.optimised.lanes import interleaved
 
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
 

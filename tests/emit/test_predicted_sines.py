@@ -16,7 +16,7 @@ from conftest import Modules, needs, tiers
 from eomc.derive import lagrange
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast.lanes import Accelerations
+from eomc.emit.optimised.lanes import Accelerations
 from eomc.program import program
 from eomc.program.trig import Angle
 from eomc.toolchain.subprocesses import write_files

@@ -19,9 +19,9 @@ from eomc.derive import lagrange
 from eomc.emit import render, views
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast import views as fast_views
 from eomc.emit.fmu import views as fmu_views
-from eomc.emit.plain import views as plain_views
+from eomc.emit.optimised import views as fast_views
+from eomc.emit.portable import views as plain_views
 from eomc.emit.public import Public
 from eomc.model.system import System
 from eomc.program import program

@@ -22,7 +22,7 @@ from eomc.derive import lagrange
 from eomc.derive.tape import Stage
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast.lanes import Accelerations
+from eomc.emit.optimised.lanes import Accelerations
 from eomc.model import from_scene as system
 from eomc.program import program, two_point
 from eomc.program.ir import Assignment, Operand, Product, Sum

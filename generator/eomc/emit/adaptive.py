@@ -15,7 +15,7 @@ from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, FixedSteps
+from eomc.emit.portable.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, FixedSteps
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.nonsmooth import has_steep_terms
 from eomc.model.system import System

@@ -8,7 +8,7 @@ from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction
 from eomc.emit.coefficients import tableau
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Derivative
+from eomc.emit.portable.views import Derivative
 from eomc.emit.projection import ZERO_SQUARE, near
 from eomc.integrators.tableaux import METHODS
 

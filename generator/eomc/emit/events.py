@@ -22,7 +22,13 @@ from eomc.emit.adaptive import (
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Events, FixedSteps, InitialEvents
+from eomc.emit.portable.adaptive_views import (
+    Adaptive,
+    AdaptiveRun,
+    Events,
+    FixedSteps,
+    InitialEvents,
+)
 from eomc.integrators.tableaux import Row
 from eomc.model.system import System
 from eomc.scene.schema import ACTIONS

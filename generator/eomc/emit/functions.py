@@ -16,8 +16,8 @@ from eomc.emit.c_expression import REALS, Block, Body, Real, group_angles
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, rename_reserved, sentence
 from eomc.emit.evaluations import KINDS, c_array_size, doc, refuses, source
-from eomc.emit.plain.parts import Computed
-from eomc.emit.plain.views import (
+from eomc.emit.portable.parts import Computed
+from eomc.emit.portable.views import (
     Indexed,
     Parameter,
 )

@@ -8,8 +8,8 @@ from itertools import accumulate
 from eomc.emit.c_function import CFunction, in_braces
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
-from eomc.emit.plain.constraint_views import Project, Projection
-from eomc.emit.plain.parts import Computed
+from eomc.emit.portable.constraint_views import Project, Projection
+from eomc.emit.portable.parts import Computed
 
 # Near singular configurations: square of the largest relative correction; factor on rounding errors
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}

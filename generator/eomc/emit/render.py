@@ -23,12 +23,12 @@ from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_function import narrowed
 from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
-from eomc.emit.fast import files as fast
-from eomc.emit.fast import views as fast_views
 from eomc.emit.fmu import files as fmu
 from eomc.emit.fmu import views as fmu_views
-from eomc.emit.plain import steppers
-from eomc.emit.plain import views as plain_views
+from eomc.emit.optimised import files as fast
+from eomc.emit.optimised import views as fast_views
+from eomc.emit.portable import steppers
+from eomc.emit.portable import views as plain_views
 from eomc.program.outline import weight
 from eomc.program.program import Program
 

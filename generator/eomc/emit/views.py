@@ -13,7 +13,7 @@ from eomc.program.ir import Cost
 
 @dataclass(frozen=True)
 class Main:
-    """Data for the template c/main.c.jinja: an example program that simulates the scene.
+    """Data for c/main.c.jinja: an example program that simulates the scene.
 
     The scene is the TOML file (or Python model) that the code is generated from. The program prints
     time, state, outputs and energy as CSV.
@@ -137,7 +137,7 @@ class Tested:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Data for the template c/selftest.c.jinja: a C program that tests the generated functions.
+    """Data for c/selftest.c.jinja: a C program that tests the generated functions.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class SelfTest:
 
 @dataclass(frozen=True)
 class CMake:
-    """Data for the template c/CMakeLists.txt.jinja, which builds the generated C as a library.
+    """Data for c/CMakeLists.txt.jinja, which builds the generated C as a library.
 
     Other projects use the library by add_subdirectory or find_package.
     """
@@ -193,7 +193,7 @@ class CMake:
 
 @dataclass(frozen=True)
 class PkgConfig:
-    """Data for the template c/package.pc.in.jinja: a pkg-config file of the generated C library.
+    """Data for c/package.pc.in.jinja: a pkg-config file of the generated C library.
 
     CMake completes and installs the file.
     """
@@ -225,7 +225,7 @@ class Stepped:
 
 @dataclass(frozen=True)
 class Costs:
-    """Data for the template c/costs.txt.jinja: a table of operation counts of the C functions.
+    """Data for c/costs.txt.jinja: a table of operation counts of the C functions.
 
     `width` is the width of the column of names, in characters.
     """

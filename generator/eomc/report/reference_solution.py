@@ -34,7 +34,7 @@ from eomc.emit.c_expression import QUAD
 from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
-from eomc.emit.plain import steppers as plain
+from eomc.emit.portable import steppers as plain
 from eomc.emit.render import show
 from eomc.emit.views import Quad
 from eomc.model.discrete import with_constant_parameters

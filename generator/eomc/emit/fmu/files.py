@@ -13,8 +13,8 @@ from eomc.emit.c_identifiers import rename_for_c
 from eomc.emit.c_names import Target
 from eomc.emit.fmu import description, scene
 from eomc.emit.fmu.views import BuildDescription, View
-from eomc.emit.plain import steppers
-from eomc.emit.plain.views import View as PlainView
+from eomc.emit.portable import steppers
+from eomc.emit.portable.views import View as PlainView
 from eomc.program.outline import weight
 from eomc.program.program import Program
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import AdaptiveTableau
-from eomc.emit.plain.parts import Computed, Named, Prefixed, Tableau
-from eomc.emit.plain.views import AnySource
+from eomc.emit.portable.adaptive_views import AdaptiveTableau
+from eomc.emit.portable.parts import Computed, Named, Prefixed, Tableau
+from eomc.emit.portable.views import AnySource
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Library:
 
 @dataclass(frozen=True)
 class Source(AnySource):
-    """Data for the template c/fast/source.c: the source file of the optimised C.
+    """Data for c/optimised/source.c: the source file of the optimised C.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Source(AnySource):
         Finished C texts of the accelerations, for one number and for vector registers.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/source.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/source.c"
     rolled: bool
     unroll: str
     extent: str
@@ -98,19 +98,19 @@ class Driven:
 
 @dataclass(frozen=True)
 class LibraryText(Prefixed, Laned):
-    """Data for the template c/fast/library.c: mathematical functions for a vector register.
+    """Data for c/optimised/library.c: mathematical functions for a vector register.
 
     count: number of values in the register, as a C expression. calls: the functions.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/library.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/library.c"
     count: str
     calls: tuple[Library, ...]
 
 
 @dataclass(frozen=True)
 class LaneText(Laned):
-    """Data for the template c/fast/lane.c: C functions for the accelerations.
+    """Data for c/optimised/lane.c: C functions for the accelerations.
 
     The template is printed for each *lane* type: one number, or a vector register with one value of
     each of several instances. Angles are those whose sines and cosines the accelerations read.
@@ -145,7 +145,7 @@ class LaneText(Laned):
         Whether some callers do not pass the sines, so that the function must compute them.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/lane.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/lane.c"
     prefix: str
     PREFIX: str
     unroll: str
@@ -169,7 +169,7 @@ class LaneText(Laned):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Data for the template c/fast/blocks.c: the C types of blocks and tiles.
+    """Data for c/optimised/blocks.c: the C types of blocks and tiles.
 
     A block is the group of instances of a batch that share a vector register. A tile is a group of
     blocks that are stepped together.
@@ -178,7 +178,7 @@ class Blocks:
     the precomputed expressions of the parameters; "" for none. blocks: number of blocks in a tile.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/blocks.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/blocks.c"
     prefix: str
     PREFIX: str
     lane: str
@@ -189,7 +189,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class TwoPoints(Prefixed):
-    """Data for the template c/fast/two_point.c: accelerations that are split into two C functions.
+    """Data for c/optimised/two_point.c: accelerations that are split into two C functions.
 
     The first one computes the position-dependent part for two configurations q in one vector
     register. The second one computes the accelerations from it, at one of the two configurations.
@@ -210,7 +210,7 @@ class TwoPoints(Prefixed):
         C call of `configuration`.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/two_point.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/two_point.c"
     extent: str
     inline: str
     members: str
@@ -223,7 +223,7 @@ class TwoPoints(Prefixed):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named, Laned, Driven):
-    """Data for the template c/fast/rk4.c: a step of the classical Runge-Kutta method.
+    """Data for c/optimised/rk4.c: a step of the classical Runge-Kutta method.
 
     It is printed for one instance, and for a vector register with values of several instances.
 
@@ -255,7 +255,7 @@ class RungeKutta4(Named, Laned, Driven):
         Whether the step returns the sines and cosines at its end for the projection.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/rk4.c"
     unroll: str
     extent: str
     noinline: str
@@ -279,14 +279,14 @@ class RungeKutta4(Named, Laned, Driven):
 
 @dataclass(frozen=True)
 class Predictions(Prefixed):
-    """Data for the template c/fast/predictions.c: sines and cosines of predicted angles.
+    """Data for c/optimised/predictions.c: sines and cosines of predicted angles.
 
     The C functions extrapolate the angles of the next RK4 step, and compute their sines and cosines
     in advance. angles: number of angles. unroll, inline: C macros before loops and before inlined
     functions.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/predictions.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/predictions.c"
     unroll: str
     inline: str
     angles: int
@@ -294,7 +294,7 @@ class Predictions(Prefixed):
 
 @dataclass(frozen=True)
 class Predicted(Named, Driven):
-    """Data for the template c/fast/predicted.c: a loop over steps of RK4 with predicted angles.
+    """Data for c/optimised/predicted.c: a loop over steps of RK4 with predicted angles.
 
     Predicted angles are extrapolated from the step before. The loop ends when they are not accurate
     enough.
@@ -312,7 +312,7 @@ class Predicted(Named, Driven):
         C calls of the four stages.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/predicted.c"
     unroll: str
     noinline: str
     angles: int
@@ -346,7 +346,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Explicit(Prefixed, Laned, Driven):
-    """Data for the template c/fast/explicit.c: a step of an explicit method except RK4.
+    """Data for c/optimised/explicit.c: a step of an explicit method except RK4.
 
     It is printed for one instance, and for a vector register with values of several instances.
 
@@ -364,7 +364,7 @@ class Explicit(Prefixed, Laned, Driven):
         C text of the sums over the stages in the increments of position and velocity.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/explicit.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/explicit.c"
     unroll: str
     extent: str
     clear: str
@@ -382,19 +382,19 @@ class Explicit(Prefixed, Laned, Driven):
 
 @dataclass(frozen=True)
 class Factors(Prefixed):
-    """Data for the template c/fast/lu.c: LU factorisation of a matrix, and solution of A x = b.
+    """Data for c/optimised/lu.c: LU factorisation of a matrix, and solution of A x = b.
 
     fabs: name of the C function for |x|. f: suffix of C literals.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/lu.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/lu.c"
     fabs: str
     f: str
 
 
 @dataclass(frozen=True)
 class Gauss(Tableau):
-    """Data for the template c/fast/gauss.c: one step of a Gauss method with Newton's method.
+    """Data for c/optimised/gauss.c: one step of a Gauss method with Newton's method.
 
     Attributes
     ----------
@@ -426,7 +426,7 @@ class Gauss(Tableau):
         C calls of the accelerations at the start and at a stage.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/gauss.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/gauss.c"
     extent: str
     f: str
     fabs: str
@@ -453,7 +453,7 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Stages(Named):
-    """Data for the template c/fast/stages.c: one fixed-point iteration over all stages of a step.
+    """Data for c/optimised/stages.c: one fixed-point iteration over all stages of a step.
 
     The method is an implicit Runge-Kutta method, such as a Gauss method. The stages are computed
     side by side in vector registers.
@@ -479,7 +479,7 @@ class Stages(Named):
         C call that projects a stage onto the constraints; "" without constraints.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/stages.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/stages.c"
     extent: str
     inputs: bool
     constants: bool
@@ -498,7 +498,7 @@ class Stages(Named):
 
 @dataclass(frozen=True)
 class Sweeps(Named):
-    """Data for the template c/fast/sweeps.c: a step of an implicit method.
+    """Data for c/optimised/sweeps.c: a step of an implicit method.
 
     The step makes a fixed number of fixed-point iterations over its stages. If these do not
     converge, the C function `settle` iterates until they do.
@@ -530,7 +530,7 @@ class Sweeps(Named):
         Whether the scene has constraints.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/sweeps.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/sweeps.c"
     extent: str
     f: str
     fabs: str
@@ -560,7 +560,7 @@ class Sweeps(Named):
 
 @dataclass(frozen=True)
 class State(Named):
-    """Data for the template c/fast/state.c: the C struct with the state of a run by one method.
+    """Data for c/optimised/state.c: the C struct with the state of a run by one method.
 
     Attributes
     ----------
@@ -577,7 +577,7 @@ class State(Named):
         Whether the scene has inputs, and constraints.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/state.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/state.c"
     extent: str
     name: str
     title: str
@@ -592,7 +592,7 @@ class State(Named):
 
 @dataclass(frozen=True)
 class Loop(Named, Driven):
-    """Data for the template c/fast/run.c: the functions for one step and for a run of many steps.
+    """Data for c/optimised/run.c: the functions for one step and for a run of many steps.
 
     Attributes
     ----------
@@ -621,7 +621,7 @@ class Loop(Named, Driven):
         Whether the step returns the sines and cosines at its end for the projection.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/run.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/run.c"
     extent: str
     name: str
     step: CFunction
@@ -644,7 +644,7 @@ class Loop(Named, Driven):
 
 @dataclass(frozen=True)
 class Batch(Named, Driven):
-    """Data for the template c/fast/batch.c: steps of many instances in vector registers.
+    """Data for c/optimised/batch.c: steps of many instances in vector registers.
 
     Attributes
     ----------
@@ -673,7 +673,7 @@ class Batch(Named, Driven):
         Whether the step returns the sines and cosines at its end for the projection.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/batch.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/batch.c"
     extent: str
     noinline: str
     name: str
@@ -694,7 +694,7 @@ class Batch(Named, Driven):
 
 @dataclass(frozen=True)
 class AdaptiveLanes(AdaptiveTableau):
-    """Data for the template c/fast/adaptive_lanes.c: adaptive steps of many instances.
+    """Data for c/optimised/adaptive_lanes.c: adaptive steps of many instances.
 
     The instances are computed side by side in vector registers.
 
@@ -719,7 +719,7 @@ class AdaptiveLanes(AdaptiveTableau):
         interpolated within the step.
     """
 
-    TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"
+    TEMPLATE: ClassVar[str] = "c/optimised/adaptive_lanes.c"
     inline: str
     noinline: str
     max_roughness: str

@@ -15,14 +15,14 @@ from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
 from eomc.emit.c_names import Target
 from eomc.emit.derivatives import derivatives
-from eomc.emit.fast import adaptive_lanes, projection, runs, views
-from eomc.emit.fast.accelerations import Accelerations
-from eomc.emit.fast.lanes import INLINE, Lane
-from eomc.emit.fast.runs import prediction_width
-from eomc.emit.fast.steppers import Steppers
 from eomc.emit.functions import Functions
-from eomc.emit.plain import steppers as plain
-from eomc.emit.plain import views as plain_views
+from eomc.emit.optimised import adaptive_lanes, projection, runs, views
+from eomc.emit.optimised.accelerations import Accelerations
+from eomc.emit.optimised.lanes import INLINE, Lane
+from eomc.emit.optimised.runs import prediction_width
+from eomc.emit.optimised.steppers import Steppers
+from eomc.emit.portable import steppers as plain
+from eomc.emit.portable import views as plain_views
 from eomc.emit.projection import project
 from eomc.integrators.tableaux import RK4
 

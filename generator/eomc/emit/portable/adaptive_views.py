@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.parts import Named
+from eomc.emit.portable.parts import Named
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class AdaptiveTableau(Named):
 
 @dataclass(frozen=True)
 class Adaptive(AdaptiveTableau):
-    """Data for the template c/adaptive.c: one step with adaptive step-size control.
+    """Data for c/adaptive.c: one step with adaptive step-size control.
 
     The four templates that it includes read the same data.
 
@@ -148,7 +148,7 @@ class Adaptive(AdaptiveTableau):
 
 @dataclass(frozen=True)
 class FixedSteps(Named):
-    """Data for the template c/fixed_steps.c: steps of fixed size with event detection.
+    """Data for c/fixed_steps.c: steps of fixed size with event detection.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ class FixedSteps(Named):
 
 @dataclass(frozen=True)
 class Events(Named):
-    """Data for the template c/events.c: event detection in a step, and state jumps.
+    """Data for c/events.c: event detection in a step, and state jumps.
 
     An event triggers at a root of its event function, a function of time and state.
 
@@ -305,7 +305,7 @@ class Events(Named):
 
 @dataclass(frozen=True)
 class InitialEvents(Named):
-    """Data for the template c/initial_events.c: events that trigger at the start of a motion.
+    """Data for c/initial_events.c: events that trigger at the start of a motion.
 
     Attributes
     ----------
@@ -328,7 +328,7 @@ class InitialEvents(Named):
 
 @dataclass(frozen=True)
 class AdaptiveRun(Named):
-    """Data for the template c/adaptive_run.c: a run by adaptive steps, with its rows and events.
+    """Data for c/adaptive_run.c: a run by adaptive steps, with its rows and events.
 
     A row is one stored state of the run, at one of the requested times.
 
@@ -390,7 +390,7 @@ class AdaptiveRun(Named):
 
 @dataclass(frozen=True)
 class AdaptiveBatch:
-    """Data for the template c/adaptive_batch.c: adaptive runs of many instances, in sequence.
+    """Data for c/adaptive_batch.c: adaptive runs of many instances, in sequence.
 
     prefix: the scene's name, with which C names begin. batch: prototype of the public function.
     alone: C call of the run of one instance, with index k. events: whether the scene has events.

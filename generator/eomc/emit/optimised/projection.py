@@ -6,10 +6,10 @@ from eomc.emit import c_function as c
 from eomc.emit import projection
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
-from eomc.emit.fast.lanes import NOINLINE, Lane
 from eomc.emit.functions import RATE_TERMS, Functions
-from eomc.emit.plain.constraint_views import Projection
-from eomc.emit.plain.parts import Computed
+from eomc.emit.optimised.lanes import NOINLINE, Lane
+from eomc.emit.portable.constraint_views import Projection
+from eomc.emit.portable.parts import Computed
 from eomc.program.program import TIME
 
 

@@ -13,12 +13,12 @@ from eomc.emit import c_function as c
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import literal, matrix, numbers, rounded, tableau
-from eomc.emit.fast import views
-from eomc.emit.fast.accelerations import Accelerations
-from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
-from eomc.emit.fast.projection import onto
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Slopes
+from eomc.emit.optimised import views
+from eomc.emit.optimised.accelerations import Accelerations
+from eomc.emit.optimised.lanes import INLINE, NOINLINE, Lane
+from eomc.emit.optimised.projection import onto
+from eomc.emit.portable.views import Slopes
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
 from eomc.program import two_point
 

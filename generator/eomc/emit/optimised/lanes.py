@@ -17,8 +17,8 @@ from eomc.emit import c_function as c
 from eomc.emit.c_expression import FOUR, Block, Body, Printer, Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, rename_reserved, sentence
-from eomc.emit.fast.accelerations import Accelerations
-from eomc.emit.plain.parts import Computed
+from eomc.emit.optimised.accelerations import Accelerations
+from eomc.emit.portable.parts import Computed
 from eomc.program import outline
 from eomc.program.ir import Call, Function, Sum
 from eomc.program.trig import Angle

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from eomc.emit import c_function as c
-from eomc.emit.fast import views
-from eomc.emit.fast.lanes import NOINLINE
-from eomc.emit.fast.projection import ending
-from eomc.emit.fast.steppers import Steppers
+from eomc.emit.optimised import views
+from eomc.emit.optimised.lanes import NOINLINE
+from eomc.emit.optimised.projection import ending
+from eomc.emit.optimised.steppers import Steppers
 from eomc.integrators.tableaux import RK4, Method
 
 

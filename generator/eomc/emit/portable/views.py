@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import (
+from eomc.emit.portable.adaptive_views import (
     Adaptive,
     AdaptiveBatch,
     AdaptiveRun,
@@ -15,8 +15,8 @@ from eomc.emit.plain.adaptive_views import (
     FixedSteps,
     InitialEvents,
 )
-from eomc.emit.plain.constraint_views import Project, Projection
-from eomc.emit.plain.parts import Computed, Named, Tableau
+from eomc.emit.portable.constraint_views import Project, Projection
+from eomc.emit.portable.parts import Computed, Named, Tableau
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class AdaptiveDeclared:
 
 @dataclass(frozen=True)
 class Header(Named):
-    """Data for the template c/header.h: the header of the generated C.
+    """Data for c/header.h: the header of the generated C.
 
     Attributes
     ----------
@@ -190,18 +190,18 @@ class AnySource(Named):
 
 @dataclass(frozen=True)
 class Source(AnySource):
-    """Data for the template c/plain/source.c: the source file of the portable C.
+    """Data for c/portable/source.c: the source file of the portable C.
 
     adaptive: whether it contains adaptive steps.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/source.c"
+    TEMPLATE: ClassVar[str] = "c/portable/source.c"
     adaptive: bool
 
 
 @dataclass(frozen=True)
 class Slopes(Named):
-    """Data for the template c/slopes.c: derivatives of the accelerations by q, q̇ and u.
+    """Data for c/slopes.c: derivatives of the accelerations by q, q̇ and u.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class Slopes(Named):
 
 @dataclass(frozen=True)
 class Derivative(Tableau):
-    """Data for the template c/derivative.c: a C function for the derivatives of one step.
+    """Data for c/derivative.c: a C function for the derivatives of one step.
 
     They are the derivatives of q and q̇ at the end of the step with respect to q, q̇ and u at its
     start.
@@ -297,7 +297,7 @@ class Derivative(Tableau):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named):
-    """Data for the template c/plain/rk4.c: one step of the classical Runge-Kutta method.
+    """Data for c/portable/rk4.c: one step of the classical Runge-Kutta method.
 
     Attributes
     ----------
@@ -315,7 +315,7 @@ class RungeKutta4(Named):
         C calls of the accelerations at the four stages.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/rk4.c"
+    TEMPLATE: ClassVar[str] = "c/portable/rk4.c"
     about: tuple[str, ...]
     step: CFunction
     advance: CFunction
@@ -329,13 +329,13 @@ class RungeKutta4(Named):
 
 @dataclass(frozen=True)
 class Explicit(Tableau):
-    """Data for the template c/plain/explicit.c: one step of an explicit Runge-Kutta method.
+    """Data for c/portable/explicit.c: one step of an explicit Runge-Kutta method.
 
     about, step, advance, advance_call, correct: as in `RungeKutta4`. stages: the number of stages.
     stage: the C call of the accelerations at stage i.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/explicit.c"
+    TEMPLATE: ClassVar[str] = "c/portable/explicit.c"
     about: tuple[str, ...]
     step: CFunction
     advance: CFunction
@@ -347,7 +347,7 @@ class Explicit(Tableau):
 
 @dataclass(frozen=True)
 class Implicit(Named):
-    """Data for the template c/plain/implicit.c: C functions that all implicit methods share.
+    """Data for c/portable/implicit.c: C functions that all implicit methods share.
 
     Attributes
     ----------
@@ -365,7 +365,7 @@ class Implicit(Named):
         C calls of the accelerations at the state and at a perturbed state.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/implicit.c"
+    TEMPLATE: ClassVar[str] = "c/portable/implicit.c"
     fabs: str
     fmax: str
     tiny: str
@@ -380,7 +380,7 @@ class Implicit(Named):
 
 @dataclass(frozen=True)
 class Gauss(Tableau):
-    """Data for the template c/plain/gauss.c: one step of a Gauss method, solved by iteration.
+    """Data for c/portable/gauss.c: one step of a Gauss method, solved by iteration.
 
     Attributes
     ----------
@@ -405,7 +405,7 @@ class Gauss(Tableau):
         methods without Newton's method project stages.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/gauss.c"
+    TEMPLATE: ClassVar[str] = "c/portable/gauss.c"
     title: str
     method: str
     newton: bool
@@ -432,7 +432,7 @@ class Gauss(Tableau):
 
 @dataclass(frozen=True)
 class Nodes(Named):
-    """Data for the template c/plain/nodes.c: one fixed-point iteration over all stages of a step.
+    """Data for c/portable/nodes.c: one fixed-point iteration over all stages of a step.
 
     Adaptive steps in portable C call the C function of this template.
 
@@ -450,7 +450,7 @@ class Nodes(Named):
         C call that projects stage i onto the constraints; "" without constraints.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/nodes.c"
+    TEMPLATE: ClassVar[str] = "c/portable/nodes.c"
     title: str
     name: str
     stages: int
@@ -464,7 +464,7 @@ class Nodes(Named):
 
 @dataclass(frozen=True)
 class Loop(Named):
-    """Data for the template c/plain/run.c: C functions for runs of one instance and of many.
+    """Data for c/portable/run.c: C functions for runs of one instance and of many.
 
     Attributes
     ----------
@@ -477,7 +477,7 @@ class Loop(Named):
         C call of one step in the body of `run`, and C call of `run` in the body of `batch`.
     """
 
-    TEMPLATE: ClassVar[str] = "c/plain/run.c"
+    TEMPLATE: ClassVar[str] = "c/portable/run.c"
     implicit: bool
     constrained: bool
     run: CFunction

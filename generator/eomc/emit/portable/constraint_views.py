@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.parts import Computed, Named
+from eomc.emit.portable.parts import Computed, Named
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Data for the template c/projection.c: projection of the end of a step onto the constraints.
+    """Data for c/projection.c: projection of the end of a step onto the constraints.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class Project(Named):
-    """Data for the template c/project.c: the public projection of a state onto the constraints.
+    """Data for c/project.c: the public projection of a state onto the constraints.
 
     Attributes
     ----------

@@ -16,8 +16,8 @@ from eomc.emit.c_names import sentence
 from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
 from eomc.emit.functions import Functions, handshake, indexed, parameters, portable_functions
-from eomc.emit.plain.parts import Computed
-from eomc.emit.plain.views import (
+from eomc.emit.portable.parts import Computed
+from eomc.emit.portable.views import (
     AdaptiveDeclared,
     Declared,
     Explicit,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from eomc.emit import adaptive
 from eomc.emit import c_function as c
 from eomc.emit.adaptive import METHOD, Stepping, SweepInterface
-from eomc.emit.fast import runs, views
-from eomc.emit.fast.lanes import INLINE, NOINLINE
-from eomc.emit.fast.steppers import Steppers
+from eomc.emit.optimised import runs, views
+from eomc.emit.optimised.lanes import INLINE, NOINLINE
+from eomc.emit.optimised.steppers import Steppers
 from eomc.scene.schema import MAX_TOLERANCE
 
 
