@@ -38,7 +38,7 @@ with atheris.instrument_imports(include=["eomc"]):
     from eomc.base.errors import EomcError
     from eomc.cli.main import COMMANDS, main
     from eomc.model.from_scene import from_scene
-    from eomc.robots import edit, joint_stops, scene_text, urdf
+    from eomc.robots import edit, limits, preparation, scene_text, urdf
     from eomc.robots.mjcf import read as mjcf
     from eomc.scene import formulas
     from eomc.scene.read import parse
@@ -96,12 +96,12 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     path.write_bytes(data)
 
     def stopped(robot: Any) -> Any:
-        return edit.with_joint_stops(robot) if joint_stops.joint_stops(robot) else robot
+        return edit.with_joint_stops(robot) if limits.joint_stops(robot) else robot
 
     def made() -> None:
         robot = reader(path)
         for change in (lambda r: r, edit.with_nearest_inertias, stopped):
-            text = scene_text.scene_text(scene_text.prepared_for_scene(change(robot)))
+            text = scene_text.scene_text(preparation.prepared_for_scene(change(robot)))
             read_back = parse(text, "fuzz.xml.toml")
             if len(robot.bodies) < SYMPY_FROM:
                 from_scene(read_back)

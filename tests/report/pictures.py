@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eomc.robots import edit, scene_text, urdf
+from eomc.robots import edit, preparation, scene_text, urdf
 from eomc.scene.read import parse, read
 from eomc.scene.scene import Scene
 
@@ -38,7 +38,7 @@ def scene(name: str) -> Scene:
 def robot(file: Path, free: bool = False) -> Scene:
     """The scene of a URDF, as eomc import writes it."""
     made = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
-    return parse(scene_text.scene_text(scene_text.prepared_for_scene(made)))
+    return parse(scene_text.scene_text(preparation.prepared_for_scene(made)))
 
 
 def robot_data(name: str) -> Path:

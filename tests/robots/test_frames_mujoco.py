@@ -29,7 +29,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.interpret import evaluate
 from eomc.program.lower import lower
-from eomc.robots.scene_text import prepared_for_scene
+from eomc.robots.preparation import prepared_for_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.slow

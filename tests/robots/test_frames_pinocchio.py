@@ -22,7 +22,7 @@ from robots.test_robots_mujoco import (  # noqa: E402
 )
 
 from eomc.derive.inverse_dynamics import inverse_dynamics  # noqa: E402
-from eomc.robots.scene_text import prepared_for_scene  # noqa: E402
+from eomc.robots.preparation import prepared_for_scene  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from eomc.derive.lagrange import derive
 from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.program.interpret import evaluate
-from eomc.robots.masses import with_masses
+from eomc.robots.edit import with_masses
 from eomc.robots.robot import Robot
 from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse

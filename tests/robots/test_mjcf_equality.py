@@ -13,8 +13,9 @@ from eomc.model.from_scene import from_scene
 from eomc.model.symbols import needed
 from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
+from eomc.robots.preparation import prepared_for_scene
 from eomc.robots.robot import body_pose
-from eomc.robots.scene_text import prepared_for_scene, scene_text
+from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
 
 INSIDE = """

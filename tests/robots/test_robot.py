@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from eomc.base import names
 from eomc.base.errors import EomcError
-from eomc.robots import edit, inertias, rotations, scene_text
+from eomc.robots import edit, inertias, preparation, rotations, scene_text
 from eomc.robots.inertias import Inertia
 from eomc.robots.robot import Drive, Motion, Robot, RobotBody, body_pose
 from eomc.scene.read import parse
@@ -145,7 +145,7 @@ def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inert
     robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
     assert edit.with_nearest_inertias(robot) == robot
     with pytest.raises(EomcError) as fault:
-        scene_text.prepared_for_scene(robot)
+        preparation.prepared_for_scene(robot)
     assert "check the signs of the tensor" in str(fault.value)
     assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
 
@@ -320,7 +320,9 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
         replace(body, name="y", parent="x" * 60, motions=(Motion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
-    robot = scene_text.prepared_for_scene(replace(arm(), name="math", bodies=bodies, drives=drives))
+    robot = preparation.prepared_for_scene(
+        replace(arm(), name="math", bodies=bodies, drives=drives)
+    )
     coordinates = [m.name for m in robot.motions]
     taken = [*coordinates, *(f"{c}_dot" for c in coordinates), *(d.name for d in robot.drives)]
     taken += [f"{b.name}_{letter}" for b in robot.bodies for letter in "xyz"]
@@ -329,7 +331,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     assert names.module_fault(robot.name) is None
     assert "'a.b' in the file" in robot.motions[0].note
     assert [d.coordinate for d in robot.drives] == [coordinates[0], coordinates[2]]
-    assert scene_text.prepared_for_scene(robot) == robot
+    assert preparation.prepared_for_scene(robot) == robot
 
 
 def test_texts_of_strangers_stay_texts() -> None:
@@ -343,15 +345,15 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
     bodies = (*arm().bodies[:6], RobotBody("finger", "hook", "revolute", (Motion("f-1", "rad"),),
                                            ((1.0, 0.0, 0.0),), note="a mesh only"))  # fmt: skip
     with pytest.raises(EomcError) as fault:
-        scene_text.prepared_for_scene(replace(arm(), bodies=bodies))
+        preparation.prepared_for_scene(replace(arm(), bodies=bodies))
     assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(
         fault.value
     )
     assert "--lock f-1=0" in str(fault.value)
     locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
-    assert len(scene_text.prepared_for_scene(locked).motions) == 3
+    assert len(preparation.prepared_for_scene(locked).motions) == 3
     with pytest.raises(EomcError, match="nothing moves"):
-        scene_text.prepared_for_scene(replace(arm(), bodies=arm().bodies[:1]))
+        preparation.prepared_for_scene(replace(arm(), bodies=arm().bodies[:1]))
 
 
 def test_inertias_that_no_body_has() -> None:
@@ -359,8 +361,8 @@ def test_inertias_that_no_body_has() -> None:
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
     assert any(
         "body column: its principal moments" in w
-        for w in scene_text.prepared_for_scene(robot).left_out
+        for w in preparation.prepared_for_scene(robot).left_out
     )
     negative = replace(broken, inertia=(0.1, 0.1, -0.1, 0.0, 0.0, 0.0))
     with pytest.raises(EomcError, match="body column: its smallest principal moment"):
-        scene_text.prepared_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))
+        preparation.prepared_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))

@@ -10,7 +10,7 @@ import pytest
 from mjcf_text import model
 
 from eomc.base.errors import SceneError
-from eomc.robots import schema, urdf
+from eomc.robots import urdf, xml
 from eomc.robots.mjcf import read
 from eomc.robots.mjcf.schema import ACTUATORS, SCHEMA
 
@@ -86,7 +86,7 @@ def test_what_urdf_does_not_have_is_reported_wherever_it_stands(tmp_path: Path) 
 
 
 def test_groups_and_depths_of_an_outline() -> None:
-    found = schema.parse("a: x @g\n b: *\n c: y\n  d:\n b2: z", {"g": "u v"})
+    found = xml.parse_format("a: x @g\n b: *\n c: y\n  d:\n b2: z", {"g": "u v"})
     assert found.attributes == {"x", "u", "v"} and [*found.children] == ["b", "c", "b2"]
     assert found.children["b"].skipped and [*found.children["c"].children] == ["d"]
 
@@ -242,9 +242,9 @@ OLDER = set(
 @pytest.mark.slow  # in the tier that installs MuJoCo
 def test_the_schema_is_that_of_mujoco() -> None:
     mujoco = pytest.importorskip("mujoco", minversion="4")
-    way: list[tuple[str, schema.Element | None]] = []  # to an element; its first attributes' line
+    way: list[tuple[str, xml.ElementSchema | None]] = []  # to an element, by its first attributes
     unknown, theirs = [], dict[int, set[str]]()
-    elements: dict[int, tuple[str, schema.Element]] = {}
+    elements: dict[int, tuple[str, xml.ElementSchema]] = {}
     for line in mujoco.mj_printSchema(False, False).splitlines():
         depth = (len(line) - len(line.lstrip())) // 3
         names = line.split()
@@ -252,9 +252,9 @@ def test_the_schema_is_that_of_mujoco() -> None:
             kind, _, *names = names
             del way[depth:]
             kind = "worldbody" if kind == "(world)body" else kind
-            around = way[-1][1] if way else schema.Element(children={"mujoco": SCHEMA})
+            around = way[-1][1] if way else xml.ElementSchema(children={"mujoco": SCHEMA})
             if kind == "worldbody":  # bodies are as the world is
-                around = schema.Element(children={kind: SCHEMA.children[kind].children["body"]})
+                around = xml.ElementSchema(children={kind: SCHEMA.children[kind].children["body"]})
             element = (
                 around.children.get(kind)
                 if around and not (around.skipped or around.is_open)

@@ -17,9 +17,10 @@ from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.robots.edit import cut, lock
-from eomc.robots.joint_stops import joint_stops
+from eomc.robots.limits import joint_stops
+from eomc.robots.preparation import prepared_for_scene
 from eomc.robots.robot import Law, Robot
-from eomc.robots.scene_text import prepared_for_scene, scene_text
+from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'

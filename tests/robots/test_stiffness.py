@@ -15,8 +15,9 @@ from eomc.derive.lagrange import derive
 from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.robots import edit, stiffness, urdf
+from eomc.robots.preparation import prepared_for_scene
 from eomc.robots.robot import Robot
-from eomc.robots.scene_text import prepared_for_scene, scene_text
+from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
 
 WRIST = """<robot name="wrist">

@@ -53,9 +53,9 @@ def command(
     from dataclasses import replace
 
     from eomc.base import names
-    from eomc.robots import edit, scene_text, urdf, xml
+    from eomc.robots import edit, preparation, scene_text, urdf, xml
+    from eomc.robots.edit import with_masses
     from eomc.robots.limits import with_input_limits
-    from eomc.robots.masses import with_masses
     from eomc.robots.mjcf import read
     from eomc.robots.robot import with_left_out_note
     from eomc.scene.toml_text import MAX_BYTES
@@ -87,7 +87,7 @@ def command(
             robot = with_input_limits(robot)
         if parameters:
             robot = with_masses(robot, tip)
-        robot = scene_text.prepared_for_scene(robot)
+        robot = preparation.prepared_for_scene(robot)
     except EomcError as fault:
         raise with_left_out_note(fault, robot.left_out) from None
     path = out or files.scene_path(robot.name)

@@ -10,7 +10,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import has_nearest, indefinite, nearest, principal, shown, unbalanced
-from eomc.robots.joint_stops import joint_stops
+from eomc.robots.limits import joint_stops
 from eomc.robots.robot import (
     COUPLING_TOLERANCE,
     Robot,
@@ -216,3 +216,50 @@ def _pose_in_world(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[V
         o, r = _at_start(body)
         offset, rotation = plus(o, apply(r, offset)), times(r, rotation)
     return offset, rotation
+
+
+def with_masses(robot: Robot, tip: str = "") -> Robot:
+    """Return the robot with its moving masses as parameters, and a payload of 0 kg at its tips.
+
+    With the name of a body as `tip`, only that body gets a payload. Otherwise each moving group of
+    rigidly connected bodies that carries no further joint gets one, on its outermost body.
+    """
+    group, _ = _groups(robot)
+    bodies = [
+        replace(b, parameter=f"mass_{b.name}") if b.mass and group[b.name] != WORLD else b
+        for b in robot.bodies
+    ]
+    taken = {b.name for b in bodies}
+    tips = [tip] if tip else _tips(robot)
+    for name in tips:
+        end = f"_{name}" if len(tips) > 1 else ""
+        load = f"load{end}"
+        while load in taken:
+            load += "_"
+        note = f"a point mass in the origin of the frame of {name}"
+        body = RobotBody(load, name, note=note, parameter=f"payload{end}")
+        at = 1 + next(k for k, b in enumerate(bodies) if b.name == name)
+        bodies.insert(at, body)
+    return replace(robot, bodies=tuple(bodies))
+
+
+def _groups(robot: Robot) -> tuple[dict[str, str], dict[str, int]]:
+    """Return, for each body, the one whose joint moves it, and the fixed joints in between."""
+    group, depth = {WORLD: WORLD}, {WORLD: 0}
+    for b in robot.bodies:
+        moves = b.joint != "fixed"
+        group[b.name] = b.name if moves else group[b.parent]
+        depth[b.name] = 0 if moves else depth[b.parent] + 1
+    return group, depth
+
+
+def _tips(robot: Robot) -> list[str]:
+    """Return the deepest body, the last of several, of each rigid group at an end of the tree."""
+    group, depth = _groups(robot)
+    carries = {WORLD, *(group[b.parent] for b in robot.bodies if b.joint != "fixed")}
+    tips: dict[str, str] = {}
+    for b in robot.bodies:
+        of = group[b.name]
+        if of not in carries and depth[b.name] >= depth[tips.get(of, of)]:
+            tips[of] = b.name
+    return [*tips.values()]

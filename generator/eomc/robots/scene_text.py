@@ -1,193 +1,32 @@
-"""Conversion of a robot to a scene: names and checks, and the scene as readable TOML text."""
+"""The scene of a robot as readable TOML text."""
 
 from __future__ import annotations
 
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
-from eomc.base import names, texts
-from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
-from eomc.robots import actuation
-from eomc.robots.formulas import angle, length, less, number, total, vector
-from eomc.robots.ineffective_constraints import without_ineffective_constraints
-from eomc.robots.inertias import has_nearest, indefinite, unbalanced
-from eomc.robots.joint_stops import DAMPING, DEPTHS, Stop, joint_stops
-from eomc.robots.masses import inertia_text, parameters
-from eomc.robots.massless import light_root, without_inertia
+from eomc.robots.limits import DAMPING, DEPTHS, Stop, joint_stops, stop_parameters
+from eomc.robots.preparation import prepared_for_scene
 from eomc.robots.robot import (
-    BARE,
+    UNLIMITED,
     Coupling,
-    Mimic,
+    Drive,
+    Law,
     Motion,
     Robot,
     RobotBody,
     RobotLoop,
+    Tendon,
     joined,
-    without_dust,
 )
-from eomc.robots.rotations import SNAP, turns_of
-from eomc.robots.stiffness import with_stable_steps
+from eomc.robots.rotations import SNAP, Vector, turns_of
 from eomc.scene.assembly import WORLD
-from eomc.scene.joints import CLOSINGS, JOINTS
+from eomc.scene.joints import JOINTS
 
-MENDED = ", as --mend-inertias writes"
-_NAME = 32  # characters of a name, to leave room for suffixes such as "_torque" and "_dot"
-
-
-def prepared_for_scene(robot: Robot) -> Robot:
-    """Return the robot in the form in which it can be written as a scene (the TOML input).
-
-    Its names are valid in a scene, massless frames become points, and constraints without effect
-    are removed. Adaptive steps are selected if forces are stiff. Tensors that violate the triangle
-    inequality are noted in `left_out`.
-
-    Raises EomcError if no joint moves, if a joint moves no mass or inertia, or if an inertia tensor
-    is not positive semi-definite.
-    """
-    robot = without_ineffective_constraints(robot)
-    bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
-    robot = _with_points(replace(robot, bodies=bodies))
-    if not robot.motions:
-        raise EomcError(
-            f"{robot.name}: nothing moves in this robot, no joint has a coordinate; with "
-            "--base free its root does"
-        )
-    faults = [
-        f"body {b.name}: {why}" + (MENDED if has_nearest(b.inertia) else "")
-        for b in robot.bodies
-        if (why := indefinite(b.inertia))
-    ]
-    if faults := [*faults, *without_inertia(robot)]:
-        raise EomcError("\n".join(faults))
-    robot = _with_scene_names(robot)  # after the errors, which use the names that --lock expects
-    notes = tuple(
-        f"body {body.name}: {why}{MENDED}; until then the scene is refused"
-        for body in robot.bodies
-        if (why := unbalanced(body.inertia))
-    )
-    if light := light_root(robot):
-        notes += (
-            f"body {light}: it is free and has neither mass nor inertia, so the joint that it "
-            "carries moves nothing against it: give it both, or import with --base fixed; until "
-            "then the scene is refused",
-        )
-    rough = [b.name for b in robot.bodies if any(_rough(by) for _, by in turns_of(b.rotation))]
-    if rough:
-        notes += (
-            "quarter turns to five digits or so, as 1.5708, which are kept as they are ("
-            f'{texts.listed(rough, 4)}): "pi/2" in their place makes less code',
-        )
-    new = tuple(words for words in notes if words not in robot.left_out)
-    return with_stable_steps(replace(robot, left_out=(*robot.left_out, *new)))
-
-
-def _rough(angle: float) -> bool:
-    """Return whether an angle is close, but not equal, to a multiple of pi/2."""
-    return SNAP < abs(angle - round(angle * 2 / math.pi) * math.pi / 2) < 1e-4
-
-
-def _with_points(robot: Robot) -> Robot:
-    """Return the robot with fixed, massless bodies that carry no other body as points."""
-    bodies: list[RobotBody] = []
-    parents: set[str] = set()
-    for body in reversed(robot.bodies):  # children come before parents
-        bare = not body.mass and not any(body.inertia) and not body.parameter
-        point = body.joint == "fixed" and bare and body.name not in parents
-        note = "" if point and body.note == BARE else body.note
-        bodies.append(replace(body, point=point, note=note))
-        if not point:
-            parents.add(body.parent)
-    return replace(robot, bodies=tuple(bodies[::-1]))
-
-
-def _with_scene_names(robot: Robot) -> Robot:
-    """Return the robot with names that are valid in a scene and unique.
-
-    A coordinate also reserves its velocity's name, and a body those of its centre of mass.
-    """
-    taken = {name for unit in DEPTHS for name in _stop_names(unit)} if robot.stopped else set()
-
-    def fit(name: str, *ends: str) -> str:
-        plain = names.plain(name)[:_NAME].rstrip("_")
-        k = 1
-        while True:
-            new = plain if k == 1 else f"{plain}_{k}"
-            mine = {new + end for end in ends}
-            if not names.fault(new) and not mine & taken:
-                taken.update(mine)
-                return new
-            k += 1
-
-    coordinates = {m.name: fit(m.name, "", "_dot") for m in robot.motions}
-    lengths = {t.name: fit(t.name, "") for t in robot.tendons}
-    tendons = tuple(
-        replace(t, name=lengths[t.name], terms=tuple((by, coordinates[q]) for by, q in t.terms))
-        for t in robot.tendons
-    )
-    along = coordinates | lengths
-    drives = tuple(
-        replace(d, name=fit(d.name, "", *actuation.law_names(d)), coordinate=along[d.coordinate])
-        for d in robot.drives
-    )
-    bodies = {WORLD: WORLD}
-    out = []
-    for body in robot.bodies:
-        name = fit(body.name, "", "_x", "_y", "_z")
-        if name == WORLD:
-            name = fit("world_body", "", "_x", "_y", "_z")
-        bodies[body.name] = name
-        motions = tuple(
-            replace(m, name=new, note=_renamed(m.name, new, m.note))
-            if (new := coordinates.get(m.name, ""))
-            else replace(m, mimics=_mimic_in_scene(m, coordinates))
-            for m in body.motions
-        )
-        note = _renamed(body.name, name, body.note)
-        parameter = fit(body.parameter, "") if body.parameter else ""
-        out.append(
-            replace(
-                body, name=name, parent=bodies[body.parent], motions=motions, note=note,
-                parameter=parameter,
-            )
-        )  # fmt: skip
-    rows = [f"_{kind}" for joint in CLOSINGS.values() for kind in joint.space]
-    loops = tuple(
-        replace(loop, name=fit(loop.name, "", *rows), bodies=(bodies[one], bodies[other]))
-        for loop in robot.loops
-        for one, other in [loop.bodies]
-    )
-    couplings = tuple(
-        replace(
-            c,
-            name=fit(c.name, ""),
-            first=tuple((by, coordinates[q]) for by, q in c.first),
-            second=tuple((by, coordinates[q]) for by, q in c.second),
-        )
-        for c in robot.couplings
-    )
-    name = names.plain(robot.name)[:_NAME].rstrip("_")
-    if names.module_fault(name):
-        name += "_robot"
-    return replace(
-        robot, name=name, bodies=tuple(out), drives=drives, tendons=tendons, loops=loops,
-        couplings=couplings,
-    )  # fmt: skip
-
-
-def _mimic_in_scene(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
-    """Return the mimic of a joint with the coordinate's name in the scene."""
-    mimic = motion.mimics
-    return mimic and replace(mimic, coordinate=coordinates[mimic.coordinate])
-
-
-def _renamed(old: str, new: str, note: str) -> str:
-    return note if old == new else joined(f"'{old}' in the file", note)
-
-
-# --- the text -------------------------------------------------------------------------------------
+_FORCES = {"rad": "N m", "m": "N"}  # by a coordinate's unit
+_MAX_TERMS = 50  # of one sum: each term nests the formula deeper, and the limit on depth is 150
 
 
 def scene_text(robot: Robot) -> str:
@@ -209,16 +48,16 @@ def scene_text(robot: Robot) -> str:
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
     stops = joint_stops(robot) if robot.stopped else []
-    numbers = parameters(robot) | actuation.gains(robot)
+    numbers = parameters(robot) | gains(robot)
     for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in stops)):
-        deep, soft = _stop_names(unit)
+        deep, soft = stop_parameters(unit)
         numbers[deep] = _depth(unit)
         numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
     tables = {
-        "[inputs]": actuation.inputs(robot),
+        "[inputs]": inputs(robot),
         "[parameters]": numbers,
-        "[definitions]": actuation.definitions(robot),
-        "[energy]": actuation.energies(robot),
+        "[definitions]": definitions(robot),
+        "[energy]": energies(robot),
         "[forces]": {s.coordinate: _stop(s) for s in stops},
     }
     parts += [_table(head, entries) for head, entries in tables.items() if entries]
@@ -239,12 +78,6 @@ def scene_text(robot: Robot) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _stop_names(unit: str) -> tuple[str, str]:
-    """Return the names of the parameters of stops of this unit: depth and damping."""
-    kind = "slide" if unit == "m" else "turn"
-    return f"stop_depth_{kind}", f"stop_damping_{kind}"
-
-
 def _depth(unit: str) -> str:
     note = "how deep a joint's effort pushes it into its stop"
     return f"{{ value = {number(DEPTHS[unit])}, unit = {toml(unit)}, note = {toml(note)} }}"
@@ -252,7 +85,7 @@ def _depth(unit: str) -> str:
 
 def _stop(s: Stop) -> str:
     """Return the formula of a stop's force, described in `joint_stops`."""
-    deep, soft = _stop_names(s.unit)
+    deep, soft = stop_parameters(s.unit)
     q, (low, high) = s.coordinate, (length(x, s.unit).strip('"') for x in s.limits)
     before = f"max(0, {low} - {q})*max(0, 1 - {soft}*{q}_dot)"
     beyond = f"max(0, {q} - {high})*max(0, 1 + {soft}*{q}_dot)".replace("- -", "+ ")
@@ -340,7 +173,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
             entry[key] = values[0] if len(set(values)) == 1 else _each(values)
     if width := max((m.friction_width for m in body.motions), default=0.0):
         entry["friction_width"] = number(width)
-    forces = [actuation.force(m.name, robot) for m in body.motions]
+    forces = [force(m.name, robot) for m in body.motions]
     if any(force != "0" for force in forces):
         entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])
     if body.note:
@@ -378,3 +211,254 @@ def _bullet(words: str) -> list[str]:
         line(words), 98, initial_indent="# - ", subsequent_indent="#   ",
         break_on_hyphens=False,
     )  # fmt: skip
+
+
+# --- inputs, control laws, tendons, and compensation of weights -----------------------------------
+
+
+def inputs(robot: Robot) -> dict[str, str]:
+    """Return the entries of the scene's table [inputs]: the TOML text of each input, by name.
+
+    The scene has one input for each drive of the robot.
+    """
+    return {d.name: _input(d, robot) for d in robot.drives}
+
+
+def gains(robot: Robot) -> dict[str, str]:
+    """Return the entries of the scene's table [parameters] for the gains of servos.
+
+    They map the name of each gain (kp or kv) to its TOML text.
+    """
+    units, entries = _units(robot), {}
+    for d in robot.drives:
+        if d.law:
+            unit = units.get(d.coordinate, "") if d.gear == 1 else ""
+            values = {"kp": d.law.kp, "kv": d.law.kv}
+            for key, suffix in (("kp", f"/{unit}"), ("kv", f" s/{unit}")):
+                shown = f", unit = {toml(_FORCES[unit] + suffix)}" if unit else ""
+                if values[key]:
+                    entries[f"{d.name}_{key}"] = f"{{ value = {number(values[key])}{shown} }}"
+    return entries
+
+
+def definitions(robot: Robot) -> dict[str, str]:
+    """Return entries of the scene's table [definitions]: the TOML text of each formula, by name.
+
+    The formulas are the lengths of tendons and the forces of servos.
+    """
+    driven = {d.coordinate for d in robot.drives}
+    acting = [t for t in robot.tendons if t.acts or t.name in driven]
+    entries = {t.name: toml(less(total(t.terms), -t.offset)) for t in acting}
+    for d in robot.drives:
+        if d.law:
+            entries[f"{d.name}_force"] = toml(_law(d, d.law, robot))
+    return entries
+
+
+def energies(robot: Robot) -> dict[str, str]:
+    """Return entries of the scene's table [energy]: the TOML text of each formula, by its key.
+
+    The energies are those of tendons, and of the weight that is compensated (gravcomp in MJCF).
+    """
+    rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
+    lifted = [b for b in robot.bodies if b.lifted and b.mass]
+    weights = [
+        (g, _sum([_weight(b, axis) for b in lifted]))
+        for g, axis in zip(robot.gravity, "xyz", strict=True)
+        if g and lifted
+    ]
+    sums = {
+        "kinetic": [(t.armature, rate) for t, rate in rates if t.armature],
+        "potential": [*((t.stiffness, _spring(t)) for t in robot.tendons if t.stiffness), *weights],
+        "dissipation": [(t.damping, rate) for t, rate in rates if t.damping],
+    }
+    return {key: _long(total(terms)) for key, terms in sums.items() if terms}
+
+
+def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
+    """Return the compensated share of a body's mass, and its centre's coordinate on `axis`."""
+    if body.parameter:
+        return body.lifted, f"{body.parameter}*{body.name}_{axis}"
+    return body.lifted * body.mass, f"{body.name}_{axis}"
+
+
+def force(coordinate: str, robot: Robot) -> str:
+    """Return the formula of the force (N or N m) that drives exert along a coordinate.
+
+    It is the value of the key `actuator` in a scene, and "0" if no drive acts on the coordinate.
+    """
+    terms = [
+        (by * d.gear, f"{d.name}_force" if d.law else d.name)
+        for d in robot.drives
+        for by, q in robot.coordinate_terms(d.coordinate)
+        if q == coordinate
+    ]
+    return total(terms)
+
+
+def _units(robot: Robot) -> Mapping[str, str]:
+    return {m.name: m.unit for m in robot.motions}
+
+
+def _input(drive: Drive, robot: Robot) -> str:
+    unit = _units(robot).get(drive.coordinate, "") if drive.gear == 1 else ""
+    note = drive.note or f"along {drive.coordinate}"
+    if drive.law:
+        at = drive.law.set_point
+        unit = unit and {"kp": unit, "kv": f"{unit}/s"}.get(at, "")
+        what = {"kp": "set point of", "kv": "set point of the rate of"}.get(at, "control along")
+        note = joined(f"{what} {drive.coordinate}", drive.note)
+    elif unit:
+        unit = _FORCES[unit]
+    of = f"unit = {toml(unit)}, " if unit else ""
+    if drive.start:
+        of += f"signal = {number(drive.start)}, "
+    if robot.limited and drive.limits != UNLIMITED:
+        of += f"limits = [{', '.join(map(number, drive.limits))}], "
+    return f"{{ {of}note = {toml(note)} }}"
+
+
+def _law(d: Drive, law: Law, robot: Robot) -> str:
+    """Return the formula of a servo's force, before the gear."""
+    coordinate = d.coordinate in _units(robot)
+    q, rate = d.coordinate, f"{d.coordinate}_dot" if coordinate else f"dot({d.coordinate})"
+    gain, by_length, by_rate = law.gain
+    pulls = {"kp": (law.kp, q), "kv": (law.kv, rate)}
+    words = []
+    if at := law.set_point:
+        words.append(f"{d.name}_{at}*({total([(1.0, d.name), (-d.gear, pulls.pop(at)[1])])})")
+        gain = 0.0
+    terms = [
+        (gain, d.name),
+        (by_length * d.gear, f"{q}*{d.name}"),
+        (by_rate * d.gear, f"{rate}*{d.name}"),
+        *((-d.gear * bool(k), f"{d.name}_{key}*{of}") for key, (k, of) in pulls.items()),
+    ]
+    words += [total([(by, of)]) for by, of in terms if by]
+    words += [number(law.bias[0])] if law.bias[0] else []
+    text = " + ".join(words).replace("+ -", "- ") or "0"
+    if robot.limited and law.force != UNLIMITED:
+        low, high = map(number, law.force)
+        text = f"min(max({text}, {low}), {high})"
+    return text
+
+
+def _spring(t: Tendon) -> str:
+    """Return the energy of a spring of stiffness 1, which is zero within its range of rest."""
+    low, high = t.rest
+    if low == high:
+        return f"({less(t.name, low)})**2/2"
+    beyond = f"max(0, {less(t.name, high)})", f"max(0, {less(f'-{t.name}', -low)})"
+    return f"({beyond[0]}**2 + {beyond[1]}**2)/2"
+
+
+def _sum(terms: Sequence[tuple[float, str]]) -> str:
+    """Return a sum in parentheses; a long one is split into partial sums."""
+    if len(terms) <= _MAX_TERMS:
+        return f"({total(terms)})"
+    return (
+        "("
+        + " + ".join(_sum(terms[k : k + _MAX_TERMS]) for k in range(0, len(terms), _MAX_TERMS))
+        + ")"
+    )
+
+
+def _long(formula: str) -> str:
+    """Return a formula of plain names and numbers as TOML, wrapped if it is long."""
+    lines = textwrap.wrap(formula, 98, break_long_words=False, break_on_hyphens=False)
+    return toml(formula) if len(lines) < 2 else '"""\n' + "\n".join(lines) + '"""'
+
+
+# --- masses as parameters -------------------------------------------------------------------------
+
+
+def parameters(robot: Robot) -> dict[str, str]:
+    """Return the entries of the scene's table [parameters] for masses and payloads.
+
+    They map the name of each mass parameter to its TOML text.
+    """
+    entries = {}
+    for b in robot.bodies:
+        if b.parameter:
+            note = "" if b.mass else f", note = {toml(f'payload at {b.parent}')}"
+            entries[b.parameter] = f'{{ value = {number(b.mass)}, unit = "kg"{note} }}'
+    return entries
+
+
+def inertia_text(body: RobotBody) -> str:
+    """Return the TOML text of a body's inertia tensor about its centre of mass.
+
+    If the mass is a parameter of the scene, the entries are formulas proportional to it.
+    """
+    tensor_entries = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
+    if not body.parameter:
+        return f"[{', '.join(map(number, tensor_entries))}]"
+    entries = []
+    for k, entry in enumerate(tensor_entries):
+        rotor = body.rotor if k < 3 else 0.0
+        own = entry - rotor
+        text = f"{number(own)}*{body.parameter}/{number(body.mass)}" if own else ""
+        text = f"{number(rotor)} + {text}" if text and rotor else text or number(rotor)
+        entries.append(toml(text) if own else text)
+    return f"[{', '.join(entries)}]"
+
+
+# --- numbers, angles and sums as formulas ---------------------------------------------------------
+
+
+def number(x: float) -> str:
+    """Return the shortest text that reads back as the number x."""
+    short = repr(float(x)).removesuffix(".0")
+    return "0" if short == "-0" else short
+
+
+def angle(x: float) -> str:
+    """Return the TOML text of an angle x (rad): a number such as 0.3, or a formula such as "pi/2".
+
+    The formula, in quotes, is used for multiples of pi/12, to within 1e-10.
+    """
+    twelfths = round(x * 12 / math.pi)
+    if abs(x - twelfths * math.pi / 12) > SNAP or abs(twelfths) > 48:
+        return _shortest(x)
+    if not twelfths:
+        return "0"
+    common = math.gcd(twelfths, 12)
+    above, below = abs(twelfths) // common, 12 // common
+    words = ("-" if twelfths < 0 else "") + (f"{above}*pi" if above > 1 else "pi")
+    return f'"{words}/{below}"' if below > 1 else f'"{words}"'
+
+
+def _shortest(x: float) -> str:
+    """An angle of a rotation, computed to about 4e-16: no more digits than that means."""
+    for digits in range(1, 17):
+        short = f"{x:.{digits}g}"
+        if abs(float(short) - x) <= 4e-16:
+            return number(float(short))
+    return number(x)
+
+
+def length(x: float, of: str) -> str:
+    """Return the TOML text of x, an angle if `of` is "rad", or a length if `of` is "m".
+
+    An angle that is a multiple of pi/12 is written as a formula in quotes, such as "pi/2".
+    """
+    return angle(x) if of == "rad" else number(x)
+
+
+def vector(v: Vector) -> str:
+    """Return the TOML text of a vector, an array of numbers."""
+    return f"[{', '.join(map(number, v))}]"
+
+
+def total(terms: Sequence[tuple[float, str]]) -> str:
+    """Return the formula of a linear combination as text, such as "2*q1 - q2".
+
+    `terms` are pairs (factor, name of a coordinate).
+    """
+    shown = [{1.0: q, -1.0: f"-{q}"}.get(by, f"{number(by)}*{q}") for by, q in terms]
+    return " + ".join(shown).replace("+ -", "- ") or "0"
+
+
+def less(text: str, x: float) -> str:
+    """Return the text of the formula `text` minus the number x, such as "q1 - 0.5"."""
+    return f"{text} - {number(x)}".replace("- -", "+ ") if x else text

@@ -33,7 +33,7 @@ FRICTION_DECAY_LIMIT = 1e6
 
 
 @dataclass(frozen=True)
-class Element:
+class ForceElement:
     """A damper and a spring that act along the linear combination J q of the coordinates.
 
     Attributes
@@ -129,7 +129,7 @@ def _is_regular(M: Array) -> bool:
     return bool(np.linalg.eigvalsh(M / np.outer(sizes, sizes)).min() > 1e-12)
 
 
-def _fastest(inverse: Array, elements: Sequence[Element]) -> tuple[float, float]:
+def _fastest(inverse: Array, elements: Sequence[ForceElement]) -> tuple[float, float]:
     """Return the largest |Im| and the fastest decay of the eigenvalues, rad/s and 1/s."""
     B, K = np.zeros((2, *inverse.shape))
     for e in elements:
@@ -146,22 +146,26 @@ def _fastest(inverse: Array, elements: Sequence[Element]) -> tuple[float, float]
 FRICTION = "friction of "  # the beginning of such an element's name
 
 
-def _elements(robot: Robot, rows: Sequence[str]) -> list[Element]:
+def _elements(robot: Robot, rows: Sequence[str]) -> list[ForceElement]:
     """Return what damps and what pulls back."""
     elements = []
     for m in (m for body in robot.bodies for m in body.motions):
         J = _of_motion(m, rows)
         elements += [
-            Element(FRICTION + m.name, J, m.friction / FRICTION_WIDTH),
-            Element(f"damping of {m.name}", J, m.damping),
-            Element(f"the spring of {m.name}", J, 0.0, m.stiffness),
+            ForceElement(FRICTION + m.name, J, m.friction / FRICTION_WIDTH),
+            ForceElement(f"damping of {m.name}", J, m.damping),
+            ForceElement(f"the spring of {m.name}", J, 0.0, m.stiffness),
         ]
     for t in robot.tendons:
-        elements.append(Element(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness))
+        elements.append(
+            ForceElement(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness)
+        )
     for d in robot.drives:
         if d.law:
             J = d.gear * _of_sum(robot.coordinate_terms(d.coordinate), rows)
-            elements.append(Element(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0)))
+            elements.append(
+                ForceElement(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0))
+            )
     return [e for e in elements if e.damping or e.stiffness]
 
 

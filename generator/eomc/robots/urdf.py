@@ -16,7 +16,7 @@ from pathlib import Path
 from eomc.base import texts
 from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.base.spatial import transposed
-from eomc.robots import schema, xml
+from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
 from eomc.robots.robot import (
     BARE,
@@ -41,7 +41,7 @@ GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 # elements and their attributes; those with * are not read, only counted
-_SCHEMA = schema.parse(
+_SCHEMA = xml.parse_format(
     """
 robot: name version
  link: name type
@@ -388,7 +388,7 @@ class _Reader:
 
     def _unread_parts(self) -> list[str]:
         """Return notes on the parts of the file that are not modelled."""
-        out = [*schema.unknown_parts(self.root, _SCHEMA, "URDF")]
+        out = [*xml.unknown_parts(self.root, _SCHEMA, "URDF")]
         links, joints = [*self.root.each("link")], [*self.root.each("joint")]
         for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
             parts = [shape for link in links for part in link.each(use) for shape in part.all()]

@@ -1,4 +1,17 @@
-"""Reader of untrusted XML: entities are not expanded, and no other file is opened."""
+"""Untrusted XML: its reader, and the elements and attributes that a format of robot files has.
+
+The reader expands no entities and opens no other file.
+
+A format is written as an outline, with a line for each element, indented by a blank a level:
+
+    joint: name type
+     origin: xyz rpy
+     safety_controller: *
+
+`*` stands for any attributes and child elements: the element is skipped as a whole, and its reader
+reports it. `+` stands for any child elements; only the attributes of the element itself are
+checked. `@name` stands for a group of attributes that several elements share.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +19,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -182,3 +195,98 @@ def _bytes(path: Path, shown: str) -> bytes:
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
         raise EomcError(f"{shown}: can't be read ({why})") from None
+
+
+# --- formats of robot files -----------------------------------------------------------------------
+
+MAX_ENTRIES = 40  # in one line of a report, so that a hostile file prints no book
+
+
+@dataclass(frozen=True)
+class ElementSchema:
+    """The attributes and child elements that an element of a robot file may have.
+
+    Attributes
+    ----------
+    attributes, children
+        Names of the attributes; child elements by name.
+    skipped : bool
+        Whether the contents of the element are not checked.
+    is_open : bool
+        Whether any child elements may occur in it, which are not checked.
+    """
+
+    attributes: frozenset[str] = frozenset()
+    children: dict[str, ElementSchema] = field(default_factory=dict)
+    skipped: bool = False
+    is_open: bool = False
+
+
+def parse_format(outline: str, groups: Mapping[str, str]) -> ElementSchema:
+    """Return the root element that an outline (see the module) describes.
+
+    `groups` maps the name of each group to its attributes, separated by blanks.
+    """
+    top = ElementSchema()
+    stack = [top]
+    for line in outline.strip().splitlines():
+        kind, _, rest = line.strip().partition(":")
+        words = rest.split()
+        names = [n for w in words for n in (groups[w[1:]].split() if w[0] == "@" else [w])]
+        element = ElementSchema(
+            frozenset(names) - {"*", "+"}, skipped="*" in names, is_open="+" in names
+        )
+        depth = len(line) - len(line.lstrip())
+        del stack[depth + 1 :]
+        stack[-1].children[kind] = element
+        stack.append(element)
+    (root,) = top.children.values()
+    return root
+
+
+def unknown_parts(root: Tag, element: ElementSchema, of: str) -> tuple[str, ...]:
+    """Return descriptions of the parts of a file that its format does not define.
+
+    The parts are elements, attributes and texts. `root` is the file's root element, and `element`
+    describes what the format permits in it. `of` is the name of the format, such as "URDF". The
+    contents of unknown elements are not checked.
+    """
+    unknown: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
+
+    def note(kind: str, what: str, place: str) -> None:
+        unknown.setdefault(kind, {}).setdefault(what, []).append(place)
+
+    waiting: list[tuple[Tag, ElementSchema, str]] = [(root, element, "")]
+    while waiting:
+        tag, known, around = waiting.pop()
+        name = tag.get("name")
+        mine = f' "{name}"' if name and known is not element else ""
+        for key in tag.attributes:
+            if key not in known.attributes:
+                note("attributes", f"{key} of {tag.kind}", mine or around)
+        if tag.text:
+            note("text", f"<{tag.kind}>", mine or around)
+        below_it = f" in {tag.kind}{mine or around}" if tag is not root else ""
+        inner: list[tuple[Tag, ElementSchema, str]] = []
+        for child in [] if known.is_open else tag.children:
+            below = known.children.get(child.kind)
+            if below is None:
+                note("elements", f"{child.kind} in {tag.kind}", mine or around)
+            elif not below.skipped:
+                inner.append((child, below, below_it))
+        waiting += reversed(inner)
+    heads = {
+        "elements": f"elements that {of} does not have",
+        "attributes": f"attributes that {of} does not have",
+        "text": f"text between tags, where {of} has attributes",
+    }
+    return tuple(f"{heads[k]}: {_listed(unknown[k])}" for k in heads if k in unknown)
+
+
+def _listed(places: Mapping[str, list[str]]) -> str:
+    """Return each entry with its first place, and the number of its other places."""
+    entries = [
+        f"{what}{where[0]}" + (f" (and {len(where) - 1} more)" if len(where) > 1 else "")
+        for what, where in places.items()
+    ]
+    return texts.listed(entries, MAX_ENTRIES)

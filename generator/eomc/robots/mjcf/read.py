@@ -32,8 +32,7 @@ from eomc.robots.mjcf.schema import SCHEMA
 from eomc.robots.mjcf.tendons import Tendons
 from eomc.robots.robot import Robot, RobotBody, joined, with_left_out_note
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
-from eomc.robots.schema import unknown_parts
-from eomc.robots.xml import Tag
+from eomc.robots.xml import Tag, unknown_parts
 from eomc.scene.assembly import WORLD
 
 # tags in a body that don't affect its motion, and unsupported ones that do

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eomc.robots.schema import Element, parse
+from eomc.robots.xml import ElementSchema, parse_format
 
 ORIENTATION = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
@@ -115,7 +115,7 @@ mujoco: model
 """  # noqa: E501
 
 
-def _nested(root: Element) -> Element:
+def _nested(root: ElementSchema) -> ElementSchema:
     """The schema in which bodies, frames and default classes stand in one another."""
     default, world = root.children["default"], root.children["worldbody"]
     body = world.children["body"]
@@ -126,6 +126,6 @@ def _nested(root: Element) -> Element:
     return root
 
 
-SCHEMA = _nested(parse(_OUTLINE, _GROUPS))
+SCHEMA = _nested(parse_format(_OUTLINE, _GROUPS))
 OPTIONS = SCHEMA.children["option"].attributes
 FLAGS = SCHEMA.children["option"].children["flag"].attributes
