@@ -19,8 +19,7 @@ from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Between, Body, Loop, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
-from eomc.scene.picture import Shape
-from eomc.scene.scene import Scene
+from eomc.scene.scene import Scene, Shape
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # position (n, 3) and rotation (n, 3, 3) of a frame at n states

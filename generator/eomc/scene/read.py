@@ -18,13 +18,9 @@ from eomc.scene import (
     messages,
     repeat,
     schema,
-    tables,
     toml_text,
     validate_bodies,
-    validate_constraints,
-    validate_coordinates,
-    validate_events,
-    validate_picture,
+    validate_tables,
 )
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Input, Output, Quantity, Run, Scene
@@ -119,7 +115,7 @@ class _SceneChecker(Checker):
     ) -> None:
         super().__init__(places)
         self.values = parameters
-        tables.repair(tree, self)
+        _repair_tables(tree, self)
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
@@ -144,18 +140,18 @@ class _SceneChecker(Checker):
         known: dict[str, float] = {}
         constants = self._quantities("constants", known)
         parameters = self._quantities("parameters", known)
-        coordinates = list(validate_coordinates.check_coordinates(self, doc, known))
+        coordinates = list(validate_tables.check_coordinates(self, doc, known))
         self._definitions()
         inputs = self._inputs(known)
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
-        events = list(validate_events.check_events(self, doc))
-        constraints = list(validate_constraints.check_constraints(self, doc))
-        validate_constraints.check_guesses(self, doc)
+        events = list(validate_tables.check_events(self, doc))
+        constraints = list(validate_tables.check_constraints(self, doc))
+        validate_tables.check_guesses(self, doc)
         run = self._run()
-        picture = validate_picture.check_picture(self, doc, known)
-        outputs = self._outputs(validate_constraints.force_names(doc, assembly))
+        picture = validate_tables.check_picture(self, doc, known)
+        outputs = self._outputs(validate_tables.force_names(doc, assembly))
         self._check_requests()
         self._warn_unused()
         if any(p.severity == "error" for p in self.problems):
@@ -448,7 +444,7 @@ class _SceneChecker(Checker):
         out = []
         for name, entry in self.doc.outputs.items():
             path = ("outputs", name, "formula")
-            if validate_constraints.reports_unknown_multiplier(
+            if validate_tables.reports_unknown_multiplier(
                 self, self.doc, path, entry.formula, forces
             ):
                 continue
@@ -487,3 +483,26 @@ class _SceneChecker(Checker):
                     f"'{name}' is not used by any formula: remove it, or use it",
                     severity="warning",
                 )
+
+
+def _repair_tables(tree: dict[str, Any], check: Checker) -> None:
+    """Report unknown tables that newcomers often write, and remove them from the tree of a scene.
+
+    If an unknown table probably stands for a valid one, its entries are moved to the valid table,
+    so that they can be checked. check: object that collects the errors.
+    """
+    for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
+        if match := messages.merge_array(name, tree[name]):
+            table, entries = match
+            check.report((name,), messages.one_table_message(name, table))
+            check.repaired |= {(table,), *((table, key) for key in entries)}
+            del tree[name]
+            existing = tree.get(table)
+            tree[table] = {**entries, **(existing if isinstance(existing, dict) else {})}
+            check.places.rename((name,), (table,))
+        elif name in messages.TABLES:
+            check.report((name,), f"there is no [{name}] in a scene: {messages.TABLES[name]}")
+            del tree[name]
+            if messages.TABLES[name] == messages.ENERGY:
+                tree.setdefault("energy", {"kinetic": "0"})
+                check.repaired.add(("energy",))
