@@ -36,7 +36,7 @@ def loop(scene: Path, root: str, rounds: int, steps: int) -> None:
         module.simulate(h=h, steps=many, every=many)
         best_c = min(best_c, (time.perf_counter() - begun) / many)
         begun = time.perf_counter()
-        _, q, qd = plain.simulate(h=h, steps=steps, every=steps)
+        _, q, qd = plain.simulate(h=h, steps=steps)
         best_python = min(best_python, (time.perf_counter() - begun) / steps)
     run = module.simulate(h=h, steps=steps, every=steps)
     halved = module.simulate(h=h / 2, steps=2 * steps, every=2 * steps)

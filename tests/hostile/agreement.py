@@ -97,7 +97,7 @@ class Scene:
         kind = np.float32 if real == "float" else np.float64
         self.q, self.qd = (np.asarray(x, kind).astype(float) for x in states)
         self.a = answer.acceleration(self.q, self.qd, np.zeros(len(self.q)))
-        _, q, qd = answer.simulate(steps=STEPS, every=STEPS)
+        _, q, qd = answer.simulate(steps=STEPS)
         self.end = np.array([q[-1], qd[-1]])
         self.real, self.eps = real, float(np.finfo(kind).eps)
 

@@ -20,9 +20,8 @@ from eomc.emit.c_expression import DOUBLE, FLOAT, Real
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.verify import one_step
-from eomc.verify.advice import Advice
 from eomc.verify.comparison import Comparison
-from eomc.verify.convergence import Convergence, Measurement
+from eomc.verify.convergence import Advice, Convergence, Measurement
 
 SCENES = Path(__file__).parents[2] / "scenes"
 MODULES = Path("build/tests/modules")

@@ -20,7 +20,7 @@ from eomc.program.assembly import assembled
 from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
-from eomc.verify.discrete import DiscreteReference
+from eomc.verify.reference import DiscreteReference
 from eomc.verify.symbolic import reference_for
 from eomc.verify.taylor import TaylorReference
 

@@ -23,8 +23,7 @@ from eomc.verify import symbolic as references
 from eomc.verify.check import check, value_rows
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence
-from eomc.verify.measurement import Measurement
-from eomc.verify.report import Report
+from eomc.verify.report import Measurement, Report
 from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import SymbolicReference, derive
 

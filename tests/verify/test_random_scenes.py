@@ -23,8 +23,7 @@ from eomc.scene.read import parse
 from eomc.verify import rows_derivatives
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement
-from eomc.verify.report import Report
+from eomc.verify.report import Measurement, Report
 from eomc.verify.rows_derivatives import module_derivatives, slopes
 from eomc.verify.rows_runs import FINE, Runs
 from eomc.verify.sampling import State

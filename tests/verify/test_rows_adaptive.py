@@ -17,7 +17,7 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import rows_adaptive
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement
+from eomc.verify.report import Measurement
 from eomc.verify.rows_adaptive_batch import LIMIT, BatchRows
 from eomc.verify.rows_adaptive_refusals import _Adaptive
 from eomc.verify.rows_refusals import Refusals

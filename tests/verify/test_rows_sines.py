@@ -15,7 +15,7 @@ from conftest import Modules
 
 import eomc
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement
+from eomc.verify.report import Measurement
 from eomc.verify.rows_sines import LIMIT, vanishing
 
 

@@ -14,11 +14,16 @@ from eomc.integrators.tableaux import METHODS
 from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.verify import one_step
-from eomc.verify.advice import PARTS, Advice
-from eomc.verify.convergence import MAX_OBSERVABLE_ORDER, ORDER_MARGIN, Convergence, Place
-from eomc.verify.measurement import Measurement, largest, units
+from eomc.verify.convergence import (
+    MAX_OBSERVABLE_ORDER,
+    ORDER_MARGIN,
+    PARTS,
+    Advice,
+    Convergence,
+    Place,
+)
 from eomc.verify.reference import Vector
-from eomc.verify.report import Row
+from eomc.verify.report import Measurement, Row, largest, units
 from eomc.verify.sampling import (
     EPS,
     LARGE,

@@ -2,7 +2,9 @@
 
 `symbolic.SymbolicReference` evaluates expressions written out, `taylor.TaylorReference` uses Taylor
 arithmetic along the definitions. Both take many states at once, as leading rows of their arguments.
-Constraints are solved by `kkt`.
+Constraints are solved by `kkt`. `DiscreteReference` adds the parameters that jumps at events set to
+one of the two, as discrete variables: each has D = 1, no other entry in its rows, and the kinetic
+energy s_dot**2/2.
 """
 
 from __future__ import annotations
@@ -55,10 +57,14 @@ class Reference(ABC):
         return 0.0
 
     @abstractmethod
-    def _value(
+    def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        """Return the value of `name`, given all arguments."""
+        """Return the value of `name` at one state or at b states.
+
+        Arguments and results are as in `evaluate`, but q, qd and t are arrays, and `values` are
+        those of all parameters, in the order of the system. u is None for the scene's signals.
+        """
 
     def evaluate(
         self,
@@ -91,7 +97,7 @@ class Reference(ABC):
         """
         q = np.asarray(q, float)
         qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
-        return self._value(name, q, qd, t, u, self._values(params))
+        return self.value(name, q, qd, t, u, self._values(params))
 
     def acceleration(
         self,
@@ -177,16 +183,15 @@ class Reference(ABC):
         qd0: ArrayLike | None = None,
         h: float | None = None,
         steps: int | None = None,
-        every: int = 1,
         u: ArrayLike | None = None,
         params: Params = None,
         t0: float = 0.0,
     ) -> tuple[Vector, Vector, Vector]:
-        """Return a run by RK4 steps: times t (n,), and q and qd, both (n, nq).
+        """Return a run of n steps by RK4: times t (n + 1,), and q and q̇, both (n + 1, nq).
 
-        q0, qd0, h (s) and steps default to the scene's initial state, step size and duration.
-        every: the initial state, every `every`-th state and the last one are stored. t0: initial
-        time, s. For b initial states (b, nq), the results q and qd are (n, b, nq).
+        q0, qd0, h (s) and steps default to the scene's initial state, step size and duration. t0:
+        initial time, s. The first row is the initial state. For b initial states (b, nq), the
+        results q and q̇ are (n + 1, b, nq).
         """
         start = self.system.coordinates
         q = np.array([c.start for c in start] if q0 is None else q0, float)
@@ -197,8 +202,7 @@ class Reference(ABC):
         rows = [(t0, q, qd)]
         for n in range(steps):
             q, qd = self._step(q, qd, h, t0 + n * h, u, values)
-            if (n + 1) % every == 0 or n + 1 == steps:
-                rows.append((t0 + (n + 1) * h, q, qd))
+            rows.append((t0 + (n + 1) * h, q, qd))
         times, qs, qds = zip(*rows, strict=True)
         return np.array(times), np.array(qs), np.array(qds)
 
@@ -247,7 +251,7 @@ class Reference(ABC):
     ) -> Vector:
         if self.system.constraints:
             return self._constrained(q, qd, t, u, values)[0]
-        D, force = self._motion(q, qd, t, u, values)
+        D, force = self.mass_and_force(q, qd, t, u, values)
         try:
             return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
         except np.linalg.LinAlgError:  # of one of the states at least
@@ -261,9 +265,9 @@ class Reference(ABC):
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
         """Return q̈ and the multipliers of the independent constraints that are solved for."""
-        D, force = self._motion(q, qd, t, u, values)
+        D, force = self.mass_and_force(q, qd, t, u, values)
         A, gamma = (
-            self._value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
+            self.value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
         )
         return kkt.solve(D, self.solved @ A, force, -gamma @ self.solved.T)
 
@@ -284,7 +288,7 @@ class Reference(ABC):
     ) -> Vector:
         """Return D, or the value `name` of the independent constraints that are solved for."""
         u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
-        value = np.asarray(self._value(name, q, qd, t, u, values))
+        value = np.asarray(self.value(name, q, qd, t, u, values))
         if name == "D":
             return value
         matrix = name == "constraint_jacobian"
@@ -362,11 +366,11 @@ class Reference(ABC):
         dqd, _ = kkt.solve(D, A, rest, -moved)
         return np.stack([dq, dqd])
 
-    def _motion(
+    def mass_and_force(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """Return D and tau - bias."""
-        D, bias, tau = (self._value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
+        """Return D (nq, nq) and the force τ - bias (nq,), with the arguments of `value`."""
+        D, bias, tau = (self.value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
         return D, tau - bias
 
     def _step(
@@ -388,3 +392,90 @@ def by_rows(x: ArrayLike, rows: int) -> list[Any]:
     """Return a list of `rows` values: the entries of x, or x repeated if it is a single number."""
     each: list[Any] = [np.asarray(x).tolist()] * rows
     return each if np.ndim(x) == 0 else np.broadcast_to(x, rows).tolist()
+
+
+VECTORS = ("g", "bias", "tau", "friction")
+WITH_KINETIC_ENERGY = ("kinetic", "energy", "jacobi")
+
+
+class DiscreteReference(Reference):
+    """Reference of a system with discrete variables: parameters that jumps at events set.
+
+    A reference is the independent evaluation of the equations in Python. system: the system, with
+    the discrete variables as additional coordinates. core: the reference of the same system with
+    the discrete variables as parameters.
+    """
+
+    def __init__(self, system: System, core: Reference) -> None:
+        self.system, self.core = system, core
+        names = [c.name for c in system.coordinates]
+        self.continuous_indices = [k for k, name in enumerate(names) if name not in system.discrete]
+        self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
+
+    def terms(self, name: str, s: Mapping[str, Any]) -> float:
+        """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
+
+        s: the arguments of `evaluate` by name. See `Reference.terms`.
+        """
+        q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
+        values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
+        params = {**(s.get("params") or {}), **values}
+        own = {
+            **s,
+            "q": q[self.continuous_indices],
+            "qd": qd[self.continuous_indices],
+            "params": params,
+        }
+        added = float(np.sum(qd[self.discrete_indices] ** 2)) / 2 if name == "energy" else 0.0
+        return self.core.terms(name, own) + added
+
+    def value(
+        self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> Any:
+        """Return the value of `name`; see `Reference.value`."""
+        value = np.asarray(self.core.value(name, *self._core_arguments(q, qd, t, u, values)))
+        if name in WITH_KINETIC_ENERGY:
+            value = value + np.sum(qd[..., self.discrete_indices] ** 2, axis=-1) / 2
+        elif name in VECTORS or name == "constraint_jacobian":
+            value = self._with_discrete_columns(value)
+        elif name in ("D", "C"):
+            value = self._with_discrete_block(value, float(name == "D"))
+        return value[()]
+
+    def mass_and_force(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> tuple[Vector, Vector]:
+        """Return D and τ - bias; see `Reference.mass_and_force`."""
+        D, force = self.core.mass_and_force(*self._core_arguments(q, qd, t, u, values))
+        return self._with_discrete_block(D, 1.0), self._with_discrete_columns(force)
+
+    def _core_arguments(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> tuple[Vector, Vector, Any, ArrayLike | None, Values]:
+        """Return the arguments of the core reference, discrete variables among the parameters."""
+        discrete = (q[..., k] for k in self.discrete_indices)
+        return (
+            q[..., self.continuous_indices],
+            qd[..., self.continuous_indices],
+            t,
+            u,
+            (*values, *discrete),
+        )
+
+    def _with_discrete_columns(self, columns: Vector) -> Vector:
+        """Return the values with zeros for the discrete variables, (..., nq)."""
+        result = np.zeros(
+            (*columns.shape[:-1], len(self.continuous_indices) + len(self.discrete_indices))
+        )
+        result[..., self.continuous_indices] = columns
+        return result
+
+    def _with_discrete_block(self, matrix: Vector, diagonal: float) -> Vector:
+        """Return the matrix (..., nq, nq) with `diagonal` on the discrete variables' diagonal."""
+        result = np.swapaxes(
+            self._with_discrete_columns(np.swapaxes(self._with_discrete_columns(matrix), -1, -2)),
+            -1,
+            -2,
+        )
+        result[..., self.discrete_indices, self.discrete_indices] = diagonal
+        return result

@@ -17,8 +17,8 @@ import numpy as np
 from eomc.integrators.tableaux import GAUSS16
 from eomc.verify import one_step
 from eomc.verify.comparison import GROWTH_LIMIT, Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import NUDGE, State, simulate
 
 LIMIT, UNIT = 0.1, "tolerances a step, times growth"

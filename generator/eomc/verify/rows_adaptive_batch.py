@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
 from eomc.verify.rows_adaptive import resolves_steps
 from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
 from eomc.verify.rows_runs import parameters

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
 from eomc.verify.rows_adaptive import TIME_ROUNDINGS, resolves_steps
 from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals, with_nonfinite_entries
 from eomc.verify.rows_runs import parameters

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
 from eomc.verify.rows_refusals import SINGULAR
 from eomc.verify.rows_runs import EVERY, LONG, TURNS, RunResult, Runs, run_in_c
 from eomc.verify.sampling import State

@@ -19,9 +19,8 @@ import numpy as np
 from eomc.scene.assembly import Loop
 from eomc.verify import rows_projection
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import STENCIL, Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.rows_bodies import Line, widths
 from eomc.verify.sampling import (
     EPS,

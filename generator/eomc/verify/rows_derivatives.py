@@ -10,9 +10,8 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.sampling import NUDGE, Expected, State, evaluate_module, perturb_each_input
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference

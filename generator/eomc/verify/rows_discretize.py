@@ -17,9 +17,8 @@ from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
 from eomc.verify.comparison import Comparison
 from eomc.verify.derivatives import WIDTHS, relative_differences
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import STENCIL, Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.sampling import MAX_DISTANCE, State
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative

@@ -17,8 +17,8 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement
 from eomc.verify.rows_runs import run_in_c
 from eomc.verify.sampling import State
 

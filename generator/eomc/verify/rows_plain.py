@@ -16,9 +16,8 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
 from eomc.verify.comparison import GROWTH_LIMIT, Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.sampling import (
     NUDGE,
     VALUES,

@@ -16,9 +16,8 @@ import numpy as np
 
 from eomc.verify import kkt
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.rows_refusals import FACTORS, Refusals
 from eomc.verify.rows_runs import parameters, run_in_c
 from eomc.verify.sampling import Expected, State, evaluate_module

@@ -21,8 +21,8 @@ from eomc.model.system import System, t
 from eomc.verify import derivatives
 from eomc.verify.angles import largest_angle
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps

@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement
 from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement
 from eomc.verify.sampling import Expected
 
 LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.measurement import Measurement, largest
 from eomc.verify.reference import Vector
-from eomc.verify.report import LIMIT
+from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.sampling import State, simulate
 
 STEPS = 250  # of a run

@@ -22,8 +22,15 @@ from eomc.base.errors import EomcError
 from eomc.model.discrete import with_constant_parameters
 from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, t
-from eomc.verify.discrete import DiscreteReference
-from eomc.verify.reference import MATRICES, SCALARS, Reference, Values, Vector, by_rows
+from eomc.verify.reference import (
+    MATRICES,
+    SCALARS,
+    DiscreteReference,
+    Reference,
+    Values,
+    Vector,
+    by_rows,
+)
 from eomc.verify.taylor import TaylorReference
 from eomc.verify.trig_simplify import simplify_by_rates, simplify_trig
 
@@ -276,20 +283,21 @@ class SymbolicReference(Reference):
         """
         return float(self.evaluate(f"{name}_terms", **s))
 
-    def _value(
+    def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
+        """Return the value of `name`; see `Reference.value`."""
         if q.ndim == 1:
             return self._value_at_state(name, q, qd, float(t), u, values)
         states = self._states(q, qd, t, u, values)
         return np.array([self._value_at_state(name, *state) for state in states])
 
-    def _motion(
+    def mass_and_force(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """Return D and tau - bias from one evaluation."""
+        """Return D and τ - bias, by one call of a compiled function."""
         n = q.shape[-1]
-        motion = self._value("motion", q, qd, t, u, values)
+        motion = self.value("motion", q, qd, t, u, values)
         D, bias, tau = motion[..., : n * n], motion[..., n * n : -n], motion[..., -n:]
         return D.reshape(*q.shape, n), tau - bias
 
