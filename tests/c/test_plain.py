@@ -144,6 +144,15 @@ def test_both_forms_have_the_same_prototypes(name: str) -> None:
     assert len(plain) > 8
 
 
+@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "cartpole", "rod", "driven"))
+def test_workspaces_have_only_members_that_the_portable_source_uses(name: str) -> None:
+    files, title = generated(name), made(name).name
+    workspaces = re.findall(r"typedef struct \{([^}]*)\} \w+_memory;", files[f"{title}.h"])
+    assert len(workspaces) == len(made(name).run.methods) + bool(made(name).run.tolerance)
+    for member in set(re.findall(r"(\w+)(?:\[\d+\])?[,;]", "".join(workspaces))):
+        assert f"memory->{member}" in files[f"{title}.c"], member
+
+
 @pytest.mark.parametrize("name", tiers(["cartpole", "driven", "everything"], "cartpole"))
 def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
@@ -175,7 +184,7 @@ def test_it_is_smaller_than_the_fast_form(name: str, tmp_path: Path) -> None:
 
 
 def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -> None:
-    """Their memories have different sizes."""
+    """Their workspaces differ."""
     title = kit("cartpole", tmp_path)
     (tmp_path / f"{title}.h").write_text(generated("cartpole")[f"fast/{title}.h"])
     for flags in ([], ["-ffast-math"]):

@@ -131,7 +131,7 @@ def render(program: Program, extension: str) -> Sources:
     return Sources(
         name=name,
         files={
-            **steppers.files(program, show, rooms=fast.rooms(methods)),
+            **steppers.files(program, show),
             **{f"{FAST}/{file}": text for file, text in fast.files(methods, show).items()},
             "main.c": narrowed(show(package.main(target))),
             "selftest.c": narrowed(show(selftest.view(target))),

@@ -39,13 +39,11 @@ Show = Callable[[View], str]  # renders template data as text
 MAX_ITERATIONS = {True: 50, False: 60}  # over the stages, with Newton's method and without
 
 
-def files(
-    program: Program, show: Show, real: Real | None = None, rooms: Sequence[int] = ()
-) -> dict[str, str]:
+def files(program: Program, show: Show, real: Real | None = None) -> dict[str, str]:
     """Return the header and the source of a program in portable C, as texts by file name.
 
     show: function that renders template data as text. real: the C type of numbers; by default that
-    of the scene. rooms: lengths of the workspaces that optimised C needs, see `header`.
+    of the scene.
     """
     plain = portable_functions(program, real)
     name = plain.prefix
@@ -62,7 +60,7 @@ def files(
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
-        show(header(plain, slopes, handshake(plain), rooms or [0] * (len(methods) + 1))),
+        show(header(plain, slopes, handshake(plain))),
         show(
             Source(
                 **source(plain, handshake(plain), slopes, show),
@@ -78,7 +76,7 @@ def header(
     plain: Functions,
     slopes: Slopes | None,
     stamp: str,
-    rooms: Sequence[int],
+    rooms: Sequence[int] = (),
     fast: bool = False,
 ) -> Header:
     """Return the data for the template of the C header, of portable or of optimised C.
@@ -93,13 +91,16 @@ def header(
         Number that the source compares with its own, to detect a header of another build.
     rooms
         Length of the workspace, as a count of numbers, for each integration method in optimised C,
-        and then for adaptive steps; 0 for the length that portable C needs. Headers of both forms
-        reserve the same length, so that a program compiled with one header runs with both.
+        and then for adaptive steps. Empty for portable C, whose runs with fixed steps need none.
     fast
         Whether the header belongs to the optimised C.
     """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
+    *fixed_rooms, adaptive_room = rooms or [
+        *(0 for _ in methods),
+        adaptive.workspace_size(s, len(s.coordinates)),
+    ]
     functions = [*plain.evaluations, plain.acceleration]
     return Header(
         title=FreeText(s.title),
@@ -127,11 +128,10 @@ def header(
                 plain.public.run(m.name), plain.public.batch(m.name) if s.run.batch else None,
                 plain.public.derivative(m.name) if s.run.discretize else None,
             )
-            for m, room in zip(methods, rooms, strict=False)
+            for m, room in zip(methods, fixed_rooms, strict=True)
         ),
         adaptive=AdaptiveDeclared(
-            adaptive.TITLE, adaptive.memory(plain),
-            rooms[-1] or adaptive.workspace_size(s, len(s.coordinates)),
+            adaptive.TITLE, adaptive.memory(plain), adaptive_room,
             plain.public.adaptive(adaptive.METHOD.name),
             plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.steps_in_parallel(target),

@@ -55,7 +55,7 @@ class Declared:
     implicit
         Whether the method is implicit.
     workspace
-        Length of the workspace of a run, as a count of numbers.
+        Length of the workspace of a run, as a count of numbers; 0 for a run that needs none.
     step, run, batch
         Prototypes of the functions for one step, for many steps, and for many instances; `batch` is
         None if the scene does not request it.
