@@ -19,7 +19,7 @@ from forks import in_a_fork as in_a_fork
 import eomc
 from eomc.model.system import System
 from eomc.toolchain import compiler as compiling
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 

@@ -241,14 +241,14 @@ def write_c(
     from dataclasses import replace
 
     from eomc.base import names
-    from eomc.toolchain import c_folder
+    from eomc.toolchain.files import write_c_folder
 
     if prefix is not None and (why := names.module_fault(prefix)):
         raise EomcError(f"--prefix: {why}")
     system = read(scene)
     system = system if prefix is None else replace(system, name=prefix)
     files = sources(system, warn=warn).embeddable
-    c_folder.write(files, Path(folder))
+    write_c_folder(files, Path(folder))
     return files
 
 

@@ -18,7 +18,7 @@ from corner_cases import CASES
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 
 def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from eomc.emit.optimised.files import PLACEHOLDERS
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 from eomc.verify import symbolic
 
 NAMES = [

@@ -13,7 +13,7 @@ from conftest import ROOT, needs, tiers
 import eomc
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 # both headers in one file, and which way each goes
 PROBE = f"""

@@ -25,7 +25,7 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import sizes
 from eomc.toolchain.compiler import Compiler
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 pytestmark = pytest.mark.slow
 CORTEX = ROOT / "docs" / "examples" / "cortex_m"

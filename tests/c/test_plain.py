@@ -25,7 +25,7 @@ from eomc.model.system import System
 from eomc.program import outline
 from eomc.program.assembly import assembled
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 from eomc.verify import rows_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row

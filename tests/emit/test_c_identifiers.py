@@ -26,7 +26,7 @@ from eomc.emit import c_identifiers
 from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"

@@ -22,7 +22,7 @@ from eomc.emit.fmu import units
 from eomc.emit.fmu.files import Unit
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 ODD = """
 eomc = 1

@@ -20,7 +20,7 @@ from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.trig import separate_angles
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 
 def odd() -> program.Program:

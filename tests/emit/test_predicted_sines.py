@@ -19,7 +19,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.optimised.lanes import Accelerations
 from eomc.program import program
 from eomc.program.trig import Angle
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 
 @cache

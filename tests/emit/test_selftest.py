@@ -18,7 +18,7 @@ import eomc
 from eomc.emit.selftest import _rounding_error
 from eomc.model import from_scene as system
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])

@@ -36,7 +36,7 @@ from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.toolchain import compiler
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 from eomc.verify import symbolic
 
 NAMES = ("cartpole", "double_pendulum", "furuta_pendulum", "spring_pendulum", "four_bar")

@@ -41,7 +41,7 @@ from eomc.program.ir import (
 from eomc.program.program import Program
 from eomc.scene import read as scene
 from eomc.toolchain import cache
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 

@@ -27,7 +27,7 @@ from eomc.model import from_scene as system
 from eomc.program import program, two_point
 from eomc.program.ir import Assignment, Operand, Product, Sum
 from eomc.scene import read as scene
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 from eomc.verify import symbolic
 
 # angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that

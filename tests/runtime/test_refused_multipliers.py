@@ -14,7 +14,7 @@ import eomc
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import Reaction
 from eomc.scene.read import parse
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_files
 
 MADE = from_scene(
     parse("""eomc = 1

@@ -13,7 +13,7 @@ import pytest
 from conftest import ROOT
 
 from eomc.base.errors import EomcError
-from eomc.toolchain import extension, lock
+from eomc.toolchain import cache, extension
 
 
 @pytest.mark.slow
@@ -41,16 +41,16 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     monkeypatch.setitem(sys.modules, "fcntl", None)  # type: ignore[arg-type]
     monkeypatch.setattr(sys, "platform", "win32")
     there = ("open", "close", "fstat", "O_RDWR", "O_CREAT")
-    monkeypatch.setattr(lock, "os", SimpleNamespace(**{name: getattr(os, name) for name in there}))
+    monkeypatch.setattr(cache, "os", SimpleNamespace(**{name: getattr(os, name) for name in there}))
     return taken
 
 
 def test_a_lock_of_windows_is_waited_for(windows: list[tuple[int, int]], tmp_path: Path) -> None:
-    with lock.locked(tmp_path / "a.lock"):
+    with cache.locked(tmp_path / "a.lock"):
         assert windows == [(1, 1), (1, 1)]
     assert (tmp_path / "a.lock").read_bytes() == b""
     (tmp_path / "folder").mkdir()
-    with pytest.raises(EomcError, match="remove it"), lock.locked(tmp_path / "folder"):
+    with pytest.raises(EomcError, match="remove it"), cache.locked(tmp_path / "folder"):
         pass
 
 
@@ -61,7 +61,7 @@ def test_a_lock_that_can_not_be_taken_is_an_error(
         raise OSError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(sys.modules["msvcrt"], "locking", refused)
-    with pytest.raises(OSError, match="denied"), lock.locked(tmp_path / "a.lock"):
+    with pytest.raises(OSError, match="denied"), cache.locked(tmp_path / "a.lock"):
         pass
 
 

@@ -9,7 +9,7 @@ import click
 from eomc import pipeline
 from eomc.cli import options
 from eomc.cli.terminal import say, status_line, warn
-from eomc.toolchain import disk_cache
+from eomc.toolchain import cache
 
 
 @click.command("show")
@@ -47,7 +47,7 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):
-        texts = disk_cache.cached_texts(root, name, form or "text", digest, make)
+        texts = cache.cached_texts(root, name, form or "text", digest, make)
     if texts["warnings"]:
         say(texts["warnings"], err=True)
     say(texts["text"])

@@ -1,24 +1,29 @@
-"""Cache of built modules: look-up by key, build under a lock, import, and unpickling.
+"""Cache of built modules: look-up by key, build under a lock, import, unpickling; cached texts.
 
 A module lies in `build/<name>/`. The name of its extension contains a digest, and `__init__.py`,
 which imports that extension, is moved into place last: if a build is interrupted, the old module
 stays complete; if it fails, its files are removed again. A file lock serialises the builds of a
 scene. A build that replaces one of another version of the scene archives the old one in
 `build/<name>/.builds/`, so that pickled values of that version can still be loaded.
+
+Texts that take SymPy seconds to produce, such as the printed equations, are stored in
+`build/.shown/` until the scene, eomc or SymPy changes.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import importlib.util
 import json
 import os
 import shutil
+import stat
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from eomc.base import resources
 from eomc.base.errors import EomcError, FolderError
 from eomc.base.version import __version__
+from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain.compiler import (
     MANY_OPERATIONS,
     STANDARD,
@@ -36,7 +42,6 @@ from eomc.toolchain.compiler import (
     processor,
     standard,
 )
-from eomc.toolchain.lock import locked
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -261,7 +266,7 @@ def _build(
     scene_digest: str,
 ) -> None:
     from eomc.toolchain import extension
-    from eomc.toolchain.subprocesses import write_files
+    from eomc.toolchain.files import write_files
 
     extension_name = f"_{name}_{build_key[:12]}"
     rendered = sources(extension_name)
@@ -466,3 +471,100 @@ def _build_of(place: tuple[str, str, str]) -> ModuleType:
             with suppress(ReplacedError, OSError):
                 return load(Built(name, there, False, key), folder)
     return load(Built(name, Path(folder), False))
+
+
+# --- locks of builds ------------------------------------------------------------------------------
+
+_LOCK_REFUSED = "{}: is no file, and builds of a scene lock one there: remove it"
+_LOCK_FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not needed, on Windows
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock on the file `path` while the block of the with statement runs.
+
+    Other processes that lock the same file wait until the block ends. If the file does not exist,
+    an empty one is created. Raises EomcError if `path` is a symbolic link, a folder, a pipe or
+    anything else that is not a regular file.
+    """
+    try:
+        flags = os.O_RDWR | os.O_CREAT
+        for name in _LOCK_FLAGS:
+            flags |= getattr(os, name, 0)
+        lock = os.open(path, flags, 0o666)
+    except OSError as fault:
+        if fault.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
+            raise
+        raise EomcError(_LOCK_REFUSED.format(path)) from None
+    try:
+        if not stat.S_ISREG(os.fstat(lock).st_mode):
+            raise EomcError(_LOCK_REFUSED.format(path))
+        _wait(lock)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _wait(lock: int) -> None:
+    """Wait for the exclusive lock; closing the file releases it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        while True:
+            try:
+                msvcrt.locking(lock, msvcrt.LK_LOCK, 1)  # first byte, which need not exist
+                return
+            except OSError as fault:  # LK_LOCK gives up after ten seconds
+                if fault.errno != errno.EDEADLK:
+                    raise
+    else:
+        import fcntl
+
+        fcntl.flock(lock, fcntl.LOCK_EX)
+
+
+# --- cached texts ---------------------------------------------------------------------------------
+
+
+def cached_texts(
+    root: Path, name: str, kind: str, scene_digest: str, make: Callable[[], dict[str, str]]
+) -> dict[str, str]:
+    """Return the texts that `make` produces, from a cache on disk if they are up to date.
+
+    They are up to date if the scene, eomc and the version of SymPy have not changed since.
+
+    Parameters
+    ----------
+    root : Path
+        Build directory; the cache is its subfolder .shown.
+    name : str
+        Name of the scene; "" disables the cache.
+    kind : str
+        Kind of texts; it is part of the name of the cache's file.
+    scene_digest : str
+        Digest of the scene's text.
+    make : callable
+        Returns the texts by name. It is called if they are not in the cache, or out of date.
+
+    Returns
+    -------
+    dict
+        The texts by name. They are returned without being cached if the folder can't be written.
+    """
+    from importlib.metadata import version
+
+    file = root / ".shown" / f"{name}.{kind}.json"
+    parts = (scene_digest, kind, generator_digest(), version("sympy"))
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    if name:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            if stored["key"] == key:
+                return {str(k): str(v) for k, v in stored["texts"].items()}
+    results = make()
+    if name:
+        with suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(file, cached=True) as new:
+                new.write_text(json.dumps({"key": key, "texts": results}), encoding="utf-8")
+    return results

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError, NoCompilerError
-from eomc.toolchain import archive
 from eomc.toolchain.compiler import Compiler, compiler_for, flags, standard
-from eomc.toolchain.subprocesses import run, try_load, write_files
+from eomc.toolchain.files import write_archive, write_files
+from eomc.toolchain.subprocesses import run, try_load
 
 if TYPE_CHECKING:
     from eomc.emit.fmu.files import Unit
@@ -54,7 +54,7 @@ def export(unit: Unit, file: Path, binary: bool = True) -> Exported:
         except NoCompilerError as fault:
             why = str(fault)
     texts = {name: text.encode(errors="backslashreplace") for name, text in unit.files.items()}
-    archive.write(file, dict(sorted((texts | binaries).items())), "binaries")
+    write_archive(file, dict(sorted((texts | binaries).items())), "binaries")
     return Exported(file, folder, why)
 
 

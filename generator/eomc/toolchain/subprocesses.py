@@ -6,7 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -31,17 +31,6 @@ def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
     finally:
         for process in running:
             _terminate(process)
-
-
-def write_files(files: Mapping[str, str], folder: Path) -> None:
-    """Write text files into a folder, and create missing folders.
-
-    files: the text of each file, by its path relative to `folder`. Characters that are not valid
-    Unicode, which names of scene files may contain, are escaped.
-    """
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def try_load(

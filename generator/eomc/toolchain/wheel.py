@@ -21,9 +21,9 @@ from eomc.base import texts
 from eomc.base.version import __version__
 from eomc.emit.render import Sources, show
 from eomc.emit.views import Compiled, Form
-from eomc.toolchain import archive, extension
+from eomc.toolchain import extension
 from eomc.toolchain.compiler import FLAGS, compiler_for, user_flags
-from eomc.toolchain.subprocesses import write_files
+from eomc.toolchain.files import write_archive, write_files
 
 COMPILED = "compiled"  # name of the module that chooses an extension
 OLDEST_GLIBC = 17  # minor version, glibc 2.17: the oldest for which wheels have a tag
@@ -114,7 +114,7 @@ def build(sources: Sources, scene: bytes, digest: str, title: str, folder: Path)
         f"Wheel-Version: 1.0\nGenerator: eomc {__version__}\nRoot-Is-Purelib: false\nTag: {tag}\n"
     ).encode()
     wheel = folder / f"{name}-{version}-{tag}.whl"
-    archive.write(wheel, _with_record(contents, f"{info}/RECORD"))
+    write_archive(wheel, _with_record(contents, f"{info}/RECORD"))
     return wheel
 
 
