@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mjcf_text import BALL, BODY, CLOSE, PI, model, refused, reported
 
-from eomc.robots.robot import Law, Motion
+from eomc.robots.robot import JointMotion, Law
 from eomc.robots.rotations import IDENTITY
 
 # ---- frames and joints
@@ -270,7 +270,7 @@ def test_springdamper_is_a_stiffness_and_a_damping_for_what_the_joint_moves(tmp_
     ball = '<geom size="0.1" mass="2"/>'
     own = 'springdamper="0.2 1.5" stiffness="7" damping="7" armature="0.5"'
 
-    def motions(joint: str, before: str = "", after: str = "") -> tuple[Motion, ...]:
+    def motions(joint: str, before: str = "", after: str = "") -> tuple[JointMotion, ...]:
         return model(tmp_path, f"<body>{joint}{ball}</body>", before, after).motions
 
     for joint, m in (

@@ -11,7 +11,7 @@ from mjcf_text import refused
 from eomc.base.errors import EomcError, SceneError
 from eomc.cli.main import main as cli
 from eomc.robots.mjcf import read
-from eomc.robots.robot import Motion
+from eomc.robots.robot import JointMotion
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_included_files_stand_in_the_place_of_include(tmp_path: Path) -> None:
         joint='<x><joint ref="0.5"/></x>',
     )
     (motion,) = read.read(main, include=True).motions
-    assert motion == Motion("a_joint", "rad", start=0.5, damping=2)
+    assert motion == JointMotion("a_joint", "rad", start=0.5, damping=2)
     with pytest.raises(SceneError, match="is not opened"):
         read.read(main)
 

@@ -15,7 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.robots import edit, inertias, preparation, rotations, scene_text
 from eomc.robots.inertias import Inertia
-from eomc.robots.robot import Drive, Motion, Robot, RobotBody, body_pose
+from eomc.robots.robot import Drive, JointMotion, Robot, RobotBody, body_pose
 from eomc.scene.read import parse
 
 angles = st.one_of(
@@ -176,13 +176,13 @@ def arm() -> Robot:
         (0.0, 0.0, -9.81),
         (
             RobotBody("base"),
-            RobotBody("column", "base", "revolute", (Motion("pan", "rad", start=0.5),),
+            RobotBody("column", "base", "revolute", (JointMotion("pan", "rad", start=0.5),),
                       ((0.0, 0.0, 1.0),), (0.0, 0.0, 0.4), mass=2.0, inertia=inertia),
-            RobotBody("boom", "column", "revolute", (Motion("lift", "rad", damping=0.1),),
+            RobotBody("boom", "column", "revolute", (JointMotion("lift", "rad", damping=0.1),),
                       ((0.0, 1.0, 0.0),), (0.1, 0.0, 0.0), rotations.from_rpy(0, 0, math.pi / 2),
                       mass=1.0, center=(0.5, 0.0, 0.0), inertia=inertia),
             RobotBody("lamp", "column", mass=0.1),
-            RobotBody("trolley", "boom", "prismatic", (Motion("reach", "m", note="0 to 1"),),
+            RobotBody("trolley", "boom", "prismatic", (JointMotion("reach", "m", note="0 to 1"),),
                       ((1.0, 0.0, 0.0),), mass=0.5, inertia=inertia),
             RobotBody("hook", "trolley", offset=(0.2, 0.0, 0.0), mass=0.2),
             RobotBody("tip frame", "hook", offset=(0.1, 0.0, 0.0)),
@@ -290,7 +290,7 @@ def test_the_scene_says_what_differs_from_the_defaults_and_no_more() -> None:
 
 
 def test_springs_of_joints() -> None:
-    motion = Motion("pan", "rad", stiffness=3.0, rest=math.pi / 4, armature=0.02, friction=0.1)
+    motion = JointMotion("pan", "rad", stiffness=3.0, rest=math.pi / 4, armature=0.02, friction=0.1)
     body = replace(arm().bodies[1], motions=(motion,))
     robot = replace(arm(), bodies=(RobotBody("base"), body), drives=())
     tree = tomllib.loads(scene_text.scene_text(robot))
@@ -314,10 +314,10 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     body = arm().bodies[1]
     bodies = (
         RobotBody("lambda"),
-        replace(body, name="a-b", parent="lambda", motions=(Motion("a.b", "rad"),)),
-        replace(body, name="a b", parent="a-b", motions=(Motion("a_b_dot", "rad"),)),
-        replace(body, name="x" * 60, parent="a b", motions=(Motion("while", "rad"),)),
-        replace(body, name="y", parent="x" * 60, motions=(Motion("y_x", "rad"),)),
+        replace(body, name="a-b", parent="lambda", motions=(JointMotion("a.b", "rad"),)),
+        replace(body, name="a b", parent="a-b", motions=(JointMotion("a_b_dot", "rad"),)),
+        replace(body, name="x" * 60, parent="a b", motions=(JointMotion("while", "rad"),)),
+        replace(body, name="y", parent="x" * 60, motions=(JointMotion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
     robot = preparation.prepared_for_scene(
@@ -342,8 +342,11 @@ def test_texts_of_strangers_stay_texts() -> None:
 
 
 def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
-    bodies = (*arm().bodies[:6], RobotBody("finger", "hook", "revolute", (Motion("f-1", "rad"),),
-                                           ((1.0, 0.0, 0.0),), note="a mesh only"))  # fmt: skip
+    finger = RobotBody(
+        "finger", "hook", "revolute", (JointMotion("f-1", "rad"),), ((1.0, 0.0, 0.0),),
+        note="a mesh only",
+    )  # fmt: skip
+    bodies = (*arm().bodies[:6], finger)
     with pytest.raises(EomcError) as fault:
         preparation.prepared_for_scene(replace(arm(), bodies=bodies))
     assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(

@@ -12,7 +12,7 @@ from mjcf_text import model
 from eomc.base.errors import SceneError
 from eomc.robots import urdf, xml
 from eomc.robots.mjcf import read
-from eomc.robots.mjcf.schema import ACTUATORS, SCHEMA
+from eomc.robots.mjcf.file import ACTUATORS, SCHEMA
 
 BEFORE = """<compiler angel="radian"><x/></compiler>
   <option gravty="0 0 -1"><flag gravitty="disable"/><flags/></option>

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.robots.robot import UNLIMITED, Motion, Range, Robot
+from eomc.robots.robot import UNLIMITED, JointMotion, Range, Robot
 
 # notes of the readers: on limits that take effect here, and on those of position and speed
 _ACTING = re.compile(r"limits of (actuators|the actuators' force on joints), kept as notes")
@@ -128,7 +128,7 @@ def joint_stops(robot: Robot) -> list[Stop]:
                 abs(factor) * d.max_force if factor else 0.0
             )
 
-    def stop(m: Motion) -> Stop:
+    def stop(m: JointMotion) -> Stop:
         effort = min(max(map(abs, m.driven)), drive_force.get(m.name, math.inf))
         known = 0 < effort < math.inf
         effort = effort if known else float(f"{holding_effort[m.name]:.3g}") or 1.0

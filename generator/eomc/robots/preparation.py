@@ -15,8 +15,8 @@ from eomc.robots.inertias import has_nearest, indefinite, unbalanced
 from eomc.robots.limits import DEPTHS, stop_parameters
 from eomc.robots.robot import (
     BARE,
+    JointMotion,
     Mimic,
-    Motion,
     Robot,
     RobotBody,
     RobotLoop,
@@ -181,7 +181,7 @@ def _with_scene_names(robot: Robot) -> Robot:
     )  # fmt: skip
 
 
-def _mimic_in_scene(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
+def _mimic_in_scene(motion: JointMotion, coordinates: Mapping[str, str]) -> Mimic | None:
     """Return the mimic of a joint with the coordinate's name in the scene."""
     mimic = motion.mimics
     return mimic and replace(mimic, coordinate=coordinates[mimic.coordinate])

@@ -40,7 +40,7 @@ class Mimic:
 
 
 @dataclass(frozen=True)
-class Motion:
+class JointMotion:
     """One degree of freedom of a joint.
 
     It is a coordinate of the scene (TOML file) unless it mimics another one.
@@ -114,7 +114,7 @@ class RobotBody:
     name: str
     parent: str = WORLD
     joint: str = "fixed"
-    motions: tuple[Motion, ...] = ()
+    motions: tuple[JointMotion, ...] = ()
     axes: tuple[Vector, ...] = ()
     offset: Vector = ORIGIN
     rotation: Matrix = IDENTITY
@@ -350,7 +350,7 @@ class Robot:
     left_out: tuple[str, ...] = ()
 
     @property
-    def motions(self) -> tuple[Motion, ...]:
+    def motions(self) -> tuple[JointMotion, ...]:
         """The coordinates of the robot, in the order of the bodies."""
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
@@ -446,7 +446,9 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
     )
 
 
-def _fixed_position(motion: Motion, values: Mapping[str, float], free: Set[str]) -> float | None:
+def _fixed_position(
+    motion: JointMotion, values: Mapping[str, float], free: Set[str]
+) -> float | None:
     """Return the position of a joint that is fixed; None if it moves."""
     mimics = motion.mimics
     if not mimics:
@@ -502,18 +504,18 @@ def _reduced(c: Coupling, values: Mapping[str, float]) -> Coupling:
     return replace(c, first=first, zero=c.zero - one, second=second, at=c.at - other)
 
 
-def free_motions(of: str = "") -> tuple[Motion, ...]:
+def free_motions(of: str = "") -> tuple[JointMotion, ...]:
     """Return the six coordinates of a free body: x, y, z (m), yaw, pitch, roll (rad).
 
     `of` is the name of the body or joint; if it is not empty, it is appended to the names of the
     coordinates.
     """
     end = f"_{of}" if of else ""
-    slides = (Motion(f"{name}{end}", "m") for name in "xyz")
+    slides = (JointMotion(f"{name}{end}", "m") for name in "xyz")
     turns = (
-        Motion(f"yaw{end}", "rad", note="about z, first"),
-        Motion(f"pitch{end}", "rad", note="about y then; singular at pi/2"),
-        Motion(f"roll{end}", "rad", note="about x then"),
+        JointMotion(f"yaw{end}", "rad", note="about z, first"),
+        JointMotion(f"pitch{end}", "rad", note="about y then; singular at pi/2"),
+        JointMotion(f"roll{end}", "rad", note="about x then"),
     )
     return (*slides, *turns)
 

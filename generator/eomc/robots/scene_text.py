@@ -13,8 +13,8 @@ from eomc.robots.robot import (
     UNLIMITED,
     Coupling,
     Drive,
+    JointMotion,
     Law,
-    Motion,
     Robot,
     RobotBody,
     RobotLoop,
@@ -137,7 +137,7 @@ def _row(c: Coupling) -> str:
     return f"{{ formula = {toml(text)}{unit} }}"
 
 
-def _coordinate(m: Motion, robot: Robot) -> str:
+def _coordinate(m: JointMotion, robot: Robot) -> str:
     start = f", start = {length(m.start, m.unit)}" if m.start else ""
     note = f", note = {toml(m.note)}" if m.note else ""
     guess = ", guess = true" if robot.loops or robot.couplings else ""
@@ -186,7 +186,7 @@ def _turns(turns: Sequence[tuple[str, float]]) -> str:
     return f"[{', '.join(shown)}]"
 
 
-def _moved_by(m: Motion) -> str:
+def _moved_by(m: JointMotion) -> str:
     """Return the coordinate of a joint, or the formula of its position if it mimics another."""
     if not m.mimics:
         return m.name

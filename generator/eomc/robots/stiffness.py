@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from eomc.base import texts
 from eomc.base.spatial import apply, cross, plus, rotated_inertia, scaled, tensor
 from eomc.integrators.tableaux import RK4
-from eomc.robots.robot import Coupling, Motion, Robot, RobotBody, RobotLoop, Terms
+from eomc.robots.robot import Coupling, JointMotion, Robot, RobotBody, RobotLoop, Terms
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
@@ -169,7 +169,7 @@ def _elements(robot: Robot, rows: Sequence[str]) -> list[ForceElement]:
     return [e for e in elements if e.damping or e.stiffness]
 
 
-def _of_motion(motion: Motion, rows: Sequence[str]) -> Array:
+def _of_motion(motion: JointMotion, rows: Sequence[str]) -> Array:
     """Return the gradient of a joint's position over the coordinates."""
     of = motion.mimics
     return _of_sum([(of.gear, of.coordinate) if of else (1.0, motion.name)], rows)

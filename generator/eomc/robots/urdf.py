@@ -22,8 +22,8 @@ from eomc.robots.robot import (
     BARE,
     UNLIMITED,
     Drive,
+    JointMotion,
     Mimic,
-    Motion,
     Robot,
     RobotBody,
     free_motions,
@@ -98,7 +98,7 @@ class _Joint:
     offset: Vector
     rotation: Matrix
     axis: Vector
-    motions: tuple[Motion, ...]
+    motions: tuple[JointMotion, ...]
     drive: Drive | None
 
 
@@ -229,7 +229,7 @@ class _Reader:
             return ""
         return link
 
-    def _motions(self, name: str, kind: str, joint: Tag, key: str) -> tuple[Motion, ...]:
+    def _motions(self, name: str, kind: str, joint: Tag, key: str) -> tuple[JointMotion, ...]:
         if kind == "floating":
             return free_motions(name)
         if kind not in ("revolute", "continuous", "prismatic", "planar"):
@@ -244,10 +244,10 @@ class _Reader:
                     self.say(key, f"its {what} is negative ({value:g}): it would drive the joint")
         of = "m" if kind == "prismatic" else "rad"
         if kind == "planar":
-            slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
-            return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
+            slide = JointMotion(f"x_{name}", "m", damping=damping, friction=friction)
+            return slide, replace(slide, name=f"y_{name}"), JointMotion(f"turn_{name}", "rad")
         start, note = 0.0, "turns without end" if kind == "continuous" else ""
-        ends, limit = Motion.limits, joint.first("limit")
+        ends, limit = JointMotion.limits, joint.first("limit")
         effort = 0.0 if limit is None else self._number(limit, "effort", key)
         if limit is not None and kind != "continuous":
             lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
@@ -257,7 +257,7 @@ class _Reader:
         speed = 0.0 if limit is None else self._number(limit, "velocity", key)
         note = joined(note, f"at most {speed:g} {of}/s" if speed > 0 else "")
         driven = (-effort, effort) if effort > 0 else UNLIMITED
-        return (Motion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
+        return (JointMotion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
     def _with_mimics(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
         """Return the joints, with each <mimic> resolved to a coordinate of the scene."""
@@ -460,7 +460,7 @@ def _macro(written: str) -> str:
     return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
 
 
-def _mimic_description(motion: Motion) -> str:
+def _mimic_description(motion: JointMotion) -> str:
     """Return a description of a joint that mimics another, with its limits."""
     assert motion.mimics
     return joined(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from eomc.robots.limits import input_range, intersection
-from eomc.robots.mjcf.file import AttributeReader, Report, leave_unread, missing
-from eomc.robots.mjcf.joints import MjcfJoint, is_limited, unique_name
-from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Reader
+from eomc.robots.mjcf.file import (
+    ACTUATORS,
+    MEASURES,
+    AttributeReader,
+    ImportReport,
+    leave_unread,
+    missing,
+)
+from eomc.robots.mjcf.joints import MjcfJoint, Tendons, is_limited, unique_name
+from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Placed, Reader
 from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
-from eomc.robots.mjcf.schema import ACTUATORS
-from eomc.robots.mjcf.shortcuts import MEASURES
-from eomc.robots.mjcf.tendons import Tendons
-from eomc.robots.robot import UNLIMITED, Drive, Law, Motion, Range, RobotBody, Tendon, joined
+from eomc.robots.robot import UNLIMITED, Drive, JointMotion, Law, Range, RobotBody, Tendon, joined
 from eomc.robots.rotations import ORIGIN, from_quaternion, yaw_pitch_roll
 from eomc.robots.xml import Tag
 
@@ -25,10 +29,11 @@ ACTIVATIONS = "activations of actuators, which are their inputs here, not what t
 BESIDES = "what the key frame home has besides positions and controls"
 LAWLESS = "laws of actuators, whose input here is their force"
 
-Loaded = TypeVar("Loaded", Motion, Tendon)
+Loaded = TypeVar("Loaded", JointMotion, Tendon)
 
 
-class Actuator(NamedTuple):
+@dataclass(frozen=True)
+class Actuator:
     """An actuator of an MJCF file.
 
     Attributes
@@ -62,7 +67,7 @@ def read_actuators(
     for tag in tags:
         if tag.kind not in ACTUATORS:
             continue
-        a = reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "actuator")
+        a = reader.attributes_with_defaults(Placed(tag, "", IDENTITY_TRANSFORM, ""), "actuator")
         on = a.get("joint", a.get("jointinparent", a.get("tendon")))
         name = a.get("name") or unique_name(f"{on or 'no'}_{tag.kind}", names)
         names.add(name)
@@ -99,7 +104,7 @@ def _drive(
             report.leave("actuators on free and ball joints", name)
             return None
         (motion,) = joint.motions
-        joints[on] = joint._replace(motions=(_loaded(motion, *load),))
+        joints[on] = replace(joint, motions=(_loaded(motion, *load),))
     elif tendon := a.get("tendon"):
         if not tendons.known(tendon, a):
             return None
@@ -203,7 +208,7 @@ def _damped(
             kv = damping(d.law, along, masses, rows)
             law = replace(d.law, bias=(*d.law.bias[:2], -kv))
             note = joined(f"a damping ratio of {d.law.bias[2]:g}", d.note)
-            each = each._replace(drive=replace(d, law=law, note=note))
+            each = replace(each, drive=replace(d, law=law, note=note))
         out.append(each)
     return out
 
@@ -216,7 +221,7 @@ def _range(a: AttributeReader, key: str, reader: Reader) -> Range:
     return values[0], values[1]
 
 
-def _range_note(report: Report, name: str, own: Range, control: Range, force: Range) -> str:
+def _range_note(report: ImportReport, name: str, own: Range, control: Range, force: Range) -> str:
     """Return the ranges of input, control and force as text; report them as left out."""
     words = []
     for what, ends in (("input", own), ("control", control), ("force", force)):
@@ -228,7 +233,7 @@ def _range_note(report: Report, name: str, own: Range, control: Range, force: Ra
 
 
 def with_key_frame_start(
-    root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: Report
+    root: Tag, joints: Sequence[MjcfJoint], actuators: Sequence[Actuator], report: ImportReport
 ) -> tuple[list[MjcfJoint], tuple[Drive, ...]]:
     """Return the joints and drives with the initial values from the file's key frame "home".
 
@@ -277,7 +282,7 @@ def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
             w, x, y, z = mine[-4:]
             mine = (*mine[:-4], *yaw_pitch_roll(from_quaternion(w, x, y, z)))
         motions = (replace(m, start=v) for m, v in zip(joint.motions, mine, strict=True))
-        out.append(joint._replace(motions=tuple(motions)))
+        out.append(replace(joint, motions=tuple(motions)))
     return out
 
 

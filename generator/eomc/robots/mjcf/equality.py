@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from eomc.base.spatial import apply, plus, scaled, transposed
 from eomc.robots import rotations
 from eomc.robots.mjcf.file import AttributeReader, missing
-from eomc.robots.mjcf.joints import MjcfJoint, unique_name
-from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Pose, Reader, pose_of, rounded
-from eomc.robots.mjcf.tendons import Tendons
-from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, body_pose
+from eomc.robots.mjcf.joints import MjcfJoint, Tendons, unique_name
+from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Placed, Reader, Transform, pose_of, rounded
+from eomc.robots.robot import Coupling, JointMotion, RobotBody, RobotLoop, body_pose
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
@@ -25,7 +24,7 @@ KINDS = ("connect", "weld", "joint", "tendon")
 SOFT = "the softness of equality constraints (solref, solimp), which hold exactly here"
 
 
-Sides = tuple[tuple[float, Motion], ...]  # a sum of coordinates, each with its factor
+Sides = tuple[tuple[float, JointMotion], ...]  # a sum of coordinates, each with its factor
 
 
 @dataclass(frozen=True)
@@ -35,15 +34,15 @@ class _Ends:
     poses: of the scene's frames in the world. anchors: origins of the scene's frames in the file's.
     """
 
-    poses: Mapping[str, Pose]
+    poses: Mapping[str, Transform]
     anchors: Mapping[str, Vector]
 
-    def of_file(self, body: str) -> Pose:
+    def of_file(self, body: str) -> Transform:
         """Return the pose in the world of the frame that the file defines for a body.
 
         `body` is the body's name. The frames of the file and of the scene differ by an offset.
         """
-        back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
+        back = Transform(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
         return self.poses[body].compose(back)
 
     def point(self, body: str, place: Vector) -> Vector:
@@ -51,8 +50,8 @@ class _Ends:
 
         `body` is the body's name, and `place` the position of the point in the world (m).
         """
-        at, turn = self.poses[body]
-        x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
+        pose = self.poses[body]
+        x, y, z = apply(transposed(pose.turn), plus(place, scaled(pose.place, -1.0)))
         return _plain(x), _plain(y), _plain(z)
 
     def shifted(self, body: str, point: Vector) -> Vector:
@@ -82,10 +81,10 @@ def read_equalities(
     Bodies and joints are in the pose of the file. `anchors` maps each body to the origin of its
     frame in the scene, in the body's frame in the file (m).
     """
-    poses = {WORLD: IDENTITY_POSE}
+    poses = {WORLD: IDENTITY_TRANSFORM}
     for body in bodies:
         offset, turn = body_pose(body, [m.start for m in body.motions])
-        poses[body.name] = poses[body.parent].compose(Pose(offset, turn))
+        poses[body.name] = poses[body.parent].compose(Transform(offset, turn))
     reading = _Reading(tendons, _Ends(poses, anchors), joints, reader)
     for section in root.each("equality"):
         for tag in section.children:
@@ -113,7 +112,9 @@ class _Reading:
         `tag` is the element of the constraint in the file.
         """
         report = self.reader.report
-        a = self.reader.attributes_with_defaults(Placed(tag, "", IDENTITY_POSE, ""), "equality")
+        a = self.reader.attributes_with_defaults(
+            Placed(tag, "", IDENTITY_TRANSFORM, ""), "equality"
+        )
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]
         name = a.get("name") or "_".join([tag.kind, *filter(None, ends)])
         name = unique_name(name, self.taken)
@@ -177,11 +178,11 @@ class _Reading:
                 if "anchor" not in a:
                     a.fault('it needs an anchor="x y z", where the bodies meet, in that of body1')
                 return [None, None]
-            place = first.compose(Pose(anchor, IDENTITY)).place
+            place = first.compose(Transform(anchor, IDENTITY)).place
             return [(name, self.ends.point(name, place), IDENTITY) for name in names]
         point = anchor or ORIGIN  # in the frame of the second body
         place, turn = (
-            second.compose(Pose(point, IDENTITY)).place,
+            second.compose(Transform(point, IDENTITY)).place,
             times(transposed(first.turn), second.turn),
         )
         on_first = self.ends.point(one, place)

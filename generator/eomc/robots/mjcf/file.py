@@ -1,4 +1,4 @@
-"""Syntax of MJCF files: elements with their lines, attributes, default classes, settings.
+"""Syntax of MJCF files: elements, attributes, settings, default classes, actuator shortcuts.
 
 Sources are the XML reference of MuJoCo's documentation and, where it is ambiguous, the behaviour of
 MuJoCo 3 and 4. No other file is opened, except included ones if `load` is called with `include`;
@@ -8,17 +8,146 @@ entities and document types are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from eomc.base.errors import Problem, SceneError
 from eomc.robots import xml
-from eomc.robots.mjcf.schema import ACTUATORS, FLAGS, OPTIONS, ORIENTATION
-from eomc.robots.mjcf.shortcuts import shortcut
 from eomc.robots.rotations import Vector
-from eomc.robots.xml import Tag
+from eomc.robots.xml import ElementSchema, Tag, parse_format
 from eomc.scene.formulas import suggest
+
+# --- elements and attributes ----------------------------------------------------------------------
+
+ORIENTATION = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+
+_GROUPS = {
+    "pose": "pos quat axisangle euler xyaxes zaxis",
+    "softness": "solreflimit solimplimit solreffriction solimpfriction margin",
+    "joint": """type group pos axis springdamper limited actuatorfrclimited stiffness range
+        actuatorfrcrange actuatorgravcomp ref springref springyield armature damping frictionloss
+        user""",
+    "geom": """type contype conaffinity condim group priority size material friction mass density
+        shellinertia solmix solref solimp margin gap surfacevel adhesion fromto hfield mesh
+        fitscale rgba castshadow fluidshape fluidcoef user""",
+    "site": "type group material size fromto mesh rgba user",
+    "tendon": """group user limited actuatorfrclimited range actuatorfrcrange frictionloss
+        springlength springyield stiffness damping armature""",
+    "seen": "width material rgba",
+    "soft": "active solref solimp",
+    # of every actuator, more than some of them have: the transmission, ranges, delays
+    "drive": """name class group user nsample interp delay ctrllimited ctrlrange forcelimited
+        forcerange lengthrange gear cranklength cranksite slidersite joint jointinparent tendon
+        site refsite armature damping""",
+    "active": "actlimited actrange",
+    "general": """actlimited actrange actdim actearly dyntype dynprm""",
+}
+
+_ACTUATORS = """
+general: @drive @general body gaintype biastype gainprm biasprm inheritrange input ffrange velrange
+motor: @drive
+position: @drive kp kv dampratio timeconst inheritrange
+velocity: @drive kv
+intvelocity: @drive @active kp kv dampratio inheritrange
+orientation: @drive kp kv dampratio input
+pid: @drive kp ki kv dampratio imax inheritrange input ffrange posrange velrange slewmax
+damper: @drive kv
+cylinder: @drive timeconst area diameter bias
+muscle: @drive timeconst tausmooth range force scale lmin lmax vmax fpmax fvmax
+adhesion: @drive body gain
+dcmotor: @drive cogging controller inductance input lugre motorconst nominal resistance saturation thermal
+plugin: @drive @general plugin instance
+ config: *
+"""  # noqa: E501
+ACTUATORS = frozenset(x.split(":")[0] for x in _ACTUATORS.strip().splitlines() if x[0] != " ")
+
+# Sections and elements with * and + say nothing about the motion, or are reported as a whole.
+_OUTLINE = f"""
+mujoco: model
+ compiler: alignfree angle assetdir autolimits balanceinertia boundinertia boundmass conflict convexhull coordinate discardvisual eulerseq exactmeshinertia fitaabb fusestatic inertiafromgeom inertiagrouprange meshdir passthrough savecanonical savecompiled saveinertial settotalmass strippath texturedir usethread
+  lengthrange: *
+ option: actuatorgroupdisable apirate ccd_iterations ccd_tolerance collision cone density gravity impratio integrator iterations jacobian ls_iterations ls_tolerance magnetic mpr_iterations mpr_tolerance noslip_iterations noslip_tolerance o_friction o_margin o_solimp o_solref sdf_initpoints sdf_iterations sleep_tolerance solver timestep tolerance viscosity wind
+  flag: actuation autoreset clampctrl constraint contact damper diagexact energy equality eulerdamp filterparent frictionloss fwdinv gravity invdiscrete ipc island limit midphase multiccd nativeccd override passive refsafe sensor sensornoise sleep speculative spring warmstart
+ size: *
+ statistic: *
+ visual: +
+ extension: +
+ asset: +
+ deformable: +
+ contact: +
+ sensor: +
+ custom: +
+ default: class
+  mesh: *
+  texture: *
+  material: *
+  camera: *
+  light: *
+  pair: *
+  joint: @joint @softness
+  geom: @pose @geom
+  site: @pose @site
+  equality: @soft
+  tendon: @tendon @softness @seen
+  {_ACTUATORS.strip().replace(chr(10), chr(10) + "  ")}
+ worldbody:
+  body: name @pose childclass fuse gravcomp mocap simple sleep user
+   inertial: @pose mass diaginertia fullinertia
+   joint: name class @joint @softness
+   freejoint: name align group
+   geom: name class @pose @geom
+    plugin: *
+   site: name class @pose @site
+   frame: name childclass @pose
+   replicate: *
+   composite: *
+   flexcomp: *
+   attach: *
+   plugin: *
+   skin: *
+   camera: *
+   light: *
+ tendon:
+  spatial: name class @tendon @softness @seen
+   site: site
+   geom: geom sidesite
+   pulley: divisor
+  fixed: name class @tendon @softness
+   joint: joint coef
+ equality:
+  connect: name class @soft body1 body2 anchor site1 site2
+  weld: name class @soft body1 body2 anchor relpose site1 site2 torquescale
+  joint: name class @soft joint1 joint2 polycoef
+  tendon: name class @soft tendon1 tendon2 polycoef
+  flex: *
+  flexvert: *
+  flexstrain: *
+  distance: *
+ actuator:
+  {_ACTUATORS.strip().replace(chr(10), chr(10) + "  ")}
+ keyframe:
+  key: name time qpos qvel act ctrl mpos mquat plastic
+"""  # noqa: E501
+
+
+def _nested(root: ElementSchema) -> ElementSchema:
+    """Return the schema, with bodies, frames and default classes nested in one another."""
+    default, world = root.children["default"], root.children["worldbody"]
+    body = world.children["body"]
+    default.children["default"] = default
+    body.children["body"] = body
+    body.children["frame"].children.update(body.children)
+    world.children.update(body.children)
+    return root
+
+
+SCHEMA = _nested(parse_format(_OUTLINE, _GROUPS))
+OPTIONS = SCHEMA.children["option"].attributes
+FLAGS = SCHEMA.children["option"].children["flag"].attributes
+
+
+# --- values of attributes, and the report ---------------------------------------------------------
 
 SHOWN = 12  # names in one note on parts that are left out
 
@@ -53,7 +182,7 @@ Classes = dict[str, dict[str, Attributes]]
 
 
 @dataclass
-class Report:
+class ImportReport:
     """Errors and notes from reading an MJCF file.
 
     Attributes
@@ -111,7 +240,7 @@ class AttributeReader:
 
     attributes: Attributes
     tag: Tag
-    report: Report
+    report: ImportReport
 
     def __contains__(self, key: str) -> bool:
         return key in self.attributes
@@ -233,10 +362,10 @@ class Settings:
         return math.radians(value) if self.degrees else value
 
 
-# ---- the file
+# --- the file -------------------------------------------------------------------------------------
 
 
-def load(path: Path, include: bool, report: Report) -> Tag:
+def load(path: Path, include: bool, report: ImportReport) -> Tag:
     """Return the root element of a file, with each <include> replaced by the included elements.
 
     `include` says whether included files may be opened. Raises SceneError at once if a file cannot
@@ -264,7 +393,7 @@ def load(path: Path, include: bool, report: Report) -> Tag:
 
 
 def _included(
-    tag: Tag, folder: Path, include: bool, opened: set[Path], report: Report
+    tag: Tag, folder: Path, include: bool, opened: set[Path], report: ImportReport
 ) -> list[Tag]:
     """Return the elements of the file that <include> refers to; it must lie in `folder`."""
     a = AttributeReader(tag.attributes, tag, report)
@@ -314,10 +443,10 @@ def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
             a.report.leave(what, name)
 
 
-# ---- settings and defaults
+# --- settings and defaults ------------------------------------------------------------------------
 
 
-def settings_of(root: Tag, report: Report) -> Settings:
+def settings_of(root: Tag, report: ImportReport) -> Settings:
     """Return the settings in the elements <compiler> and <option> of a file.
 
     If a setting is repeated, the last value applies. Settings that are not modelled are noted in
@@ -379,7 +508,7 @@ def _compiler(s: Settings, a: AttributeReader) -> Settings:
     )
 
 
-def classes_of(root: Tag, report: Report) -> Classes:
+def classes_of(root: Tag, report: ImportReport) -> Classes:
     """Return the default classes of a file: attribute values that its elements can inherit.
 
     The result maps the name of each class and the kind of element to the attributes. Attributes
@@ -434,3 +563,72 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
             value = " ".join(words)
         over[key] = value
     return over
+
+
+# --- actuator shortcuts ---------------------------------------------------------------------------
+
+# numeric attributes of shortcuts
+MEASURES = ("kp", "kv", "dampratio", "timeconst", "area", "diameter")
+
+
+def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """Return the attributes of <general> that an actuator shortcut such as <position> sets.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the shortcut.
+    inherited, own
+        Attributes of its default class, and of the element. Missing numbers are inherited, except
+        from a class with another shortcut or without a constant gain.
+
+    Returns
+    -------
+    dict
+        The attributes. A shortcut whose force is not affine in its input has `kind` as gaintype and
+        biastype.
+    """
+    same = inherited.get(" law") == kind
+    if not same and (" law" in inherited or inherited.get("gaintype", "fixed") != "fixed"):
+        inherited = {}
+    gain = (*inherited.get("gainprm", "1").split(), "0", "0", "0")
+    bias = (*inherited.get("biasprm", "").split(), "0", "0", "0")
+    affine = {"gaintype": "fixed", "biastype": "affine"}
+    if kind == "motor":
+        return {"gaintype": "fixed", "biastype": "none", "dyntype": "none", "gainprm": "1"}
+    if kind in ("position", "intvelocity"):
+        kp = own.get("kp", gain[0])
+        kv = _minus(own["kv"]) if "kv" in own else own.get("dampratio", bias[2])
+        attributes = affine | {"gainprm": kp, "biasprm": f"0 {_minus(kp)} {kv}"}
+        attributes["dyntype"] = inherited.get("dyntype", "none") if same else "none"
+        if "timeconst" in own:
+            attributes["dyntype"] = "filterexact" if _value(own["timeconst"]) else "none"
+        integrates = {"dyntype": "integrator", "actlimited": "true"}
+        return attributes | (integrates if kind == "intvelocity" else {})
+    if kind == "velocity":
+        kv = own.get("kv", gain[0])
+        return affine | {"dyntype": "none", "gainprm": kv, "biasprm": f"0 0 {_minus(kv)}"}
+    if kind == "damper":
+        types = {"gaintype": "affine", "biastype": "none", "dyntype": "none", "ctrllimited": "true"}
+        rate = _minus(own["kv"]) if "kv" in own else gain[2]
+        return types | {"gainprm": f"0 0 {rate}"}
+    if kind == "cylinder":
+        area = own.get("area", gain[0])
+        if "diameter" in own:
+            area = repr(math.pi / 4 * _value(own["diameter"]) ** 2)
+        own_bias = own.get("bias", "").split()
+        bias_text = " ".join([*own_bias, *bias[len(own_bias) :]][:3])
+        return affine | {"dyntype": "filter", "gainprm": area, "biasprm": bias_text}
+    return {"gaintype": kind, "biastype": kind}
+
+
+def _value(text: str) -> float:
+    """Return a number; 0 for a fault, which is reported where the attribute is read."""
+    try:
+        return xml.number(text)
+    except ValueError:
+        return 0.0
+
+
+def _minus(text: str) -> str:
+    return repr(-_value(text))

@@ -1,19 +1,31 @@
-"""Joints of an MJCF file: motions, axes, limits, and names of coordinates."""
+"""Joints of an MJCF file and the fixed tendons over them.
+
+A joint has motions, axes, limits, and names of its coordinates. The length of a fixed tendon is a
+linear combination of joint positions; springs, dampers and actuators act along it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.mjcf.file import AttributeReader, Report, Settings, leave_unread
-from eomc.robots.mjcf.masses import IDENTITY_POSE, Placed, Pose, Reader, direction, rounded
-from eomc.robots.robot import UNLIMITED, Motion, free_motions, joined
+from eomc.robots.mjcf.file import AttributeReader, ImportReport, Settings, leave_unread, missing
+from eomc.robots.mjcf.masses import (
+    IDENTITY_TRANSFORM,
+    Placed,
+    Reader,
+    Transform,
+    direction,
+    rounded,
+)
+from eomc.robots.robot import UNLIMITED, JointMotion, Range, Tendon, free_motions, joined
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, unit, yaw_pitch_roll
+from eomc.robots.xml import Tag
 
 
-class MjcfJoint(NamedTuple):
+@dataclass(frozen=True)
+class MjcfJoint:
     """A joint of an MJCF file.
 
     Attributes
@@ -24,7 +36,7 @@ class MjcfJoint(NamedTuple):
         Degrees of freedom, and their unit axes.
     anchor : Vector
         Its position in the body's frame (m).
-    zero : Pose
+    zero : Transform
         Pose of the frame in which the joint's coordinates are zero, relative to the body's frame
         moved to the anchor.
     armature : float
@@ -36,10 +48,10 @@ class MjcfJoint(NamedTuple):
     name: str
     type: str
     kind: str
-    motions: tuple[Motion, ...]
+    motions: tuple[JointMotion, ...]
     axes: tuple[Vector, ...]
     anchor: Vector
-    zero: Pose
+    zero: Transform
     armature: float
     spring: tuple[float, float] = (0.0, 0.0)
 
@@ -50,7 +62,7 @@ LIMITS = "limits of joints, kept as notes"
 TYPES = ("hinge", "slide", "ball", "free")
 
 
-def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint | None:
+def joint_of(placed: Placed, name: str, pose: Transform, reader: Reader) -> MjcfJoint | None:
     """Return the joint that an element of the file describes, or None if the element has a fault.
 
     `pose` is the pose of the joint's body in the parent's frame. The motions of free and ball
@@ -102,12 +114,14 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
         )
-        mjcf_joint = MjcfJoint(name, kind, kind, motions, (), ORIGIN, IDENTITY_POSE, 0.0, spring)
+        mjcf_joint = MjcfJoint(
+            name, kind, kind, motions, (), ORIGIN, IDENTITY_TRANSFORM, 0.0, spring
+        )
         return _with_turn_forces(mjcf_joint, own, report)
     if kind == "ball":
         motions = tuple(replace(m, note=joined(m.note, note)) for m in free_motions()[3:])
         mjcf_joint = MjcfJoint(
-            name, kind, "spherical", motions, (), anchor, IDENTITY_POSE, 0.0, spring
+            name, kind, "spherical", motions, (), anchor, IDENTITY_TRANSFORM, 0.0, spring
         )
         return _with_turn_forces(mjcf_joint, own, report)
     axis = direction(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
@@ -116,7 +130,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint
     x, y, z = (rounded(c, 1.0) for c in apply(placed.pose.turn, axis))
     axis = unit((x, y, z))
     ref = value("ref")
-    motion = Motion(
+    motion = JointMotion(
         name,
         "rad" if turns else "m",
         start=ref,
@@ -128,14 +142,14 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> MjcfJoint
         **own,
     )
     if turns:
-        zero = Pose(ORIGIN, from_axis_angle(axis, -ref) if ref else IDENTITY)
+        zero = Transform(ORIGIN, from_axis_angle(axis, -ref) if ref else IDENTITY)
         return MjcfJoint(name, kind, "revolute", (motion,), (axis,), anchor, zero, 0.0, spring)
     # sliding does not depend on the place: at the body's origin the frames stay simple
-    zero = Pose(scaled(axis, -ref) if ref else ORIGIN, IDENTITY)
+    zero = Transform(scaled(axis, -ref) if ref else ORIGIN, IDENTITY)
     return MjcfJoint(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0, spring)
 
 
-def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: Report) -> MjcfJoint:
+def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: ImportReport) -> MjcfJoint:
     """Return a free or ball joint with damping, friction and springs on each coordinate.
 
     In MuJoCo these act on the angular velocity and on the total angle of rotation. Applied to each
@@ -160,7 +174,7 @@ def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: Report) -
         )
         for m in joint.motions
     )
-    return joint._replace(motions=motions, armature=own["armature"])
+    return replace(joint, motions=motions, armature=own["armature"])
 
 
 def _limits(
@@ -170,7 +184,7 @@ def _limits(
 
     All are reported as left out.
     """
-    notes, ends, driven = [], Motion.limits, Motion.driven
+    notes, ends, driven = [], JointMotion.limits, JointMotion.driven
     limits = a.numbers("range", 2)
     if limits and kind != "free" and is_limited(a, "limited", settings):
         off = "limit" in settings.disabled
@@ -196,7 +210,7 @@ def _limits(
 
 def without_limits(joint: MjcfJoint) -> MjcfJoint:
     """Return the joint without its position limits."""
-    return joint._replace(motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
+    return replace(joint, motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
 
 
 def is_limited(a: AttributeReader, key: str, settings: Settings) -> bool:
@@ -235,6 +249,115 @@ def with_coordinate_names(joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
                 new = unique_name(m.name if short else f"{m.name}_{joint.name}", taken)
                 taken.add(new)
                 motions.append(replace(m, name=new))
-            joint = joint._replace(motions=tuple(motions))
+            joint = replace(joint, motions=tuple(motions))
         out.append(joint)
     return out
+
+
+# --- fixed tendons --------------------------------------------------------------------------------
+
+LEFT = "tendons"  # kind in the report of tendons that have no effect
+
+
+class Tendons:
+    """The tendons of an MJCF file.
+
+    `fixed` contains those that are linear combinations of joint positions, by name.
+    """
+
+    def __init__(self, root: Tag, joints: Sequence[MjcfJoint], reader: Reader) -> None:
+        self.fixed: dict[str, Tendon] = {}
+        self._reader = reader
+        self._tags = [tag for section in root.each("tendon") for tag in section.children]
+        self._joints = {joint.name: joint for joint in joints}
+        self._driven: set[str] = set()
+        used_names = {m.name for joint in joints for m in joint.motions}
+        for tag in self._tags:
+            name = tag.get("name")
+            reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
+            terms = self._terms(tag) if tag.kind == "fixed" else None
+            if not terms:
+                continue
+            tendon = self._read(Tendon(unique_name(name or "tendon", used_names), terms), tag)
+            used_names.add(tendon.name)
+            self.fixed[name or tendon.name] = tendon
+            if tendon.acts:
+                self.reads(name)
+
+    @property
+    def acting(self) -> tuple[Tendon, ...]:
+        """The fixed tendons that have stiffness, damping, armature or an actuator."""
+        return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
+
+    def known(self, name: str, a: AttributeReader) -> bool:
+        """Return True if the file has a tendon called `name`; otherwise report a fault."""
+        names = {tag.get("name") for tag in self._tags}
+        if name not in names:
+            a.fault(missing("tendon", name, names))
+        return name in names
+
+    def reads(self, name: str) -> None:
+        """Record that a fixed tendon is modelled, so that it is not listed as left out."""
+        self._reader.report.read(LEFT, f"fixed {name}".rstrip())
+
+    def driven(self, name: str) -> str:
+        """Record that an actuator drives a tendon, and return the unique name of the tendon.
+
+        `name` is the tendon's name in the file. It is a fixed tendon: a linear combination of joint
+        positions.
+        """
+        self._driven.add(name)
+        self.reads(name)
+        return self.fixed[name].name
+
+    def _terms(self, tag: Tag) -> tuple[tuple[float, str], ...]:
+        """Return the terms of a fixed tendon; none if it refers to free, ball or unknown joints."""
+        terms = []
+        for each in tag.each("joint"):
+            a = self._reader.own_attributes(each)
+            joint = a.get("joint")
+            if joint not in self._joints:
+                a.fault(missing("joint", joint, self._joints) if joint else "it needs a joint")
+                return ()
+            if self._joints[joint].type in {"free", "ball"}:
+                return ()
+            terms.append((a.number("coef", 1.0), self._joints[joint].motions[0].name))
+        return tuple(terms)
+
+    def _read(self, tendon: Tendon, tag: Tag) -> Tendon:
+        report, name = self._reader.report, tag.get("name")
+        a = self._reader.attributes_with_defaults(Placed(tag, "", IDENTITY_TRANSFORM, ""), "tendon")
+        own = {}
+        for key in ("stiffness", "damping"):
+            own[key], *more = a.numbers(key, 3, 1) or (0.0,)
+            if any(more):
+                report.leave(f"{key} in the square and cube of tendons", name)
+        own["armature"] = a.number("armature")
+        for key, value in own.items():
+            if value < 0:
+                a.fault(f"{key} must not be negative")
+        for key, what in (("", "length"), ("actuatorfrc", "force")):
+            if a.numbers(f"{key}range", 2) and is_limited(
+                a, f"{key}limited", self._reader.settings
+            ):
+                report.leave(f"limits of {what} of tendons", name)
+        leave_unread(a, "tendon", name)
+        disabled = self._reader.settings.disabled
+        for key, effect in (("stiffness", "spring"), ("damping", "damper")):
+            own[key] = 0.0 if effect in disabled else own[key]
+        return replace(
+            tendon,
+            stiffness=own["stiffness"],
+            damping=own["damping"],
+            armature=own["armature"],
+            rest=self._rest_range(tendon, a),
+        )
+
+    def _rest_range(self, tendon: Tendon, a: AttributeReader) -> Range:
+        """Return the range in which its spring is slack: springlength, or the joints' springref."""
+        slack = a.numbers("springlength", 2, 1) or (-1.0,)
+        if {*slack} != {-1.0}:
+            return slack[0], slack[-1]
+        rests = {joint.motions[0].name: joint.motions[0].rest for joint in self._joints.values()}
+        length = sum(by * rests[q] for by, q in tendon.terms)
+        return length, length

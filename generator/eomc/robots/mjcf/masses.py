@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 from eomc.base.spatial import apply, cross, dot, plus, point_inertia, six, transposed
 from eomc.robots import rotations
@@ -18,14 +17,14 @@ from eomc.robots.inertias import (
     unbalanced,
 )
 from eomc.robots.mjcf.file import (
+    ORIENTATION,
     AttributeReader,
     Classes,
-    Report,
+    ImportReport,
     Settings,
     merged,
     missing,
 )
-from eomc.robots.mjcf.schema import ORIENTATION
 from eomc.robots.robot import RobotBody
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
 from eomc.robots.xml import Tag
@@ -34,7 +33,8 @@ LEAST_MASS = 1e-15  # kg, mjMINVAL of MuJoCo's compiler
 ROUNDING = 1e-15  # relative to neighbouring entries: smaller ones become zero
 
 
-class Pose(NamedTuple):
+@dataclass(frozen=True)
+class Transform:
     """The pose of a frame in another frame.
 
     `place` is its origin (m), and the columns of `turn` are its axes.
@@ -43,25 +43,28 @@ class Pose(NamedTuple):
     place: Vector
     turn: Matrix
 
-    def compose(self, other: Pose) -> Pose:
+    def compose(self, other: Transform) -> Transform:
         """Return the product of two poses: frame C in frame A, from B in A and C in B.
 
         This pose is that of B in A, and `other` is that of C in B.
         """
-        return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
+        return Transform(
+            plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn)
+        )
 
 
-IDENTITY_POSE = Pose(ORIGIN, IDENTITY)
+IDENTITY_TRANSFORM = Transform(ORIGIN, IDENTITY)
 
 
-class Mass(NamedTuple):
+@dataclass(frozen=True)
+class Mass:
     """A mass (kg), its centre of mass (m), and its inertia tensor about the centre (kg m^2)."""
 
     mass: float = 0.0
     center: Vector = ORIGIN
     inertia: Inertia = NO_INERTIA
 
-    def in_frame(self, pose: Pose) -> Mass:
+    def in_frame(self, pose: Transform) -> Mass:
         """Return the mass with its centre and inertia tensor transformed to another frame.
 
         `pose` is the pose of the present frame in that other frame.
@@ -73,14 +76,15 @@ class Mass(NamedTuple):
         )
 
 
-class Placed(NamedTuple):
+@dataclass(frozen=True)
+class Placed:
     """An element of a body, with its place in the tree.
 
     Attributes
     ----------
     tag, body
         The element, and the name of the body.
-    pose : Pose
+    pose : Transform
         Pose of the enclosing frames in the body's frame.
     childclass : str
         Default class that applies to the element.
@@ -88,7 +92,7 @@ class Placed(NamedTuple):
 
     tag: Tag
     body: str
-    pose: Pose
+    pose: Transform
     childclass: str
 
 
@@ -100,7 +104,7 @@ class Reader:
     ----------
     settings, classes
         Settings of the file, and default classes of attributes.
-    report : Report
+    report : ImportReport
         Receives faults and notes on parts that are left out.
     sites : dict
         Named sites read so far.
@@ -108,7 +112,7 @@ class Reader:
 
     settings: Settings
     classes: Classes
-    report: Report
+    report: ImportReport
     sites: dict[str, Placed] = field(default_factory=dict)
 
     def attributes_with_defaults(self, placed: Placed, kind: str) -> AttributeReader:
@@ -138,7 +142,7 @@ class Reader:
         return AttributeReader(tag.attributes, tag, self.report)
 
 
-# ---- poses
+# --- poses ----------------------------------------------------------------------------------------
 
 
 def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
@@ -184,12 +188,12 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
     return rotations.cleaned(transposed((first, second, cross(first, second))))
 
 
-def pose_of(a: AttributeReader, settings: Settings) -> Pose:
+def pose_of(a: AttributeReader, settings: Settings) -> Transform:
     """Return the pose of an element's frame in the enclosing frame, from its attributes."""
-    return Pose(a.vector("pos") or ORIGIN, _orientation(a, settings))
+    return Transform(a.vector("pos") or ORIGIN, _orientation(a, settings))
 
 
-# ---- masses
+# --- masses ---------------------------------------------------------------------------------------
 
 
 def _ball(size: Sequence[float], shell: bool) -> tuple[float, Vector]:
@@ -309,7 +313,9 @@ def _geom_mass(placed: Placed, reader: Reader, is_static: bool) -> Mass | None:
     return Mass(m, ORIGIN, inertia).in_frame(placed.pose.compose(pose))
 
 
-def _form(kind: str, a: AttributeReader, settings: Settings) -> tuple[Sequence[float], Pose] | None:
+def _form(
+    kind: str, a: AttributeReader, settings: Settings
+) -> tuple[Sequence[float], Transform] | None:
     """Return the sizes of a geom, m, and its pose in the enclosing frame; None after a fault."""
     count = SHAPES[kind][0]
     size, ends = a.numbers("size", 3, 1), a.numbers("fromto", 6)
@@ -330,7 +336,7 @@ def _form(kind: str, a: AttributeReader, settings: Settings) -> tuple[Sequence[f
             return None
         half = math.hypot(*between) / 2
         size = (size[0], half) if count == 2 else (size[0], size[0], half)
-        pose = Pose(((ax + bx) / 2, (ay + by) / 2, (az + bz) / 2), toward(along))
+        pose = Transform(((ax + bx) / 2, (ay + by) / 2, (az + bz) / 2), toward(along))
     if len(size) < count or min(size[:count]) <= 0:
         a.fault(f"the size of a {kind} is {count} positive numbers")
         return None

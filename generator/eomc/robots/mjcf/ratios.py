@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from eomc.base import spatial
 from eomc.base.spatial import apply, cross, plus, scaled
 from eomc.robots.mjcf.joints import MjcfJoint
-from eomc.robots.mjcf.masses import IDENTITY_POSE, Pose
+from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Transform
 from eomc.robots.robot import Law, RobotBody, Tendon, body_pose
 from eomc.robots.rotations import ORIGIN, Vector
 from eomc.scene.assembly import WORLD
@@ -90,7 +90,7 @@ def sprung(
             motions = (
                 replace(m, stiffness=stiffness, damping=m.damping + damping) for m in joint.motions
             )
-            joint = joint._replace(motions=tuple(motions))
+            joint = replace(joint, motions=tuple(motions))
         out.append(joint)
     return out
 
@@ -107,12 +107,12 @@ def masses_at_start(
 
     rows = [m.name for joint in joints for m in joint.motions]
     M = np.diag([m.armature for joint in joints for m in joint.motions])
-    poses: dict[str, Pose] = {WORLD: IDENTITY_POSE}
+    poses: dict[str, Transform] = {WORLD: IDENTITY_TRANSFORM}
     columns: dict[str, list[tuple[int, Vector, Vector]]] = {WORLD: []}
     waiting, row = iter(joints), 0
     for body in bodies:
-        around = poses[body.parent].compose(Pose(body.offset, body.rotation))
-        stands = Pose(*body_pose(body, [m.start for m in body.motions]))
+        around = poses[body.parent].compose(Transform(body.offset, body.rotation))
+        stands = Transform(*body_pose(body, [m.start for m in body.motions]))
         pose = poses[body.name] = poses[body.parent].compose(stands)
         mine = []  # turns: the rate and a point of the axis; slides: no rate, the velocity
         if body.joint != "fixed":

@@ -13,23 +13,23 @@ from eomc.robots.mjcf.actuators import read_actuators, with_key_frame_start
 from eomc.robots.mjcf.equality import read_equalities
 from eomc.robots.mjcf.file import (
     ONE_FILE,
+    SCHEMA,
     AttributeReader,
-    Report,
+    ImportReport,
     classes_of,
     load,
     settings_of,
 )
 from eomc.robots.mjcf.joints import (
     MjcfJoint,
+    Tendons,
     joint_of,
     unique_name,
     with_coordinate_names,
     without_limits,
 )
-from eomc.robots.mjcf.masses import IDENTITY_POSE, Mass, Placed, Pose, Reader
+from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Mass, Placed, Reader, Transform
 from eomc.robots.mjcf.ratios import sprung
-from eomc.robots.mjcf.schema import SCHEMA
-from eomc.robots.mjcf.tendons import Tendons
 from eomc.robots.robot import Robot, RobotBody, joined, with_left_out_note
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
 from eomc.robots.xml import Tag, unknown_parts
@@ -75,7 +75,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
         If the file cannot be read.
     """
     path = Path(path)
-    report = Report()
+    report = ImportReport()
     root = load(path, include, report)
     if root.kind != "mujoco":
         what = KINDS.get(root.kind, "not MJCF")
@@ -124,7 +124,7 @@ def _geom_left_out(placed: Placed, reader: Reader) -> None:
     reader.report.leave(what, a.get("name"))
 
 
-# ---- the tree
+# --- the tree -------------------------------------------------------------------------------------
 
 
 def _bodies(
@@ -194,7 +194,8 @@ def _bodies(
             if p.tag.kind == "geom":
                 _geom_left_out(p, reader)
         mass = masses.body_mass(tag, inner, reader, is_static and not own)
-        chain, own, anchor = _chain(name, parent, is_static, pose, own, mass, names["body"], report)
+        fixed = RobotBody(name, parent, offset=pose.place, rotation=pose.turn)
+        chain, own, anchor = _chain(fixed, mass, own, is_static, names["body"], report)
         if own or not is_static:
             passive = not {"spring", "damper"} <= settings.disabled  # as MuJoCo has it
             lifted = a.number("gravcomp")
@@ -203,9 +204,9 @@ def _bodies(
         bodies += chain
         anchors[name] = anchor
         joints += own
-        back = Pose(scaled(anchor, -1.0), IDENTITY)
+        back = Transform(scaled(anchor, -1.0), IDENTITY)
         waiting += [
-            (p._replace(pose=back.compose(p.pose)), is_static and not own)
+            (replace(p, pose=back.compose(p.pose)), is_static and not own)
             for p in reversed(inner)
             if p.tag.kind == "body"
         ]
@@ -217,7 +218,9 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
     report = reader.report
     contents: list[Placed] = []
     reader.class_of(childclass, tag)
-    waiting = [Placed(child, body, IDENTITY_POSE, childclass) for child in reversed(tag.children)]
+    waiting = [
+        Placed(child, body, IDENTITY_TRANSFORM, childclass) for child in reversed(tag.children)
+    ]
     while waiting:
         placed = waiting.pop()
         inner = placed.tag
@@ -241,36 +244,36 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
 
 
 def _chain(
-    name: str,
-    parent: str,
-    is_static: bool,
-    pose: Pose,
-    joints: Sequence[MjcfJoint],
+    body: RobotBody,
     mass: Mass,
+    joints: Sequence[MjcfJoint],
+    is_static: bool,
     taken: Collection[str],
-    report: Report,
+    report: ImportReport,
 ) -> tuple[list[RobotBody], list[MjcfJoint], Vector]:
     """Return the chain of bodies for one <body>, one for each joint; the last has the mass.
 
-    is_static: the parent doesn't move. pose: of the body in the parent. The third value is the
-    origin of the last body's frame, the anchor of the last joint, in the frame of <body>.
+    `body` is the body without mass, fixed to its parent in the pose of the file; `is_static` says
+    that the parent does not move. `taken` are the names of bodies in the file. The second value
+    are the joints of the chain. The third is the origin of the last body's frame, the anchor of
+    the last joint, in the frame of <body>.
     """
     if not joints:
-        only = RobotBody(name, parent, offset=pose.place, rotation=pose.turn)
-        return [_heavy(only, mass, ORIGIN)], [], ORIGIN
+        return [_heavy(body, mass, ORIGIN)], [], ORIGIN
+    name, pose = body.name, Transform(body.offset, body.rotation)
     bodies: list[RobotBody] = []
     own: list[MjcfJoint] = []
     anchor = ORIGIN
     for i, joint in enumerate(joints):
-        step = Pose(plus(joint.anchor, scaled(anchor, -1.0)), IDENTITY)
+        step = Transform(plus(joint.anchor, scaled(anchor, -1.0)), IDENTITY)
         frame = (step if bodies else pose.compose(step)).compose(joint.zero)
         if joint.type == "free":
-            frame = IDENTITY_POSE
+            frame = IDENTITY_TRANSFORM
         last = i == len(joints) - 1
         bodies.append(
             RobotBody(
                 name if last else unique_name(f"{name}_{joint.name}", taken),
-                bodies[-1].name if bodies else parent,
+                bodies[-1].name if bodies else body.parent,
                 joint.kind,
                 joint.motions,
                 joint.axes,
@@ -288,7 +291,7 @@ def _chain(
                 joint.name,
             )
             motions = tuple(replace(m, armature=joint.armature) for m in joint.motions)
-            joint = joint._replace(motions=motions, armature=0.0)
+            joint = replace(joint, motions=motions, armature=0.0)
         own.append(joint)
     bodies[-1] = _heavy(bodies[-1], mass, anchor)
     return bodies, own, anchor
@@ -325,10 +328,10 @@ def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[R
     return tuple(out)
 
 
-# ---- sections besides the tree
+# --- sections besides the tree --------------------------------------------------------------------
 
 
-def _sections(root: Tag, report: Report) -> None:
+def _sections(root: Tag, report: ImportReport) -> None:
     """Report the sections of the file that are not read."""
     for section in root.children:
         if section.kind in SECTIONS:
