@@ -24,7 +24,7 @@ from eomc.derive.tape import Stage, Tape
 from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.symbols import needed, symbol
 from eomc.model.system import System, t
-from eomc.model.tree import Frame, Tree
+from eomc.model.tree import BodyFrame, Tree
 
 Twist = tuple[Vector, Vector]  # (velocity, angular velocity) or (force, moment)
 
@@ -153,7 +153,7 @@ class Sweep(Links):
         For each link, its angular velocity and angular acceleration.
     """
 
-    def __init__(self, tape: Tape, system: System, frames: Sequence[Frame]) -> None:
+    def __init__(self, tape: Tape, system: System, frames: Sequence[BodyFrame]) -> None:
         super().__init__(tape, system.tree or Tree((), (), ZERO, ZERO))
         self.system, self.plane, self.frames = system, system.plane, frames
         self.d, self.width = (2, 3) if system.plane else (3, 6)
@@ -277,7 +277,7 @@ class Sweep(Links):
             known[name] = self.tape.named(formula.xreplace(known), name.name)
         return known
 
-    def _formulas(self, f: Frame) -> Sequence[Expr]:
+    def _formulas(self, f: BodyFrame) -> Sequence[Expr]:
         """Return the formulas of a frame's placement."""
         placed = (*f.offset, *(x for row in f.rotation for x in row)) if f.link < 0 else ()
         return (*placed, f.angle) if self.plane else placed
@@ -298,7 +298,7 @@ class Sweep(Links):
             return (*frame.at[:2], frame.angle)
         return (*frame.at, *(x for row in frame.rotation for x in row))
 
-    def frame(self, f: Frame) -> FrameKinematics:
+    def frame(self, f: BodyFrame) -> FrameKinematics:
         """Return pose, velocity, acceleration and Jacobian of the frame `f`."""
         if f.link < 0:
             return self._frame_by_formulas(f)
@@ -329,7 +329,7 @@ class Sweep(Links):
             f.link, arm, at, rows, angle, (v, omega), (a, alpha), [*jacobian.values()]
         )
 
-    def _frame_by_formulas(self, f: Frame) -> FrameKinematics:
+    def _frame_by_formulas(self, f: BodyFrame) -> FrameKinematics:
         """Compute the kinematics of a frame that is placed by formulas, or fixed in the world."""
         tape, (x, y, z) = self.tape, map(self.value, f.offset)
         rows = [self.vector([self.value(e) for e in row]) for row in f.rotation]

@@ -19,7 +19,7 @@ from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
 from eomc.scene.messages import is_in_degrees
-from eomc.scene.scene import Run
+from eomc.scene.scene import RunSettings
 from eomc.scene.schema import (
     DEFAULT_TOLERANCE,
     MAX_TOLERANCE,
@@ -332,7 +332,7 @@ def symbol_of(value: Any, role: str) -> Any:
 def run(
     h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
     tolerance: Any, events: bool, inverse_dynamics: Any,
-) -> Run:  # fmt: skip
+) -> RunSettings:  # fmt: skip
     """Return the settings of simulations and generated code from the arguments of System.make.
 
     All arguments but `events` are the arguments of System.make with these names. h, duration: step
@@ -368,4 +368,4 @@ def run(
     elif events:
         tolerance = DEFAULT_TOLERANCE[real]
     plain = (float(h), float(duration), methods, real, batch, linearize, discretize)
-    return Run(*plain, tolerance=tolerance, inverse_dynamics=inverse_dynamics)
+    return RunSettings(*plain, tolerance=tolerance, inverse_dynamics=inverse_dynamics)

@@ -26,7 +26,7 @@ _RANGE = f"is not between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size, as numbers m
 
 
 @dataclass(frozen=True)
-class Bound:
+class DigitBound:
     """An upper bound on the number of decimal digits of an exact number.
 
     Arithmetic operations on bounds return the bound of the result. They raise FormulaError if the
@@ -43,27 +43,27 @@ class Bound:
     value: float | None = None
     digits: float = 0.0
 
-    def __add__(self, other: Bound) -> Bound:
+    def __add__(self, other: DigitBound) -> DigitBound:
         return _bounded(lambda a, b: a + b, self.digits + other.digits, self, other)
 
-    def __sub__(self, other: Bound) -> Bound:
+    def __sub__(self, other: DigitBound) -> DigitBound:
         return _bounded(lambda a, b: a - b, self.digits + other.digits, self, other)
 
-    def __mul__(self, other: Bound) -> Bound:
+    def __mul__(self, other: DigitBound) -> DigitBound:
         return _bounded(lambda a, b: a * b, self.digits + other.digits, self, other)
 
-    def __truediv__(self, other: Bound) -> Bound:
+    def __truediv__(self, other: DigitBound) -> DigitBound:
         if other.value == 0:
             raise FormulaError("divides by zero")
         return _bounded(lambda a, b: a / b, self.digits + other.digits, self, other)
 
-    def __neg__(self) -> Bound:
-        return Bound(None if self.value is None else -self.value, self.digits)
+    def __neg__(self) -> DigitBound:
+        return DigitBound(None if self.value is None else -self.value, self.digits)
 
-    def __pos__(self) -> Bound:
+    def __pos__(self) -> DigitBound:
         return self
 
-    def __pow__(self, other: Bound) -> Bound:
+    def __pow__(self, other: DigitBound) -> DigitBound:
         if other.value is None:
             if self.value == 0:
                 raise FormulaError(
@@ -76,16 +76,16 @@ class Bound:
         return _bounded(lambda a, b: a**b, digits, self, other)
 
 
-VARIES = Bound()
+VARIES = DigitBound()
 
 
-def _bounded(function: Callable[..., Any], digits: float, *parts: Bound) -> Bound:
+def _bounded(function: Callable[..., Any], digits: float, *parts: DigitBound) -> DigitBound:
     """Apply a function to bounded values. Raises FormulaError beyond MAX_DIGITS."""
     if not digits <= MAX_DIGITS:
         raise FormulaError(_TOO_LONG)
     numbers = [part.value for part in parts]
     if None in numbers:
-        return Bound(None, digits)
+        return DigitBound(None, digits)
     try:
         value = function(*numbers)
     except OverflowError:
@@ -98,20 +98,20 @@ def _bounded(function: Callable[..., Any], digits: float, *parts: Bound) -> Boun
         raise FormulaError("has no real value")
     if not abs(value) < 10.0**MAX_LOG10:
         raise FormulaError(_RANGE)
-    return Bound(float(value), digits)
+    return DigitBound(float(value), digits)
 
 
-def _literal(text: str) -> Bound:
+def _literal(text: str) -> DigitBound:
     mantissa, _, exponent = text.partition("e") if text[:2] != "0x" else (text, "", "")
     digits = float(len(mantissa) + abs(int(exponent or 0)))
-    return Bound(formulas.NUMERIC["number"](text), digits)
+    return DigitBound(formulas.NUMERIC["number"](text), digits)
 
 
-def _call(name: str) -> Callable[..., Bound]:
+def _call(name: str) -> Callable[..., DigitBound]:
     function = formulas.NUMERIC[name]
     rational = name in ("abs", "min", "max", "sign", "heaviside")
 
-    def bound_of_call(*parts: Bound) -> Bound:
+    def bound_of_call(*parts: DigitBound) -> DigitBound:
         if any(part.value is None for part in parts):
             return VARIES
         return _bounded(
@@ -123,13 +123,13 @@ def _call(name: str) -> Callable[..., Bound]:
 
 _ALGEBRA: Mapping[str, Any] = {
     "number": _literal,
-    "pi": Bound(math.pi, _IRRATIONAL_DIGITS),
+    "pi": DigitBound(math.pi, _IRRATIONAL_DIGITS),
     "dot": lambda _: VARIES,
     **{name: _call(name) for name in formulas.FUNCTIONS if name != "dot"},
 }
 
 
-def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
+def bound(formula: Formula, known: Mapping[str, DigitBound]) -> DigitBound:
     """Return an upper bound on the digits of the value of a formula, without computing it exactly.
 
     known: dict from a name in the formula to the bound of its value; names that are not in it stand
@@ -137,5 +137,5 @@ def bound(formula: Formula, known: Mapping[str, Bound]) -> Bound:
     has too many digits.
     """
     result = formulas.evaluate(formula, _ALGEBRA, lambda name: known.get(name, VARIES))
-    assert isinstance(result, Bound)
+    assert isinstance(result, DigitBound)
     return result if result.value is not None else VARIES

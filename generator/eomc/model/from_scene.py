@@ -29,8 +29,7 @@ from eomc.model.symbols import (
 )
 from eomc.model.system import System
 from eomc.scene.formulas import Formula, FormulaError, fold_values
-from eomc.scene.scene import Coordinate as Written
-from eomc.scene.scene import Scene
+from eomc.scene.scene import Scene, SceneCoordinate
 from eomc.scene.scope import ENERGIES
 
 
@@ -46,7 +45,7 @@ class _Formulas:
         self.known |= {name: symbol(name) for name in names}
         self.problems: list[Problem] = []
         self.doubts: list[Problem] = []
-        self.sizes: dict[str, digit_bound.Bound] = {}  # of constants and definitions
+        self.sizes: dict[str, digit_bound.DigitBound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
         """Convert a formula to a SymPy expression and return it.
@@ -296,7 +295,7 @@ def from_scene(scene: Scene) -> System:
     )
 
 
-def _follows(scene: Scene, c: Written) -> Iterator[str]:
+def _follows(scene: Scene, c: SceneCoordinate) -> Iterator[str]:
     """Yield the formulas of start and rate that depend on parameters, "" for others."""
     constants = {one.name: one.value for one in scene.constants}
     for formula in (c.start, c.rate):

@@ -36,7 +36,7 @@ from eomc.model.symbols import (
     t,
 )
 from eomc.scene.messages import is_in_degrees
-from eomc.scene.scene import Run
+from eomc.scene.scene import RunSettings
 from eomc.scene.schema import ACTIONS, DIRECTIONS
 
 _OF_NUMBERS = (
@@ -138,7 +138,7 @@ class Maker:
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
-        title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
+        title: str, run: RunSettings, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
     ) -> AnySystem:  # fmt: skip
         """Make a mechanical system from the arguments of System.make and return it.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from eomc.base import spatial
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Body, Turn
+from eomc.scene.assembly import WORLD, Assembly, RigidBody, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 from eomc.scene.scene import Scene
@@ -199,7 +199,7 @@ class Kinematics:
             weighs += [mass * v, inertia @ R.T @ omega]
         return Jacobian(np.vstack(moves), np.vstack([*weighs, *rotors]))
 
-    def _tree_rates(self, q: Array) -> Iterator[tuple[Body, Array, Array, Array]]:
+    def _tree_rates(self, q: Array) -> Iterator[tuple[RigidBody, Array, Array, Array]]:
         """Yield each body's rotation and its translational and rotational Jacobians (3, nq)."""
         frames = self._frames(q)
         above: dict[str, list[Motion]] = {WORLD: []}  # all motions between a body and the world
@@ -217,7 +217,7 @@ class Kinematics:
                         omega[:, k] += slope * axis
             yield body, R, v, omega
 
-    def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
+    def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[RigidBody, Array, Array, Array]]:
         """Yield rotation and Jacobians (3, nq) of bodies placed by formulas.
 
         The Jacobians are computed by central differences. The tuples are those of `_tree_rates`.
@@ -255,7 +255,7 @@ class Kinematics:
             for body in self.placed
         }
 
-    def joint_frame(self, body: Body) -> Pose:
+    def joint_frame(self, body: RigidBody) -> Pose:
         """Return the pose of a joint's frame in the frame of the parent body.
 
         body: the body that the joint attaches to its parent. The pose is a pair (position (3,) in
@@ -264,7 +264,7 @@ class Kinematics:
         offset = self.vector(body.offset, self.values) if body.offset else np.zeros(3)
         return offset, self._rotation(body.rotation, self.values)
 
-    def axes(self, body: Body) -> list[Array]:
+    def axes(self, body: RigidBody) -> list[Array]:
         """Return a unit vector for each motion of a body's joint.
 
         The components of each vector are in the joint's frame after the motions before it.
@@ -272,7 +272,7 @@ class Kinematics:
         axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
 
-    def _roots(self, body: Body) -> tuple[float, Array]:
+    def _roots(self, body: RigidBody) -> tuple[float, Array]:
         """Return square roots of mass and inertia tensor: 2 K = |root_m v|^2 + |root_I omega|^2."""
         inertia = [self._number(entry, self.values) for entry in body.inertia]
         moments, axes = np.linalg.eigh(spatial.tensor(inertia))

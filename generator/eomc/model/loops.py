@@ -31,7 +31,7 @@ from eomc.model import rational
 from eomc.model.mechanics import Mechanics
 from eomc.model.rational import ZERO, Matrix, Vector
 from eomc.model.symbols import Constraint, Reaction, needed, symbol, t
-from eomc.scene.assembly import Loop
+from eomc.scene.assembly import LoopJoint
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,12 @@ class Closed:
 
 
 def close(
-    loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, to_world: Matrix
+    loop: LoopJoint,
+    plane: bool,
+    ends: tuple[End, End],
+    turned: Matrix,
+    length: Expr,
+    to_world: Matrix,
 ) -> Closed:
     """Return the constraint equations and the reaction of a joint that closes a loop.
 
@@ -189,7 +194,7 @@ def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vect
     return columns[(k + 1) % 3], columns[(k + 2) % 3], along
 
 
-def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
+def gear(loop: LoopJoint, ratio: Expr, offset: Expr) -> Closed:
     """Return the constraint equation of a gear between two coordinates.
 
     The equation is second coordinate - ratio * first coordinate - offset = 0. loop: the gear in the

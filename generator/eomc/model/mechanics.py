@@ -27,8 +27,8 @@ from eomc.model.symbols import (
     Parameter,
     Reaction,
 )
-from eomc.model.tree import Frame, Tree
-from eomc.scene.scene import Run, Scene
+from eomc.model.tree import BodyFrame, Tree
+from eomc.scene.scene import RunSettings, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of C's float, in full precision
 
@@ -130,9 +130,9 @@ class Mechanics:
     reactions: tuple[Reaction, ...] = ()
     applied: tuple[tuple[Expr, Expr], ...] = ()
     tree: Tree | None = None
-    frames: tuple[Frame, ...] = ()
+    frames: tuple[BodyFrame, ...] = ()
     plane: bool = False
-    run: Run = field(default_factory=Run)
+    run: RunSettings = field(default_factory=RunSettings)
     title: str = ""
     note: str = ""
     file: str = ""
@@ -217,7 +217,7 @@ class Mechanics:
         return replace(self, parameters=changed)
 
     @property
-    def output_frames(self) -> tuple[Frame, ...]:
+    def output_frames(self) -> tuple[BodyFrame, ...]:
         """The frames of bodies and points for which the C code computes poses and Jacobians.
 
         Their order is that of the setting `frames` in the table [run] of the scene.

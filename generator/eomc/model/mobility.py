@@ -23,7 +23,7 @@ from eomc.base.errors import EomcError, Problem
 from eomc.base.texts import listed, plural
 from eomc.model.kinematics import Array, Kinematics, Null
 from eomc.scene import formulas
-from eomc.scene.assembly import Assembly, Body, Damper, Spring
+from eomc.scene.assembly import Assembly, Damper, RigidBody, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import CLOSINGS, JOINTS
 
@@ -235,7 +235,7 @@ def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
         )
 
 
-def _formulas_fix(placed: Sequence[Body], d: int, rank: int, M: int) -> Iterator[str]:
+def _formulas_fix(placed: Sequence[RigidBody], d: int, rank: int, M: int) -> Iterator[str]:
     if placed:
         yield (
             f"{listed([b.name for b in placed])}: M counts {d} freedoms for each body that is "

@@ -21,8 +21,8 @@ from eomc.model.coulomb_friction import Friction
 from eomc.model.loops import Closed
 from eomc.model.rational import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
-from eomc.model.tree import Frame, Link, Tree
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spring
+from eomc.model.tree import BodyFrame, Link, Tree
+from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
@@ -73,7 +73,7 @@ class Terms:
     forces: dict[str, Expr] = field(default_factory=dict)
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[BodyFrame] = field(default_factory=list)
     closed: list[Closed] = field(default_factory=list)  # one for each loop
     frictions: list[tuple[Expr, Friction]] = field(
         default_factory=list
@@ -161,7 +161,7 @@ class Builder:
             if body.joint:
                 self._join(body)
 
-    def _join(self, body: Body) -> None:
+    def _join(self, body: RigidBody) -> None:
         key = f"body.{body.name}"
         parent = self.places[body.parent]
         offset = self._vector(f"{key}.offset", body.offset) if body.offset else ZERO
@@ -231,7 +231,7 @@ class Builder:
         R = self._entries(name, product(place.R, turn))
         return _Place(len(terms.links) - 1, ZERO, back, place.at, R)
 
-    def _load(self, body: Body, place: _Place) -> None:
+    def _load(self, body: RigidBody, place: _Place) -> None:
         """Add the body's mass to its link and to the energies."""
         key, terms = f"body.{body.name}", self.terms
         mass = self.value(f"{key}.mass", body.mass)
@@ -303,10 +303,10 @@ class Builder:
         for loop in self.assembly.loops:
             self.terms.closed.append(self._close(f"loop.{loop.name}", loop))
 
-    def _frame(self, name: str, place: _Place) -> Frame:
+    def _frame(self, name: str, place: _Place) -> BodyFrame:
         if name in self.loads:
-            return Frame(name, -1, place.at, place.R, place.angle, *self.loads[name])
-        return Frame(name, place.link, place.offset, place.rotation, place.angle)
+            return BodyFrame(name, -1, place.at, place.R, place.angle, *self.loads[name])
+        return BodyFrame(name, place.link, place.offset, place.rotation, place.angle)
 
     def _apply(self, key: str, force: Force) -> None:
         """Add a force at a point of a body, or a torque; virtual work is F.dp + tau.(dR R^T)."""
@@ -326,7 +326,7 @@ class Builder:
                 applied += ((y, torque[axis] * x) for y, x in zip(row, other, strict=True))
         applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
 
-    def _close(self, key: str, loop: Loop) -> Closed:
+    def _close(self, key: str, loop: LoopJoint) -> Closed:
         """Add a joint that closes a loop, or a gear."""
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
@@ -343,7 +343,7 @@ class Builder:
         R = self.places[base].R
         return loops.close(loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R)
 
-    def _put(self, body: Body) -> None:
+    def _put(self, body: RigidBody) -> None:
         assert body.position is not None
         key, terms = f"body.{body.name}", self.terms
         mass = self.value(f"{key}.mass", body.mass)
@@ -419,7 +419,7 @@ class Builder:
         x, y, z = (self.value(key, formula) for formula in formulas)
         return (x, y, z)
 
-    def _rotation(self, key: str, turned: Body | Loop) -> Matrix:
+    def _rotation(self, key: str, turned: RigidBody | LoopJoint) -> Matrix:
         R = ONE
         for turn in turned.rotation:
             angle = self.value(key, turn.angle)

@@ -76,7 +76,7 @@ class Tree:
 
 
 @dataclass(frozen=True)
-class Frame:
+class BodyFrame:
     """The frame of a body or of a point on a body.
 
     Attributes

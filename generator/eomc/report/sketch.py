@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from eomc.base import spatial
 from eomc.report.marks import Drawing, Marks
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Between, Body, Loop, Turn
+from eomc.scene.assembly import WORLD, Assembly, Between, LoopJoint, RigidBody, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 from eomc.scene.scene import Scene, Shape
@@ -136,7 +136,7 @@ class _Sketch:
                 pose = self._vector(body.position), self._rotation(body.rotation)
                 self.poses[body.name], self.centers[body.name] = pose, pose[0]
 
-    def _after_joint(self, body: Body, at: Array, R: Array) -> Pose:
+    def _after_joint(self, body: RigidBody, at: Array, R: Array) -> Pose:
         kind = JOINTS[body.joint]
         along = zip(kind.motions, kind.motion_axes(body.axes), body.coordinates, strict=True)
         for motion, axis, by in along:
@@ -163,7 +163,7 @@ class _Sketch:
             for end in some:
                 self._between(kind, end, assembly)
 
-    def _draw_joint(self, body: Body) -> None:
+    def _draw_joint(self, body: RigidBody) -> None:
         """Draw the joint of a body, and a rod from the parent's frame to it."""
         marks, (seat, R) = self.marks, self.joint_frames[body.name]
         at = marks.point(seat)
@@ -186,7 +186,7 @@ class _Sketch:
         if body.point:
             marks.add("point", marks.point(self.poses[body.name][0]))
 
-    def _draw_loop(self, loop: Loop) -> None:
+    def _draw_loop(self, loop: LoopJoint) -> None:
         """Draw the joint that closes a loop, and rods from the frames of its bodies to it."""
         marks, ends = self.marks, list[Array]()
         for k, name in enumerate(loop.bodies):
@@ -210,7 +210,7 @@ class _Sketch:
             for end in (first, second) if loop.joint == "distance" else (first,):
                 marks.add("joint", end)
 
-    def _mass(self, body: Body, plane: bool) -> None:
+    def _mass(self, body: RigidBody, plane: bool) -> None:
         """Draw the centre of mass; in the plane also the orientation of the body."""
         mass = float(self._number(body.mass))
         if mass <= 0:
@@ -242,7 +242,7 @@ class _Sketch:
             if group and (root.joint in ("", "free") or not shows_rotation):
                 self._inertia(group, self.poses[root.name][1])
 
-    def _inertia(self, group: Sequence[Body], R: Array) -> None:
+    def _inertia(self, group: Sequence[RigidBody], R: Array) -> None:
         """Draw the box with the mass and inertia of bodies fixed to one another.
 
         `R` is the rotation of the box. With edges 2a, 2b, 2c, Ixx = m (b² + c²)/3.

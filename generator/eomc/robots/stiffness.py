@@ -21,12 +21,12 @@ from eomc.robots.robot import Coupling, JointMotion, Robot, RobotBody, RobotLoop
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
-from eomc.scene.scene import Run
+from eomc.scene.scene import RunSettings
 
 Array = NDArray[np.float64]
 
 FRICTION_WIDTH = 0.01  # m/s or rad/s, a scene's default
-OSCILLATION_LIMIT, DECAY_LIMIT = (x / Run.h for x in RK4.limits)  # rad/s, 1/s, by default
+OSCILLATION_LIMIT, DECAY_LIMIT = (x / RunSettings.h for x in RK4.limits)  # rad/s, 1/s, by default
 # 1/s: friction whose velocities decay faster is smoothed over a wider range. Implicit steps to a
 # tolerance of 1e-11, which estimates of errors take, resolve this decay in double precision
 FRICTION_DECAY_LIMIT = 1e6
@@ -88,7 +88,8 @@ def with_stable_steps(robot: Robot) -> Robot:
     )
     words = (
         f"stiff: {texts.listed(stiff, 6)}: at the start {' and '.join(rates)}, too fast for steps "
-        f'of rk4 of {Run.h:g} s; therefore [run] has method = "auto", steps that fit a tolerance'
+        f"of rk4 of {RunSettings.h:g} s; therefore "
+        '[run] has method = "auto", steps that fit a tolerance'
     )
     if any(name.startswith(FRICTION) for name in stiff):
         words += (

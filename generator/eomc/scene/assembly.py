@@ -28,7 +28,7 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Body:
+class RigidBody:
     """A rigid body, attached by a joint in a tree or placed by formulas.
 
     Attributes
@@ -144,7 +144,7 @@ class Force:
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopJoint:
     """A joint that closes a loop in a tree of bodies, or a gear between two coordinates.
 
     Attributes
@@ -208,8 +208,8 @@ class Assembly:
 
     plane: bool
     gravity: Vector
-    bodies: tuple[Body, ...]
+    bodies: tuple[RigidBody, ...]
     springs: tuple[Spring, ...] = ()
     dampers: tuple[Damper, ...] = ()
     forces: tuple[Force, ...] = ()
-    loops: tuple[Loop, ...] = ()
+    loops: tuple[LoopJoint, ...] = ()

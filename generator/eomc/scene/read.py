@@ -23,7 +23,7 @@ from eomc.scene import (
     validate_tables,
 )
 from eomc.scene.formulas import Formula, suggest
-from eomc.scene.scene import Input, Output, Quantity, Run, Scene
+from eomc.scene.scene import Quantity, RunSettings, Scene, SceneInput, SceneOutput
 from eomc.scene.scope import (
     INPUT,
     NOTHING,
@@ -180,7 +180,7 @@ class _SceneChecker(Checker):
             used=dict(self.used),
         )
 
-    def _run(self) -> Run:
+    def _run(self) -> RunSettings:
         """Return the settings of a run; events and the method "auto" require adaptive steps."""
         settings = self.doc.run.model_dump()
         single = settings["real"] == "float"
@@ -201,7 +201,7 @@ class _SceneChecker(Checker):
             if sticks and settings[key]:
                 why = 'friction that sticks has no derivatives: take friction = "smooth" for that'
                 self.report(("run", key), why)
-        return Run(**settings)
+        return RunSettings(**settings)
 
     # document and names
 
@@ -373,7 +373,7 @@ class _SceneChecker(Checker):
             circular.update(cycle)
         return circular
 
-    def _inputs(self, known: Mapping[str, float]) -> list[Input]:
+    def _inputs(self, known: Mapping[str, float]) -> list[SceneInput]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
         rule = "a signal can't depend on inputs"
         out = []
@@ -381,7 +381,7 @@ class _SceneChecker(Checker):
             signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)
             limits = self._limits(("inputs", name, "limits"), entry.limits, known)
             if signal:
-                out.append(Input(name, entry.unit, signal, entry.note, limits))
+                out.append(SceneInput(name, entry.unit, signal, entry.note, limits))
         return out
 
     def _limits(
@@ -438,7 +438,7 @@ class _SceneChecker(Checker):
                 out[name] = formula
         return out
 
-    def _outputs(self, forces: Sequence[str]) -> list[Output]:
+    def _outputs(self, forces: Sequence[str]) -> list[SceneOutput]:
         """Check the outputs, whose formulas may use all quantities of the motion."""
         self.allow_solved_quantities([f"{name}_ddot" for name in self.doc.coordinates], forces)
         out = []
@@ -455,7 +455,7 @@ class _SceneChecker(Checker):
                 )
                 self.report(("outputs", name), message)
             if formula:
-                out.append(Output(name, entry.unit, formula, entry.note))
+                out.append(SceneOutput(name, entry.unit, formula, entry.note))
         return out
 
     def _check_requests(self) -> None:

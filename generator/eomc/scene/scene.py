@@ -13,7 +13,7 @@ from eomc.scene.source_map import SourceMap
 
 
 @dataclass(frozen=True)
-class Coordinate:
+class SceneCoordinate:
     """A generalized coordinate of a scene.
 
     start: initial value in `unit`. rate: initial velocity in unit/s. The velocity has the name
@@ -48,7 +48,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Input:
+class SceneInput:
     """An input, whose value can be given at every step.
 
     signal: formula that determines the input if no value is given. limits: formulas of the smallest
@@ -63,7 +63,7 @@ class Input:
 
 
 @dataclass(frozen=True)
-class Output:
+class SceneOutput:
     """An output: a named quantity that is computed from the motion by a formula.
 
     The formula may use all quantities of the scene, accelerations and constraint forces too.
@@ -76,7 +76,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Constraint:
+class SceneConstraint:
     """A constraint equation: a formula that is zero along every motion.
 
     The formula depends on coordinates and t (holonomic), or is linear in the velocities.
@@ -89,7 +89,7 @@ class Constraint:
 
 
 @dataclass(frozen=True)
-class Event:
+class SceneEvent:
     """An event, which is triggered when a formula crosses zero.
 
     when: the formula. direction: "rising", "falling" or "both". action: "record", "stop" or "jump".
@@ -143,7 +143,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSettings:
     """Settings of the table [run] of a scene: what code is generated, and defaults of simulations.
 
     Attributes
@@ -222,19 +222,19 @@ class Scene:
     note: str
     file: str
     digest: str
-    coordinates: tuple[Coordinate, ...]
+    coordinates: tuple[SceneCoordinate, ...]
     parameters: tuple[Quantity, ...]
     constants: tuple[Quantity, ...]
-    inputs: tuple[Input, ...]
+    inputs: tuple[SceneInput, ...]
     definitions: tuple[tuple[str, Formula], ...]
     kinetic: Formula
     potential: Formula
     dissipation: Formula
     forces: Mapping[str, Formula]
-    outputs: tuple[Output, ...]
-    events: tuple[Event, ...]
-    constraints: tuple[Constraint, ...]
-    run: Run
+    outputs: tuple[SceneOutput, ...]
+    events: tuple[SceneEvent, ...]
+    constraints: tuple[SceneConstraint, ...]
+    run: RunSettings
     assembly: Assembly | None
     picture: Picture | None
     places: SourceMap = field(repr=False, compare=False)

@@ -10,7 +10,7 @@ from typing import Any
 
 from eomc.base import names
 from eomc.base.errors import MOST
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spring, Vector
+from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring, Vector
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import CLOSING_ALIASES, CLOSINGS, JOINT_ALIASES, JOINTS, Z
 from eomc.scene.schema import (
@@ -66,7 +66,7 @@ class _Bodies:
         self.check, self.doc = check, doc
         self.values = ValueChecker(check, doc, known)
         self.joints = JointChecker(self.values)
-        self.bodies: dict[str, Body] = {}
+        self.bodies: dict[str, RigidBody] = {}
 
     def assembly(self) -> Assembly:
         """Check all tables of bodies and what acts on them, and return the assembly."""
@@ -168,7 +168,7 @@ class _Bodies:
                 remedy = ", and let forces act through [forces]" if key == "actuator" else ""
                 self.check.report((*path, key), f"{why}: remove '{key}'{remedy}")
         mass, inertia = self.values.mass(path, entry)
-        self.bodies[entry.name] = Body(
+        self.bodies[entry.name] = RigidBody(
             name=entry.name,
             mass=mass,
             inertia=inertia,
@@ -193,7 +193,7 @@ class _Bodies:
         parent = self.joints.parent((*path, "body"), entry.name, entry.body)
         self.values.has_inertia[entry.name] = False
         if parent is not None:
-            self.bodies[entry.name] = Body(
+            self.bodies[entry.name] = RigidBody(
                 name=entry.name,
                 mass=ZERO,
                 inertia=(ZERO,) * 6,
@@ -231,7 +231,7 @@ class _Bodies:
             check_width(check, path, value, width, entry.friction)
         if parent is None or coordinates is None:
             return
-        self.bodies[entry.name] = Body(
+        self.bodies[entry.name] = RigidBody(
             name=entry.name,
             mass=mass,
             inertia=inertia,
@@ -264,7 +264,7 @@ class _Bodies:
 
     # --- the tree ---------------------------------------------------------------------------------
 
-    def _sorted_bodies(self) -> list[Body]:
+    def _sorted_bodies(self) -> list[RigidBody]:
         """Return the bodies, parents before children, else in their order; cycles are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
         for ring in islice(find_cycles(graph), MOST):
@@ -289,7 +289,7 @@ class _Bodies:
                 out.append(self.bodies[name])
         return out
 
-    def _check_inertia(self, ordered: Iterable[Body]) -> None:
+    def _check_inertia(self, ordered: Iterable[RigidBody]) -> None:
         """Report joints that move nothing with inertia.
 
         Nothing is reported if energies are given as well or if there are constraints, where bodies
@@ -644,7 +644,7 @@ class LoopChecker:
         self.check, self.doc = values.check, values.doc
         self.rows = {*values.doc.constraints}  # names of constraint equations so far
 
-    def loop(self, path: Path, entry: LoopTable) -> Loop | None:
+    def loop(self, path: Path, entry: LoopTable) -> LoopJoint | None:
         """Check a [[loop]] table and return the loop, or None if its kind of joint is unknown.
 
         path: keys of the table in the scene. entry: the table. Errors are reported.
@@ -666,7 +666,7 @@ class LoopChecker:
                 "length": self._distance((*path, "length"), kind, entry),
             }
         self._report_foreign_keys(path, kind, entry)
-        loop = Loop(entry.name, kind, note=entry.note, **parts)
+        loop = LoopJoint(entry.name, kind, note=entry.note, **parts)
         self._check_row_names(path, loop)
         return loop
 
@@ -814,7 +814,7 @@ class LoopChecker:
                     remedy = "give axis in the frame of each body, [[0, 0, 1], [1, 0, 0]]"
                 self.check.report((*path, key), f"a {kind} joint has no '{key}': {remedy}")
 
-    def _check_row_names(self, path: Path, loop: Loop) -> None:
+    def _check_row_names(self, path: Path, loop: LoopJoint) -> None:
         """Report a name of the loop or of its constraint equations that is in use already."""
         check, path = self.check, (*path, "name")
         if path in check.repaired:

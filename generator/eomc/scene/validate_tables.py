@@ -14,7 +14,14 @@ from eomc.base import names, texts
 from eomc.scene import formulas, messages
 from eomc.scene.assembly import WORLD, Assembly, Turn, Vector
 from eomc.scene.formulas import Formula, FormulaError, suggest
-from eomc.scene.scene import Constraint, Coordinate, Event, Picture, PicturePlace, Shape
+from eomc.scene.scene import (
+    Picture,
+    PicturePlace,
+    SceneConstraint,
+    SceneCoordinate,
+    SceneEvent,
+    Shape,
+)
 from eomc.scene.schema import BodyTable, Document, EventTable
 from eomc.scene.schema import Place as Written
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
@@ -26,7 +33,7 @@ FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 def check_coordinates(
     check: Checker, doc: Document, known: Mapping[str, float]
-) -> Iterator[Coordinate]:
+) -> Iterator[SceneCoordinate]:
     """Check the table [coordinates] of a document and yield its coordinates.
 
     known: values of constants and parameters by name. Errors are reported to `check`; faulty
@@ -57,7 +64,7 @@ def check_coordinates(
             width = checked or FRICTION_WIDTH
             check_width(check, ("coordinates", name), value, checked, entry.friction)
         if start and rate:
-            yield Coordinate(
+            yield SceneCoordinate(
                 name, entry.unit, start, rate, entry.note, is_fixed, is_rate_fixed, friction, width
             )
 
@@ -99,7 +106,7 @@ def check_width(
 _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
-def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
+def check_constraints(check: Checker, doc: Document) -> Iterator[SceneConstraint]:
     """Check the table [constraints] of a document and yield its constraint equations.
 
     Errors are reported to `check`; faulty entries may be left out.
@@ -124,7 +131,7 @@ def check_constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
                 formula.text,
             )
         check.check_smooth(path, formula)
-        yield Constraint(name, entry.unit, formula, entry.note)
+        yield SceneConstraint(name, entry.unit, formula, entry.note)
 
 
 def _equation_remedy(text: str) -> str:
@@ -223,7 +230,7 @@ INPUT_REMEDY = ": write '{name}*on' where it acts, with a parameter on = 1, and 
 CONSTANT_REMEDY = ", and does not change in a run: make it a parameter"
 
 
-def check_events(check: Checker, doc: Document) -> Iterator[Event]:
+def check_events(check: Checker, doc: Document) -> Iterator[SceneEvent]:
     """Check the [[event]] tables of a document and yield the events.
 
     Errors are reported to `check`; faulty entries may be left out.
@@ -252,7 +259,7 @@ def check_events(check: Checker, doc: Document) -> Iterator[Event]:
                 ("event", k, "when"), "never crosses zero: it has no names", text=when.text
             )
         elif when:
-            yield Event(entry.name, when, entry.direction, entry.action, jump, entry.note)
+            yield SceneEvent(entry.name, when, entry.direction, entry.action, jump, entry.note)
 
 
 def _jump(

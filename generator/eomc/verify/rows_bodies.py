@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
+from eomc.scene.assembly import WORLD, Assembly, Damper, Force, RigidBody, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.scene import Scene
 from eomc.verify.comparison import Comparison
@@ -278,14 +278,14 @@ class Line:
         """Return the values of three constant formulas, (3,)."""
         return np.array([float(self.evaluate(x)) for x in entries])
 
-    def oriented(self, frame: Frame, body: Body) -> Frame:
+    def oriented(self, frame: Frame, body: RigidBody) -> Frame:
         """Return the frame after the rotations in the table of the body."""
         for turn in body.rotation:
             axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
             frame = frame.turned(self.evaluate(turn.angle) + 0 * self.nodes, axis)
         return frame
 
-    def attach(self, body: Body) -> None:
+    def attach(self, body: RigidBody) -> None:
         """Compute and store the frame of a body that has a joint.
 
         body: the body; the frame of its parent must be stored already. The coordinates of its
@@ -326,7 +326,7 @@ class Line:
         return self.at_middle(self.forces()) - self.loss()
 
     @property
-    def bodies(self) -> Sequence[Body]:
+    def bodies(self) -> Sequence[RigidBody]:
         """Bodies with at least one coordinate between them and the world."""
         return [b for b in self.assembly.bodies if b.name not in self.immovable_bodies()]
 
@@ -342,7 +342,7 @@ class Line:
         """Return the entry of an array of values at the nodes that belongs to the middle node."""
         return float((values + 0 * self.nodes)[self.middle])
 
-    def points(self, body: Body) -> list[tuple[float, Vector]]:
+    def points(self, body: RigidBody) -> list[tuple[float, Vector]]:
         """Return point masses with the same mass, centre of mass and inertia as the body.
 
         Each is a pair of a mass, kg, which may be negative, and a position in the body's frame, m.
@@ -359,7 +359,7 @@ class Line:
             masses += [(moment / 2, centre + axis), (moment / 2, centre - axis)]
         return masses
 
-    def kinetic(self, body: Body) -> Vector:
+    def kinetic(self, body: RigidBody) -> Vector:
         """Return the kinetic energy of a body and of rotors at its joint at the nodes, (n,), in J.
 
         The energy of the body is that of its point masses, see `points`.
@@ -372,7 +372,7 @@ class Line:
             energy = energy + self.evaluate(armature) / 2 * rate**2
         return energy
 
-    def rates(self, body: Body) -> Iterator[Vector]:
+    def rates(self, body: RigidBody) -> Iterator[Vector]:
         """Yield the time derivative of each joint coordinate of a body at the line's nodes, (n,).
 
         A body's joint has one such coordinate, in m or rad, for each direction or axis of motion.
@@ -380,7 +380,7 @@ class Line:
         for formula in body.coordinates:
             yield self.rate @ (self.evaluate(formula) + 0 * self.nodes)
 
-    def weight(self, body: Body) -> Vector:
+    def weight(self, body: RigidBody) -> Vector:
         """Return the potential energy -m g·c of a body's weight, in J, at the line's nodes, (n,).
 
         c is the position of the centre of mass and g the acceleration of gravity.

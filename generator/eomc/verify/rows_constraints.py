@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from eomc.scene.assembly import Loop
+from eomc.scene.assembly import LoopJoint
 from eomc.verify import rows_projection
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import STENCIL, Vector
@@ -216,7 +216,7 @@ class FormRows:
         return worst
 
     def _reaction_power(
-        self, loop: Loop, s: State, moving: Vector, width: float, force: Vector
+        self, loop: LoopJoint, s: State, moving: Vector, width: float, force: Vector
     ) -> float:
         """Return a reaction's power at velocities `moving`, less that at rest, per their sum."""
         total, scene = 0.0, self.system.scene
