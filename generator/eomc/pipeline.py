@@ -21,7 +21,7 @@ from eomc.base.errors import EomcError, NoCompilerError
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem, SceneError
-    from eomc.emit.fmu.files import Unit
+    from eomc.emit.fmu.unit import Unit
     from eomc.emit.render import Sources
     from eomc.model.system import System
     from eomc.program.program import Program

@@ -43,11 +43,10 @@ from payloads import (
 import eomc
 from eomc.base import texts
 from eomc.base.errors import EomcError, SceneError
-from eomc.emit import package, render, selftest
+from eomc.emit import embedding, package, portable, render, selftest
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.optimised import files
-from eomc.emit.portable import steppers
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text
@@ -245,14 +244,14 @@ def test_templates_are_given_free_text_only_as_free_text() -> None:
     whole = derived()
     marked = replace(whole, system=with_texts(whole.system, "MARKED"))
     target = Target(marked, DOUBLE)
-    given: list[Any] = [package.main(target), package.face(target, "_x")]
+    given: list[Any] = [embedding.main(target), package.face(target, "_x")]
     given += [package.binding(target), selftest.view(target)]
 
     def show(view: Any) -> str:
         given.append(view)
         return ""
 
-    steppers.files(marked, show)
+    portable.files(marked, show)
     files.files(files.steppers(target), show)
     assert len(given) > 12
     for view in given:

@@ -22,7 +22,7 @@ from conftest import needs
 import eomc
 from eomc.base import names
 from eomc.derive import lagrange
-from eomc.emit import c_identifiers
+from eomc.emit import c_names
 from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.scene import read as scene
@@ -67,7 +67,7 @@ def test_the_compiler_has_told_its_macros() -> None:
 def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
     accepted = {m for m in macros() if not names.fault(m)}
     assert len(accepted) > 1000
-    used = {m: c_identifiers.in_c(m, "scene") for m in accepted}
+    used = {m: c_names.in_c(m, "scene") for m in accepted}
     assert {m for m, c in used.items() if c in macros()} == set()
     # and what is made of names
     made = ("sin_{}", "cos_{}", "{}_dot", "{}_ddot", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
@@ -82,7 +82,7 @@ def test_no_enumerator_is_a_macro() -> None:
             name, coordinate = macro[:cut].lower(), macro[cut + 1 :].lower()
             if macro.upper() != macro or names.fault(coordinate) or names.module_fault(name):
                 continue
-            assert c_identifiers.may_be_enumerator_of_others(macro), macro
+            assert c_names.may_be_enumerator_of_others(macro), macro
 
 
 def made(text: str) -> dict[str, str]:
@@ -276,9 +276,7 @@ def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
             continue
         first = replace(function.body[0], name="NAN")
         odd = replace(function, body=(first, *function.body[1:]))
-        found, _ = c_identifiers.rename_for_c(
-            replace(made, functions={**made.functions, name: odd})
-        )
+        found, _ = c_names.rename_for_c(replace(made, functions={**made.functions, name: odd}))
         assert found.functions[name].body[0].name == "NAN_", name
 
 

@@ -19,7 +19,7 @@ from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.emit import render
 from eomc.emit.fmu import units
-from eomc.emit.fmu.files import Unit
+from eomc.emit.fmu.unit import Unit
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain.files import write_files

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +18,34 @@ from conftest import tiers
 import eomc
 from eomc.base import resources
 from eomc.derive import lagrange
-from eomc.emit import render, views
+from eomc.emit import render
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fmu import views as fmu_views
-from eomc.emit.optimised import views as fast_views
-from eomc.emit.portable import views as plain_views
 from eomc.emit.public import Public
 from eomc.model.system import System
 from eomc.program import program
 
-MODULES = (views, plain_views, fast_views, fmu_views)
-FOUND = {v for m in MODULES for v in vars(m).values() if dataclasses.is_dataclass(v)}
-VIEWS = sorted((v for v in FOUND if hasattr(v, "TEMPLATE")), key=lambda v: str(v.TEMPLATE))
+EMIT = Path(render.__file__).parent
+MODULES = sorted(p.relative_to(EMIT).as_posix() for p in EMIT.rglob("*.py"))
 INCLUDED = {
     "c/evaluations.c",  # by the sources of both forms
     *(f"c/adaptive_{part}.c" for part in ("measures", "newton", "stages", "corners")),
 }
 # modules that hold C
 MAY = ("c_function.py", "c_expression.py")
+
+
+def _views() -> Iterator[Any]:
+    """Yield the class of every view of a template."""
+    names = [f"eomc.emit.{m.removesuffix('.py').replace('/', '.')}" for m in MODULES]
+    for name in (*names, "eomc.report.reference_solution"):
+        for value in vars(importlib.import_module(name)).values():
+            if dataclasses.is_dataclass(value) and value.__module__ == name:
+                if hasattr(value, "TEMPLATE"):
+                    yield value
+
+
+VIEWS = sorted(_views(), key=lambda v: str(v.TEMPLATE))
 
 
 def asked(template: str) -> set[str]:
@@ -62,12 +73,7 @@ def test_every_template_of_code_has_a_view() -> None:
     assert names == shown | INCLUDED
 
 
-EMIT = Path(render.__file__).parent
-
-
-@pytest.mark.parametrize(
-    "module", sorted(p.relative_to(EMIT).as_posix() for p in EMIT.rglob("*.py"))
-)
+@pytest.mark.parametrize("module", MODULES)
 def test_no_c_syntax_in_python(module: str) -> None:
     """Semicolons, arrows, braces and const: in two files alone."""
     if module in MAY:

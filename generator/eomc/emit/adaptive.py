@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.coefficients import matrix, numbers, rounded
-from eomc.emit.functions import Functions
-from eomc.emit.portable.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, FixedSteps
+from eomc.emit.functions import SceneFunctions
+from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.nonsmooth import has_steep_terms
 from eomc.model.system import System
@@ -36,7 +36,264 @@ RECENT_STEPS = 4  # steps in which one may be halved for its events without bein
 EVENTS_PER_STEP = 32  # without events at the same time
 
 
-def memory(functions: Functions) -> str:
+@dataclass(frozen=True)
+class AdaptiveFields(NameFields):
+    """Coefficients and constants that the templates of adaptive steps share, as C literals.
+
+    Attributes
+    ----------
+    method
+        Prefix of the C names of the integration method.
+    extent
+        Length of vectors of coordinates, as a C expression.
+    stages, c
+        Number of stages of the method, and the nodes: times of the stages as fractions of a step.
+    f, sqrt
+        Suffix of C literals of this precision, and the name of the C square root.
+    eps, tiny
+        The rounding unit, and a small positive number that avoids divisions by zero.
+    powers
+        Matrix that multiplies the accelerations at the stages, to obtain the coefficients of the
+        polynomial of time through them.
+    most
+        Largest number of iterations over the stages.
+    retry_after
+        Number of steps by Newton's method before fixed-point iteration is tried again.
+    of_most, of_most_coarse
+        Least scale to which the error of a coordinate or velocity is related, as a fraction of the
+        largest coordinate or velocity: in general, and where rounding errors are estimated.
+    unscaled
+        Number of trailing coordinates that only jumps change; they have no scale.
+    """
+
+    method: str
+    extent: str
+    stages: int
+    f: str
+    sqrt: str
+    eps: str
+    tiny: str
+    of_most: str
+    of_most_coarse: str
+    unscaled: int
+    most: int
+    c: tuple[str, ...]
+    powers: tuple[str, ...]
+    retry_after: int
+
+
+@dataclass(frozen=True)
+class AdaptiveStepView(AdaptiveFields):
+    """Data for c/adaptive.c: one step with adaptive step-size control.
+
+    The four templates that it includes read the same data.
+
+    Attributes
+    ----------
+    lanes
+        Macro before loops over stages that the compiler is to vectorise; "" for none.
+    total
+        C expression for the sum of half[0], half[1], ..., the sums of pairs of stages.
+    top
+        Rows of the matrix that multiplies the accelerations at the stages, to obtain the
+        coefficients of the last four Legendre polynomials. The error is estimated from these.
+    weights
+        Rows of weights of the stage accelerations in the increments of position and velocity.
+    timed, events, begins
+        Whether accelerations depend on time, whether there are events, and whether some events may
+        trigger at the start of a motion.
+    may_rest, capped, capped_now
+        Whether all bodies may stay at rest under time-dependent forces, so that motions are
+        rounding errors; the function that then limits the scales of the error estimate; its call.
+    project, whole
+        C call that projects the end of a step onto the constraints ("" for none), and whether its
+        arguments are the state (q, q̇) itself rather than the increments in the step.
+    solve_stages, sweep, solve, solve_within
+        The function `solve_stages`, which solves for the stages by iteration; the C call of one
+        iteration in it; and its C calls for a step and for the state within a step.
+    step, start, within
+        The function for the next step, the call of the accelerations at its start, and the function
+        for the state within a step (dense output).
+    corners, share
+        Whether forces may jump or have kinks, and the fraction of the tolerance that applies to
+        steps in which they do.
+    fabs, longest, close
+        Name of the C function for |x|; largest time span, in time scales of the initial motion, to
+        which the least step size is relative; number of least step sizes within which kinks count
+        as repeated.
+    ends
+        Weights of the stage accelerations that give the values of their polynomial at the start and
+        at the end of a step.
+    forces, forces_there, forces_here, forces_near
+        The function for the accelerations at a state, and its calls at the end of a step, at a
+        state, and at a perturbed state.
+    slopes, slopes_now, nudge
+        The function for the derivatives of the accelerations by finite differences, its call, and
+        the relative size of the differences.
+    eigenvalues, to_parts, from_parts
+        The three results of `Method.eigen`, for Newton's method.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive.c"
+    title: str
+    lanes: str
+    total: str
+    top: tuple[str, ...]
+    weights: tuple[str, ...]
+    timed: bool
+    may_rest: bool
+    capped: CFunction
+    capped_now: str
+    events: bool
+    begins: bool
+    project: str
+    whole: bool
+    solve_stages: CFunction
+    sweep: str
+    step: CFunction
+    start: str
+    solve: str
+    within: CFunction
+    solve_within: str
+    corners: bool
+    fabs: str
+    longest: str
+    close: str
+    share: str
+    ends: tuple[str, ...]
+    forces: CFunction
+    forces_there: str
+    forces_here: str
+    forces_near: str
+    slopes: CFunction
+    slopes_now: str
+    nudge: str
+    eigenvalues: tuple[str, ...]
+    to_parts: tuple[str, ...]
+    from_parts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FixedStepsView(NameFields):
+    """Data for c/fixed_steps.c: steps of fixed size with event detection.
+
+    Attributes
+    ----------
+    method, extent, stages, f, eps
+        As in `AdaptiveFields`.
+    fabs
+        Name of the C function for |x|.
+    timed, jumps, above
+        Whether accelerations depend on time, whether events make the state jump, and whether there
+        are events of stick-slip friction.
+    fixed, at
+        Prototypes of the functions for the next step and for the state at a time within the last
+        step.
+    inside
+        C call that interpolates the state within an adaptive step.
+    step
+        C call of the integration method through the function pointer memory->step.
+    forces_before, forces_halfway, forces_after
+        C calls of the accelerations at the start, the middle and the end of a step.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/fixed_steps.c"
+    method: str
+    extent: str
+    stages: int
+    f: str
+    eps: str
+    fabs: str
+    timed: bool
+    jumps: bool
+    above: bool
+    fixed: CFunction
+    at: CFunction
+    inside: str
+    step: str
+    forces_before: str
+    forces_halfway: str
+    forces_after: str
+
+
+@dataclass(frozen=True)
+class AdaptiveRunView(NameFields):
+    """Data for c/adaptive_run.c: a run by adaptive steps, with its rows and events.
+
+    A row is one stored state of the run, at one of the requested times.
+
+    Attributes
+    ----------
+    constants, compute_constants
+        Whether there is a C struct of precomputed expressions of the parameters, and the C call
+        that computes it ("" for none).
+    unread_p
+        Whether the parameters are an argument that the body does not use.
+    loosest, tightest
+        Largest and smallest tolerance.
+    events, max_events
+        Whether there are events, and their largest number in one step.
+    recent_steps, retry_after
+        As in `EventsView` and `AdaptiveFields`.
+    initial_events, changed, happen, restart, values
+        C calls, "" for none: of the jumps at the start; of the function for changes of event
+        functions when inputs change; of the detection of events in a step; of the restart after an
+        event; and of the event functions.
+    run, advance, fixed
+        Prototype of the public function, and C calls of an adaptive step and of a fixed step.
+    row, row_before, look
+        C calls that store a row: the state at the end of a step, the state before a jump, and the
+        state within a step.
+    project_row, project_restart
+        C calls that project a row and the state after an event onto the constraints; "" for none.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive_run.c"
+    method: str
+    constants: bool
+    unread_p: bool
+    compute_constants: str
+    loosest: str
+    tightest: str
+    events: bool
+    f: str
+    eps: str
+    fabs: str
+    recent_steps: int
+    initial_events: str
+    changed: str
+    values: str
+    huge: str
+    max_events: int
+    retry_after: int
+    run: CFunction
+    advance: str
+    fixed: str
+    happen: str
+    restart: str
+    row: str
+    row_before: str
+    look: str
+    project_row: str
+    project_restart: str
+
+
+@dataclass(frozen=True)
+class AdaptiveBatchView:
+    """Data for c/adaptive_batch.c: adaptive runs of many instances, in sequence.
+
+    prefix: the scene's name, with which C names begin. batch: prototype of the public function.
+    alone: C call of the run of one instance, with index k. events: whether the scene has events.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive_batch.c"
+    prefix: str
+    batch: CFunction
+    alone: str
+    events: bool
+
+
+def memory(functions: SceneFunctions) -> str:
     """Return the name of the C struct for the workspace of a run with adaptive step-size control.
 
     The workspace keeps data between the calls that continue a run.
@@ -95,13 +352,13 @@ class SweepInterface:
 
 
 @dataclass(frozen=True)
-class Stepping:
+class AdaptiveFunctions:
     """The C functions of adaptive steps for one form (portable or optimised) of the C code.
 
     Most properties are prototypes of static functions whose bodies are in templates.
     """
 
-    functions: Functions
+    functions: SceneFunctions
     form: SweepInterface
 
     @property
@@ -244,7 +501,7 @@ class Stepping:
         return c.static(f"{self.method}_at", "void", *own, *self.step_arguments, self.workspace)
 
 
-def tableau(stepping: Stepping) -> dict[str, Any]:
+def tableau(stepping: AdaptiveFunctions) -> dict[str, Any]:
     """Return the variables, by name, that all templates of adaptive steps share.
 
     These are the coefficients of the integration method, tolerances and C names.
@@ -270,7 +527,7 @@ def tableau(stepping: Stepping) -> dict[str, Any]:
     }
 
 
-def steps(stepping: Stepping) -> Adaptive:
+def steps(stepping: AdaptiveFunctions) -> AdaptiveStepView:
     """Return the data for the template of the C code that makes one adaptive step.
 
     The template also has the code that interpolates the state within the step.
@@ -281,7 +538,7 @@ def steps(stepping: Stepping) -> Adaptive:
     references["m"] = "newton ? &m : 0"
     eigenvalues, to_parts, from_parts = m.eigen
     last, b = [m.legendre(n) for n in range(m.stages - 4, m.stages)], rounded(m.b, real)
-    return Adaptive(
+    return AdaptiveStepView(
         **tableau(stepping),
         title=TITLE,
         fabs=f"fabs{real.function_suffix}",
@@ -324,13 +581,13 @@ def steps(stepping: Stepping) -> Adaptive:
     )
 
 
-def fixed(stepping: Stepping) -> FixedSteps:
+def fixed(stepping: AdaptiveFunctions) -> FixedStepsView:
     """Return the data for the template of steps of fixed size in which events are detected."""
     functions = stepping.functions
     target, real = functions.target, functions.target.real
     at = {"q": "q_at", "qd": "qd_at"}
     state = {name: c.member(stepping.state.name, name) for name in ("q", "qd")}
-    return FixedSteps(
+    return FixedStepsView(
         **functions.names,
         method=stepping.method,
         extent=stepping.form.extent,
@@ -356,7 +613,7 @@ def max_events_per_step(system: System) -> int:
     return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
-def row_storage(stepping: Stepping) -> CFunction:
+def row_storage(stepping: AdaptiveFunctions) -> CFunction:
     """Return the prototype of the C function that stores a state in a run's output arrays."""
     arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
@@ -368,9 +625,9 @@ def tightest(real: Real) -> float:
 
 
 def run(
-    stepping: Stepping, happen: str = "", restart: str = "", initial_events: str = "",
+    stepping: AdaptiveFunctions, happen: str = "", restart: str = "", initial_events: str = "",
     changed: str = "", values: str = "",
-) -> AdaptiveRun:  # fmt: skip
+) -> AdaptiveRunView:  # fmt: skip
     """Return the data for the template of an adaptive run, the loop over steps.
 
     Parameters
@@ -394,7 +651,7 @@ def run(
     def projected(**state: str) -> str:
         return functions.public.project.call(fixed="0", **state) if form.project else ""
 
-    return AdaptiveRun(
+    return AdaptiveRunView(
         **functions.names,
         method=stepping.method,
         constants=form.constants,
@@ -441,7 +698,7 @@ def steps_in_parallel(target: Target) -> bool:
     )
 
 
-def call_for_instance(functions: Functions) -> str:
+def call_for_instance(functions: SceneFunctions) -> str:
     """Return the C call that continues the adaptive run of one instance of a batch.
 
     A batch is a number of instances of the system. The call is in a loop in which k is the index of
@@ -459,12 +716,12 @@ def call_for_instance(functions: Functions) -> str:
     )  # fmt: skip
 
 
-def batch(functions: Functions) -> AdaptiveBatch:
+def batch(functions: SceneFunctions) -> AdaptiveBatchView:
     """Return the data for the template of the C function that makes a batch of adaptive runs.
 
     A batch is a number of instances of the system. The C code steps one instance after the other.
     """
-    return AdaptiveBatch(
+    return AdaptiveBatchView(
         prefix=functions.prefix,
         batch=functions.public.adaptive_batch(METHOD.name),
         alone=call_for_instance(functions),

@@ -257,7 +257,7 @@ class Printer:
 
 
 @dataclass(frozen=True)
-class Body:
+class CBody:
     """The C statements of a function in blocks, with its results as C expressions.
 
     Attributes
@@ -294,7 +294,7 @@ def body(
     in_order: bool = False,
     reserved: frozenset[str] = frozenset(),
     together: bool = False,
-) -> Body:
+) -> CBody:
     """Return a function of a program as C statements.
 
     Parameters
@@ -355,7 +355,7 @@ def body(
             printer.inline[a.name] = (text, strength)
         else:
             lines[a.stage].append(set_to(a.name, text))
-    return Body(
+    return CBody(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
         results=tuple(printer.in_lane(o) for o in function.outputs),

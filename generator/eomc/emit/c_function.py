@@ -1,4 +1,4 @@
-""" """
+"""C functions as data: their prototypes, calls, statements and definitions, and long lines."""
 
 from __future__ import annotations
 
@@ -126,6 +126,41 @@ def static(name: str, result: str, *arguments: CArgument) -> CFunction:
     result: C type of the result.
     """
     return CFunction(name, result, arguments, qualifier="static")
+
+
+@dataclass(frozen=True)
+class Computed:
+    """A C function whose body is generated from a function of the eomc program, with its helpers.
+
+    Attributes
+    ----------
+    function
+        The C function itself.
+    parts
+        Static C functions that `function` calls: the pieces of a long function, or the function for
+        one column of a matrix.
+    values
+        C definition of the struct with the intermediate values that the pieces share; "" for none.
+    column_call, out, symmetric
+        For matrix functions that loop over columns: the C call that computes one column, the name
+        of the output array, and whether the matrix is symmetric.
+    """
+
+    function: CFunction
+    parts: tuple[CFunction, ...] = ()
+    values: str = ""
+    column_call: str = ""
+    out: str = ""
+    symmetric: bool = False
+
+    @property
+    def text(self) -> str:
+        """C text of the struct and of all functions, in the order in which C needs them.
+
+        Not for functions that loop over columns: a template writes their loop around `column_call`.
+        """
+        texts = (self.values, *(f.definition for f in self.parts), self.function.definition)
+        return "\n\n".join(filter(None, texts))
 
 
 def block_text(block: Block) -> str:

@@ -4,14 +4,31 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import TypedDict
+from typing import Any
 
 from sympy import Rational
 
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Real
+from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import Method, Row
+
+
+@dataclass(frozen=True)
+class TableauFields(NameFields):
+    """Fields of a view: the coefficients of a Runge-Kutta method for second-order equations.
+
+    c: the nodes. A, AA: the rows of the matrices A and A A. b, bA: the weights b and b A. All are
+    C literals or initialisers; `tableau` returns them.
+    """
+
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
 
 
 def literal(x: Fraction, real: Real) -> str:
@@ -58,26 +75,15 @@ def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
     return c_function.in_braces(numbers(row, real) for row in padded)
 
 
-class Tableau(TypedDict):
-    """Coefficients of a Runge-Kutta method for second-order equations, as C literals.
+def tableau(m: Method, real: Real) -> dict[str, Any]:
+    """Return the fields c, A, AA, b and bA of `TableauFields` for the integration method `m`.
 
-    They are the nodes c, the matrices A and A A by rows (lines of C initialisers), and the weights
-    b and b A.
+    real: the C type of the literals.
     """
-
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
-
-
-def tableau(m: Method, real: Real) -> Tableau:
-    """Return the coefficients of the integration method `m` as C literals of the type `real`."""
-    return Tableau(
-        c=numbers(m.c, real),
-        A=matrix(m.a, real),
-        AA=matrix(m.a_squared, real),
-        b=numbers(rounded(m.b, real), real),
-        bA=numbers(m.b_a, real),
-    )
+    return {
+        "c": numbers(m.c, real),
+        "A": matrix(m.a, real),
+        "AA": matrix(m.a_squared, real),
+        "b": numbers(rounded(m.b, real), real),
+        "bA": numbers(m.b_a, real),
+    }

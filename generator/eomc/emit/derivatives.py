@@ -1,21 +1,167 @@
-"""Functions for the derivatives of a step with respect to q, qd and u, in both forms of C."""
+"""Derivatives of accelerations and of steps with respect to q, q̇ and u, in both forms of C."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from eomc.emit import c_function as c
-from eomc.emit.c_function import CFunction
-from eomc.emit.coefficients import tableau
-from eomc.emit.functions import Functions
-from eomc.emit.portable.views import Derivative
+from eomc.emit.c_function import CFunction, Computed
+from eomc.emit.c_names import sentence
+from eomc.emit.coefficients import TableauFields, tableau
+from eomc.emit.functions import SceneFunctions
 from eomc.emit.projection import ZERO_SQUARE, near
+from eomc.emit.public import program_function
+from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import METHODS
 
 MAX_NEWTON_ITERATIONS = 50  # for the stages
 
 
-def derivatives(plain: Functions) -> Iterator[Derivative]:
+@dataclass(frozen=True)
+class LinearizationView(NameFields):
+    """Data for c/linearization.c: derivatives of the accelerations by q, q̇ and u.
+
+    Attributes
+    ----------
+    inputs
+        Whether the scene has inputs u.
+    width
+        Length of one row [da/dq, da/dqd, da/du], as a C expression.
+    slopes
+        The static function that computes all rows.
+    linearization
+        Prototype of the public function, which splits the rows into A_q, A_qd and B.
+    unread
+        Names of arguments of the public function that its body does not use.
+    signal_call, slopes_call
+        C calls of the scene's signals for u ("" if they are not needed) and of `slopes`.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/linearization.c"
+    inputs: bool
+    width: str
+    slopes: Computed
+    linearization: CFunction
+    unread: tuple[str, ...]
+    signal_call: str
+    slopes_call: str
+
+
+@dataclass(frozen=True)
+class DerivativeView(TableauFields):
+    """Data for c/derivative.c: a C function for the derivatives of one step.
+
+    They are the derivatives of q and q̇ at the end of the step with respect to q, q̇ and u at its
+    start.
+
+    Attributes
+    ----------
+    inputs, width
+        Whether there are inputs u, and the number of variables in q, q̇ and u, as a C expression.
+    rates, eliminate, projection
+        C functions that all methods share, so that only one method prints them: the derivatives of
+        the accelerations (None for the other methods), Gaussian elimination (whether it is
+        printed), and the correction onto the constraints with its directional derivative (or None).
+    linearization, feedback
+        C calls of the derivatives of the accelerations, and of the derivatives of the signals, the
+        scene's formulas for inputs ("" if the signals do not depend on the state).
+    moved, projection_call, move
+        For scenes with constraints: the function that projects the end of a step and its
+        derivatives onto the constraints, the call of `projection` in it, and the call of `moved`.
+    near, scale_floor
+        Tolerances of that correction, as in `ProjectionView`.
+    function, implicit, stages
+        Prototype of the function, whether the method is implicit, and its number of stages.
+    step, start, stage, rates_call
+        C calls of the step, of the accelerations at its start and at a stage, and of `rates`.
+    converged, tolerance
+        Largest relative correction of velocities with which the stages of an implicit method are
+        accepted: in general, and when Newton's iteration does not reduce it further.
+    other
+        Largest relative difference between the end of the step itself and the end that follows from
+        the stages computed here; if it is exceeded, the function fails.
+    most
+        Largest number of Newton iterations.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/derivative.c"
+    inputs: bool
+    width: str
+    rates: CFunction | None
+    linearization: str
+    feedback: str
+    eliminate: bool
+    projection: Computed | None
+    moved: CFunction | None
+    projection_call: str
+    move: str
+    near: str
+    scale_floor: str
+    function: CFunction
+    implicit: bool
+    stages: int
+    step: str
+    start: str
+    stage: str
+    rates_call: str
+    fabs: str
+    fmax: str
+    tiny: str
+    converged: str
+    tolerance: str
+    other: str
+    most: int
+
+
+# --- the derivatives of the accelerations ---------------------------------------------------------
+
+
+def linearization(plain: SceneFunctions) -> LinearizationView | None:
+    """Return the template data for the derivatives of the accelerations q̈.
+
+    The derivatives are A_q = ∂q̈/∂q, A_qd = ∂q̈/∂q̇ and B = ∂q̈/∂u. Return None if the program does
+    not contain them. plain: the C functions of the scene.
+    """
+    target = plain.target
+    function = program_function(target, "linearization")
+    if function is None:
+        return None
+    NQ, inputs = plain.NQ, bool(target.system.inputs)
+    width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
+    cost, doc = sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
+    if "linearization" in target.program:
+        slopes = plain.static(function, "slopes", "slopes", doc, fails=True)
+    else:
+        column = "[da/dq, da/dqd, da/du] times along."
+        one = plain.static(function, "slopes_column", "column", column, fails=True)
+        along = ("column", "along")
+        arguments_ = tuple(a for a in one.function.arguments if a.name not in along)
+        loop_function = replace(
+            one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
+            arguments=(c.output_array(plain.real, "slopes"), *arguments_),
+        )  # fmt: skip
+        slopes = Computed(
+            loop_function, (*one.parts, one.function), one.values, one.function.call()
+        )
+        cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"
+    arguments = plain.arguments(*plain.state, "u", "p")
+    arguments_read = plain.read(function)
+    reads_u = plain.reads_u(function) and plain.signal is not None
+    return LinearizationView(
+        **plain.names,
+        inputs=inputs,
+        width=width,
+        slopes=slopes,
+        linearization=replace(plain.public.linearization, doc=(cost,)),
+        unread=tuple(a.name for a in arguments if a.name not in arguments_read),
+        signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
+        slopes_call=slopes.function.call(),
+    )
+
+
+def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
     """Yield, for each integration method, the data for the template of the derivatives of a step.
 
     The derivatives are with respect to q, qd and u. Nothing is yielded if the scene does not
@@ -39,7 +185,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
-        yield Derivative(
+        yield DerivativeView(
             **plain.names,
             inputs=inputs,
             width=f"2*{plain.NQ} + {plain.NU}" if inputs else f"2*{plain.NQ}",
@@ -71,7 +217,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
         )
 
 
-def _moved(plain: Functions) -> CFunction:
+def _moved(plain: SceneFunctions) -> CFunction:
     """Return the static function that projects a step's end and its derivatives onto the
     constraints.
     """

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from math import cos, pi, prod
-from typing import Any
+from typing import Any, ClassVar
 
 from eomc.emit import c_function as c
 from eomc.emit.adaptive import (
     EVENTS_PER_STEP,
     METHOD,
     RECENT_STEPS,
-    Stepping,
+    AdaptiveFunctions,
+    AdaptiveRunView,
+    AdaptiveStepView,
+    FixedStepsView,
     SweepInterface,
     fixed,
     max_events_per_step,
@@ -21,14 +25,8 @@ from eomc.emit.adaptive import (
 )
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
-from eomc.emit.functions import Functions
-from eomc.emit.portable.adaptive_views import (
-    Adaptive,
-    AdaptiveRun,
-    Events,
-    FixedSteps,
-    InitialEvents,
-)
+from eomc.emit.functions import SceneFunctions
+from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import Row
 from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
@@ -38,6 +36,334 @@ MAX_TAIL = 0.02  # last Chebyshev coefficients of a resolved event function, ove
 MAX_EVENT_HALVINGS = 10  # of steps with unresolved events, besides one in RECENT_STEPS
 DIFFERENCE_STEP = 1e-6  # of finite differences, as a fraction of the step
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
+
+
+@dataclass(frozen=True)
+class EventsView(NameFields):
+    """Data for c/events.c: event detection in a step, and state jumps.
+
+    An event triggers at a root of its event function, a function of time and state.
+
+    Attributes
+    ----------
+    method, fabs, sqrt, eps, tiny, huge
+        Prefix of C names, names of C functions, and constants.
+    samples, nodes, slopes
+        Number of evaluations of an event function in a step; their positions, as fractions of the
+        step; and the matrix that multiplies the values there to obtain the derivatives there.
+    stages, once, twice
+        Number of stages; the first and the second integrals of the powers of time up to each node.
+    directions, actions, above
+        For each event: -1, 0 or 1 for falling, both or rising; 0, 1 or 2 for record, stop or jump;
+        1 if its function cannot become negative immediately after it was zero.
+    jumps
+        Whether events make the state jump.
+    max_events, together
+        Largest number of events in one step, and of jumps at the same time.
+    difference_step, near, close
+        Tolerances as fractions of a step: for finite differences, for corrections of a root, and
+        for an accurate root.
+    chance
+        Fraction of the time between jumps. If the next jump follows within it, the two jumps are
+        taken as coincidental.
+    halvings, recent_steps
+        A step is halved at most `halvings` times to resolve event functions, not counting one
+        halving in every `recent_steps` steps.
+    max_tail, last
+        Largest size of the last Chebyshev coefficients of a resolved event function, relative to
+        its largest value, and the weights that compute these coefficients.
+    rounding, rounded, values_near
+        The function that estimates the rounding error of an event function, its C call, and the C
+        call of the event functions in its body.
+    evaluate_events, refine_root, find_root, event_step, changed, restart
+        The functions: event functions within a step, root between two times, first root in a step,
+        all events of a step, changes by new inputs, and the start after an event.
+    values, values_there, values_end, values_now, values_before, values_after
+        C calls of the event functions: in `evaluate_events`, at a state within the step, at its
+        end, in `changed`, and before and after a jump.
+    look_value, look_before, look_after, bracket, bracket_dip, cross, inside
+        C calls of `evaluate_events` at a time and shortly before and after it, of `refine_root` up
+        to a node and up to a minimum, of `find_root`, and of the state within a step.
+    jump, project, project_all
+        C calls of the jump map (the new state after an event), and of the projection onto the
+        constraints with and without entries of the state that stay fixed; "" for none.
+    set
+        For each event of the scene, 1 for the entries of q and qd that its jump sets, else 0.
+    modes
+        Initialisers with the indices of each friction mode and of its coordinate.
+    own
+        Number of events that the scene itself defines; the others belong to friction.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/events.c"
+    method: str
+    fabs: str
+    sqrt: str
+    eps: str
+    tiny: str
+    samples: int
+    nodes: tuple[str, ...]
+    slopes: tuple[str, ...]
+    stages: int
+    once: tuple[str, ...]
+    twice: tuple[str, ...]
+    directions: tuple[int, ...]
+    actions: tuple[int, ...]
+    above: tuple[int, ...]
+    jumps: bool
+    max_events: int
+    together: int
+    difference_step: str
+    near: str
+    close: str
+    chance: str
+    huge: str
+    halvings: int
+    recent_steps: int
+    rounding: CFunction
+    rounded: str
+    values_near: str
+    max_tail: str
+    last: tuple[str, ...]
+    evaluate_events: CFunction
+    values: str
+    refine_root: CFunction
+    find_root: CFunction
+    look_value: str
+    bracket: str
+    bracket_dip: str
+    event_step: CFunction
+    cross: str
+    look_before: str
+    look_after: str
+    inside: str
+    values_there: str
+    values_end: str
+    changed: CFunction
+    values_now: str
+    restart: CFunction
+    values_before: str
+    jump: str
+    project: str
+    project_all: str
+    set: tuple[str, ...]
+    modes: tuple[str, ...]
+    own: int
+    values_after: str
+
+
+@dataclass(frozen=True)
+class InitialEventsView(NameFields):
+    """Data for c/initial_events.c: events that trigger at the start of a motion.
+
+    Attributes
+    ----------
+    function
+        Prototype of the static C function that makes the jumps of these events.
+    values
+        C call that computes one value for each event, which is positive if the event triggers.
+    restart
+        C call that makes the state jump.
+    method
+        Prefix of the C names of the integration method.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/initial_events.c"
+    function: CFunction
+    values: str
+    restart: str
+    method: str
+
+
+def views(
+    functions: SceneFunctions, form: SweepInterface
+) -> Iterator[AdaptiveStepView | FixedStepsView | EventsView | InitialEventsView | AdaptiveRunView]:
+    """Yield the data for the templates of adaptive steps, events and runs, in their order in the C
+    file.
+
+    form: what differs between portable and optimised C. Without events, there are only the
+    templates of adaptive steps and runs.
+    """
+    stepping = AdaptiveFunctions(functions, form)
+    yield steps(stepping)
+    if not functions.target.system.events:
+        yield run(stepping)
+        return
+    yield fixed(stepping)
+    event_view = _events(stepping)
+    yield event_view
+    arguments = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
+    again = arguments | {"reached": "reached"}
+    start_view = (
+        _start_events(stepping, event_view.restart)
+        if "begins" in functions.target.program
+        else None
+    )
+    if start_view:
+        yield start_view
+    start_call = start_view.function.call(x="&x") if start_view else ""
+    end_state = {"events": "x.last_values", "t": "x.t", "q": "x.q", "qd": "x.qd"}
+    values = functions.public.evaluation("events").call(**end_state)
+    changed = event_view.changed.call(x="&x")
+    yield run(
+        stepping,
+        event_view.event_step.call(**arguments),
+        event_view.restart.call(**again),
+        start_call,
+        changed,
+        values,
+    )
+
+
+def _start_events(stepping: AdaptiveFunctions, restart: CFunction) -> InitialEventsView:
+    """Return the data for the template of events that trigger at the start of a motion.
+
+    restart: the C function that continues the run after an event.
+    """
+    functions, x = stepping.functions, stepping.state.name
+    values, record = (
+        functions.public.evaluation("begins"),
+        functions.public.adaptive_events,
+    )
+    arguments_taken = {a.name for f in (values, restart) for a in f.arguments}
+    extra = [a for a in functions.arguments("u", "p") if a.name in arguments_taken]
+    arguments = (stepping.state, *extra, *record, stepping.workspace)
+    state = {name: c.member(x, name) for name in ("t", "q", "qd")}
+    return InitialEventsView(
+        **functions.names,
+        function=c.static(f"{stepping.method}_initial_events", functions.status, *arguments),
+        values=values.call(begins="value", **state),
+        method=stepping.method,
+        restart=restart.call(reached=state["t"]),
+    )  # fmt: skip
+
+
+def _events(stepping: AdaptiveFunctions) -> EventsView:
+    """Return the data for the template of event detection."""
+    functions, method = stepping.functions, stepping.method
+    target, real, public = functions.target, functions.real, functions.public
+    end, system = target.real.function_suffix, target.system
+    jumps = "jumps" in target.program
+    evaluated = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
+    argument_names = {a.name for f in evaluated for a in f.arguments}
+    values, number, k = evaluated[0], stepping.number, CArgument("int", "k")
+    read = c.input_array(f"{method}_adaptive_state", "x")
+    # arguments of the formulas besides the state
+    extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
+
+    values_at = (c.output_array(real, "g"), read, number("z"), *extra)
+    evaluate_events = c.static(f"{method}_evaluate_events", "void", *values_at)
+    ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
+    refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
+    above = tuple(int(e.above) for e in system.events if "begins" in target.program)
+    find_root = c.static(
+        f"{method}_find_root", real, stepping.state, k, number("from"), c.input_array(real, "g"),
+        *([number("noise")] if above else []), *extra,
+    )  # fmt: skip
+    outputs = [c.output_array(real, name) for name in ("reached", "q_at", "qd_at")]
+    record = public.adaptive_events
+    rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
+    event_step = c.static(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
+    changed = c.static(f"{method}_events_changed", "int", stepping.state, *extra)
+    calls = [*evaluated, *([public.project] if stepping.form.project else ())]
+    taken_by_calls = {a.name for f in calls for a in f.arguments}
+    after_event = [a for a in functions.arguments("u", "p") if a.name in taken_by_calls]
+    restart = c.static(
+        f"{method}_restart", functions.status, stepping.state, number("reached"), *outputs[1:],
+        *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),
+    )  # fmt: skip
+    at = {"q": "q_at", "qd": "qd_at"}
+    within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
+    reached = {"t": "reached", **at}
+    now = {name: c.member("x", name) for name in ("t", "q", "qd")}
+    difference = DIFFERENCE_STEP if target.real.epsilon < 1e-10 else 1e-3
+    return EventsView(
+        method=method,
+        fabs=f"fabs{end}",
+        sqrt=f"sqrt{end}",
+        **_tables(functions),
+        directions=tuple(DIRECTIONS[e.direction] for e in system.events),
+        actions=tuple(ACTIONS.index(e.action) for e in system.events),
+        above=above,
+        jumps=jumps,
+        max_events=max_events_per_step(system),
+        together=EVENTS_PER_STEP + 4 * (max_events_per_step(system) - EVENTS_PER_STEP),
+        difference_step=target.literal(difference),
+        near=target.literal(0.01),
+        close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
+        chance=target.literal(1e-6),
+        **_rounding(stepping, extra),
+        evaluate_events=evaluate_events,
+        values=values.call(events="g", **within),
+        refine_root=refine_root,
+        find_root=find_root,
+        look_value=evaluate_events.call(g="value"),
+        bracket=refine_root.call(high="node[j]", at_high="g[j]"),
+        bracket_dip=refine_root.call(high="z", at_high="value[k]"),
+        event_step=event_step,
+        cross=find_root.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
+        look_before=evaluate_events.call(g="value", z=f"z - {target.literal(difference / 2)}"),
+        look_after=evaluate_events.call(g="value", z=f"z + {target.literal(difference / 2)}"),
+        inside=stepping.state_within.call(),
+        values_there=values.call(events="value", **within),
+        values_end=values.call(events="value", t=now["t"]),
+        changed=changed,
+        values_now=values.call(events="value", **now),
+        restart=restart,
+        values_before=values.call(events="before", **reached),
+        jump=evaluated[-1].call(**reached) if jumps else "",
+        project=public.project.call(fixed="set[k]", **reached) if stepping.form.project else "",
+        project_all=public.project.call(fixed="0", **reached) if stepping.form.project else "",
+        set=_set(system) if stepping.form.project and jumps else (),
+        modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
+        own=len(system.own_events),
+        values_after=values.call(events="value", **reached),
+    )
+
+
+def _rounding(stepping: AdaptiveFunctions, extra: Sequence[CArgument]) -> dict[str, Any]:
+    """Return the template variables for the C function that estimates rounding errors of event
+    functions.
+
+    They are its prototype, its call, and the call of the event functions in it. extra: its
+    arguments besides the state.
+    """
+    read, k = c.input_array(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
+    function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
+    state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
+    values = stepping.functions.public.evaluation("events").call(events="value", **state)
+    return {"rounding": function, "rounded": function.call(), "values_near": values}
+
+
+def _set(system: System) -> tuple[str, ...]:
+    """Return, for each event of the scene, flags in braces: which entries of [q, qd] its jump
+    sets.
+    """
+    states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
+    rows = ({name for name, _ in e.jump} for e in system.own_events)
+    return c.in_braces([str(int(name in names)) for name in states] for names in rows)
+
+
+def _tables(functions: SceneFunctions) -> dict[str, Any]:
+    """Return template variables: nodes for event functions, and weights for their values there."""
+    target = functions.target
+    x, real = nodes(), target.real
+    return {
+        **functions.names,
+        "eps": target.literal(real.epsilon),
+        "tiny": target.literal(1e-30),
+        "samples": SAMPLES,
+        "nodes": numbers(x, real),
+        "slopes": matrix(slopes(x), real),
+        "huge": target.literal(1e30),
+        "halvings": MAX_EVENT_HALVINGS,
+        "recent_steps": RECENT_STEPS,
+        "max_tail": target.literal(MAX_TAIL),
+        "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
+        "stages": METHOD.stages,
+        "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),
+        "twice": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 2)),
+    }
 
 
 def nodes() -> Row:
@@ -103,194 +429,3 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
 
     integral = (once, twice)[times - 1]
     return [tuple(integral(n, at) for n in range(count)) for at in x]
-
-
-def views(
-    functions: Functions, form: SweepInterface
-) -> Iterator[Adaptive | FixedSteps | Events | InitialEvents | AdaptiveRun]:
-    """Yield the data for the templates of adaptive steps, events and runs, in their order in the C
-    file.
-
-    form: what differs between portable and optimised C. Without events, there are only the
-    templates of adaptive steps and runs.
-    """
-    stepping = Stepping(functions, form)
-    yield steps(stepping)
-    if not functions.target.system.events:
-        yield run(stepping)
-        return
-    yield fixed(stepping)
-    event_view = _events(stepping)
-    yield event_view
-    arguments = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
-    again = arguments | {"reached": "reached"}
-    start_view = (
-        _start_events(stepping, event_view.restart)
-        if "begins" in functions.target.program
-        else None
-    )
-    if start_view:
-        yield start_view
-    start_call = start_view.function.call(x="&x") if start_view else ""
-    end_state = {"events": "x.last_values", "t": "x.t", "q": "x.q", "qd": "x.qd"}
-    values = functions.public.evaluation("events").call(**end_state)
-    changed = event_view.changed.call(x="&x")
-    yield run(
-        stepping,
-        event_view.event_step.call(**arguments),
-        event_view.restart.call(**again),
-        start_call,
-        changed,
-        values,
-    )
-
-
-def _start_events(stepping: Stepping, restart: CFunction) -> InitialEvents:
-    """Return the data for the template of events that trigger at the start of a motion.
-
-    restart: the C function that continues the run after an event.
-    """
-    functions, x = stepping.functions, stepping.state.name
-    values, record = (
-        functions.public.evaluation("begins"),
-        functions.public.adaptive_events,
-    )
-    arguments_taken = {a.name for f in (values, restart) for a in f.arguments}
-    extra = [a for a in functions.arguments("u", "p") if a.name in arguments_taken]
-    arguments = (stepping.state, *extra, *record, stepping.workspace)
-    state = {name: c.member(x, name) for name in ("t", "q", "qd")}
-    return InitialEvents(
-        **functions.names,
-        function=c.static(f"{stepping.method}_initial_events", functions.status, *arguments),
-        values=values.call(begins="value", **state),
-        method=stepping.method,
-        restart=restart.call(reached=state["t"]),
-    )  # fmt: skip
-
-
-def _events(stepping: Stepping) -> Events:
-    """Return the data for the template of event detection."""
-    functions, method = stepping.functions, stepping.method
-    target, real, public = functions.target, functions.real, functions.public
-    end, system = target.real.function_suffix, target.system
-    jumps = "jumps" in target.program
-    evaluated = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
-    argument_names = {a.name for f in evaluated for a in f.arguments}
-    values, number, k = evaluated[0], stepping.number, CArgument("int", "k")
-    read = c.input_array(f"{method}_adaptive_state", "x")
-    # arguments of the formulas besides the state
-    extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
-
-    values_at = (c.output_array(real, "g"), read, number("z"), *extra)
-    evaluate_events = c.static(f"{method}_evaluate_events", "void", *values_at)
-    ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
-    refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
-    above = tuple(int(e.above) for e in system.events if "begins" in target.program)
-    find_root = c.static(
-        f"{method}_find_root", real, stepping.state, k, number("from"), c.input_array(real, "g"),
-        *([number("noise")] if above else []), *extra,
-    )  # fmt: skip
-    outputs = [c.output_array(real, name) for name in ("reached", "q_at", "qd_at")]
-    record = public.adaptive_events
-    rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
-    event_step = c.static(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
-    changed = c.static(f"{method}_events_changed", "int", stepping.state, *extra)
-    calls = [*evaluated, *([public.project] if stepping.form.project else ())]
-    taken_by_calls = {a.name for f in calls for a in f.arguments}
-    after_event = [a for a in functions.arguments("u", "p") if a.name in taken_by_calls]
-    restart = c.static(
-        f"{method}_restart", functions.status, stepping.state, number("reached"), *outputs[1:],
-        *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),
-    )  # fmt: skip
-    at = {"q": "q_at", "qd": "qd_at"}
-    within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
-    reached = {"t": "reached", **at}
-    now = {name: c.member("x", name) for name in ("t", "q", "qd")}
-    difference = DIFFERENCE_STEP if target.real.epsilon < 1e-10 else 1e-3
-    return Events(
-        method=method,
-        fabs=f"fabs{end}",
-        sqrt=f"sqrt{end}",
-        **_tables(functions),
-        directions=tuple(DIRECTIONS[e.direction] for e in system.events),
-        actions=tuple(ACTIONS.index(e.action) for e in system.events),
-        above=above,
-        jumps=jumps,
-        max_events=max_events_per_step(system),
-        together=EVENTS_PER_STEP + 4 * (max_events_per_step(system) - EVENTS_PER_STEP),
-        difference_step=target.literal(difference),
-        near=target.literal(0.01),
-        close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
-        chance=target.literal(1e-6),
-        **_rounding(stepping, extra),
-        evaluate_events=evaluate_events,
-        values=values.call(events="g", **within),
-        refine_root=refine_root,
-        find_root=find_root,
-        look_value=evaluate_events.call(g="value"),
-        bracket=refine_root.call(high="node[j]", at_high="g[j]"),
-        bracket_dip=refine_root.call(high="z", at_high="value[k]"),
-        event_step=event_step,
-        cross=find_root.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
-        look_before=evaluate_events.call(g="value", z=f"z - {target.literal(difference / 2)}"),
-        look_after=evaluate_events.call(g="value", z=f"z + {target.literal(difference / 2)}"),
-        inside=stepping.state_within.call(),
-        values_there=values.call(events="value", **within),
-        values_end=values.call(events="value", t=now["t"]),
-        changed=changed,
-        values_now=values.call(events="value", **now),
-        restart=restart,
-        values_before=values.call(events="before", **reached),
-        jump=evaluated[-1].call(**reached) if jumps else "",
-        project=public.project.call(fixed="set[k]", **reached) if stepping.form.project else "",
-        project_all=public.project.call(fixed="0", **reached) if stepping.form.project else "",
-        set=_set(system) if stepping.form.project and jumps else (),
-        modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
-        own=len(system.own_events),
-        values_after=values.call(events="value", **reached),
-    )
-
-
-def _rounding(stepping: Stepping, extra: Sequence[CArgument]) -> dict[str, Any]:
-    """Return the template variables for the C function that estimates rounding errors of event
-    functions.
-
-    They are its prototype, its call, and the call of the event functions in it. extra: its
-    arguments besides the state.
-    """
-    read, k = c.input_array(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
-    function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
-    state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
-    values = stepping.functions.public.evaluation("events").call(events="value", **state)
-    return {"rounding": function, "rounded": function.call(), "values_near": values}
-
-
-def _set(system: System) -> tuple[str, ...]:
-    """Return, for each event of the scene, flags in braces: which entries of [q, qd] its jump
-    sets.
-    """
-    states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
-    rows = ({name for name, _ in e.jump} for e in system.own_events)
-    return c.in_braces([str(int(name in names)) for name in states] for names in rows)
-
-
-def _tables(functions: Functions) -> dict[str, Any]:
-    """Return template variables: nodes for event functions, and weights for their values there."""
-    target = functions.target
-    x, real = nodes(), target.real
-    return {
-        **functions.names,
-        "eps": target.literal(real.epsilon),
-        "tiny": target.literal(1e-30),
-        "samples": SAMPLES,
-        "nodes": numbers(x, real),
-        "slopes": matrix(slopes(x), real),
-        "huge": target.literal(1e30),
-        "halvings": MAX_EVENT_HALVINGS,
-        "recent_steps": RECENT_STEPS,
-        "max_tail": target.literal(MAX_TAIL),
-        "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
-        "stages": METHOD.stages,
-        "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),
-        "twice": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 2)),
-    }

@@ -5,25 +5,17 @@ State in arrays, parameters in a struct. Each is straight-line code, outlined wh
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from eomc.emit import c_function as c
-from eomc.emit import heading
-from eomc.emit.c_expression import REALS, Block, Body, Real, group_angles
-from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.c_expression import REALS, Block, CBody, Real, group_angles
+from eomc.emit.c_function import CArgument, CFunction, Computed
 from eomc.emit.c_names import Target, rename_reserved, sentence
-from eomc.emit.evaluations import KINDS, c_array_size, doc, refuses, source
-from eomc.emit.portable.parts import Computed
-from eomc.emit.portable.views import (
-    Indexed,
-    Parameter,
-)
-from eomc.emit.public import Public
+from eomc.emit.public import KINDS, Public, c_array_size, doc, program_function, refuses
 from eomc.integrators.tableaux import METHODS
-from eomc.model.symbols import Constraint, Coordinate, Event, Input, Output
 from eomc.program import outline
 from eomc.program.ir import Function
 from eomc.program.program import Program
@@ -39,7 +31,7 @@ MAX_UNCOMMENTED_LINES = 16  # statements without comments between stages
 
 
 @dataclass(frozen=True)
-class Functions:
+class SceneFunctions:
     """The C functions generated for a program: prototypes, arguments and bodies.
 
     The program is the list of functions (D, bias, acceleration, ...) derived from a scene. The
@@ -64,7 +56,7 @@ class Functions:
         return self.target.real.name
 
     @property
-    def names(self) -> dict[str, str]:
+    def names(self) -> dict[str, Any]:
         """The template variables that most templates share: prefix, PREFIX and real."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
@@ -219,7 +211,7 @@ class Functions:
             "", tuple(self.target.loads(function, self.target.element, self.target.element))
         )
 
-    def straight_line_body(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
+    def straight_line_body(self, function: Function, out: str) -> tuple[tuple[Block, ...], CBody]:
         """Return the C statements of a function of the program, and its results as C expressions.
 
         out: name of the C array that the statements write the results to; "" to return the only
@@ -230,7 +222,7 @@ class Functions:
         last = Block("", ends if out else (c.result(body.results[0]),))
         return (*self.statements(function, body), last), body
 
-    def statements(self, function: Function, body: Body) -> tuple[Block, ...]:
+    def statements(self, function: Function, body: CBody) -> tuple[Block, ...]:
         """Return the C statements of a function: definitions of local variables, then assignments.
 
         body: the assignments in C. Many statements are divided by stage (time, position, velocity)
@@ -292,7 +284,9 @@ class Functions:
     @cached_property
     def evaluations(self) -> tuple[Computed, ...]:
         """The C functions that evaluate quantities such as D or energy, in header order."""
-        return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
+        return tuple(
+            self.evaluation(n) for n in KINDS if program_function(self.target, n) is not None
+        )
 
     def evaluation(self, name: str) -> Computed:
         """Return the C function, with its body, that evaluates a quantity.
@@ -300,7 +294,7 @@ class Functions:
         `name` is the name of the quantity, such as D, bias or signal.
         """
         kind, target = KINDS[name], self.target
-        function = source(target, name)
+        function = program_function(target, name)
         assert function is not None
         cost = sentence(function)
         by_columns = name not in target.program
@@ -466,7 +460,7 @@ class Functions:
         return self.static(function, "projection_along", "column", doc, fails=True)
 
     @cached_property
-    def projected(self) -> CFunction:
+    def project_end(self) -> CFunction:
         """The prototype of the static C function that projects the state after a step.
 
         It belongs to the portable form of the C code. Its body is in a template.
@@ -476,7 +470,7 @@ class Functions:
         return c.static(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
 
     @cached_property
-    def onto(self) -> CFunction:
+    def project_stage(self) -> CFunction:
         """The prototype of the static C function that projects the state at a stage of a step.
 
         The function makes one correction onto the constraints, of first order. Its body is in a
@@ -528,41 +522,11 @@ class Functions:
         return Computed(result, parts, values)
 
 
-def portable_functions(program: Program, real: Real | None = None) -> Functions:
+def portable_functions(program: Program, real: Real | None = None) -> SceneFunctions:
     """Return the C functions of a program in portable form, which uses sin and cos of libm.
 
     real: C type of the numbers; None for the type that the scene specifies.
     """
-    return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
-
-
-def indexed(
-    plain: Functions,
-    items: Sequence[Constraint | Coordinate | Event | Input | Output],
-    prefix: str = "",
-) -> tuple[Indexed, ...]:
-    """Return the C enumerator, unit and note of each of the given items of the scene.
-
-    items: coordinates, inputs, outputs, constraints or events. prefix: "OUT_", "EVENT_" or
-    "CONSTRAINT_", which `Target.enum` adds to the names of such items.
-    """
-    enum = plain.target.enum
-    return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in items)
-
-
-def parameters(plain: Functions) -> tuple[Parameter, ...]:
-    """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
-    return tuple(
-        Parameter(p.name, plain.target.literal(p.value), heading.words(p.unit, p.note))
-        for p in plain.target.system.parameters
+    return SceneFunctions(
+        Target(program, replace(real or REALS[program.system.run.real], reach=0.0))
     )
-
-
-def handshake(plain: Functions) -> str:
-    """Return a hexadecimal C constant that must be the same in the C source and in its header.
-
-    The C compiler reports a header of another scene or form. Optimised C has another constant than
-    portable C, since its workspaces differ in size.
-    """
-    digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
-    return f"0x{digest[:8]}u"

@@ -1,36 +1,22 @@
-"""Views of the files besides both forms of C: example, binding and Python package."""
+"""The Python package of a scene: its C binding, its modules and its type stubs."""
 
 from __future__ import annotations
 
-import math
-import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, refuses, takes_qdd
-from eomc.emit.heading import stamp, words
-from eomc.emit.public import Public
-from eomc.emit.views import (
-    Binding,
-    Bound,
-    BoundAdaptive,
-    BoundMethod,
-    Declarations,
-    Face,
-    Main,
-    Named,
-    Stub,
-)
-from eomc.integrators.tableaux import METHODS
+from eomc.emit.public import KINDS, Public, refuses, takes_qdd
+from eomc.emit.views import stamp, words
+from eomc.integrators.tableaux import METHODS, Method
 from eomc.runtime.package import CONSTRAINED
 from eomc.scene.formulas import fold_values, parse
 
-_OF_STEPS = ("Phi", "Gamma")
-ROWS = 200  # approximate number of rows that main.c prints
-LINE = 88  # width of the column names there
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
     "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
@@ -43,55 +29,297 @@ OPTIONAL = {  # functions by the option that brings them
 }
 
 
-def main(target: Target) -> Main:
-    """Return the data for main.c, an example program that simulates the scene.
+@dataclass(frozen=True)
+class BoundFunction:
+    """An evaluation function, such as D or energy, in the Python binding, called for n states.
 
-    The program prints about 200 lines.
+    Attributes
+    ----------
+    name
+        Name of the function without the scene's prefix.
+    call
+        C call for the state with index k, with an assignment if the function returns a number.
+    solve
+        C call that first computes the accelerations which the function reads; "" if it reads none.
+    at
+        C call at x = [q; qd], for SciPy's LowLevelCallable; "" unless the function returns a double
+        that depends on the state and parameters only.
+    refuses
+        Number of results for each state, as C text, if the function returns a status; otherwise "".
     """
-    s, public = target.system, Public(target)
-    steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
-    names = [target.as_written(c.name) for c in s.coordinates]
-    method, output_names = s.run.methods[0], [o.name for o in s.outputs]
-    columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *output_names, "energy"))
-    outputs = public.evaluation("outputs").call(u="NULL") if output_names else ""
-    solved = output_names and takes_qdd(target, "outputs")
-    rows = {"q_rows": "NULL", "qd_rows": "NULL", "memory": "&memory", "status": "&status"}
-    if s.run.tolerance is None:
-        run = public.run(method).call(
-            t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", **rows
-        )
-    else:
-        method, limits = f"{adaptive.METHOD.name}_adaptive", {"t_end": "next", "h_most": "0"}
-        run = public.adaptive(adaptive.METHOD.name).call(
-            t="&t", **limits, u="NULL", steps="1000000", times="NULL", count="0", t_rows="NULL",
-            room="0", events="NULL", which="NULL", event_rows="NULL", **rows,
-        )  # fmt: skip
-    return Main(
-        title=FreeText(s.title),
-        stamp=tuple(stamp(target)),
+
+    name: str
+    call: str
+    solve: str
+    at: str
+    refuses: str
+
+
+@dataclass(frozen=True)
+class BoundMethod:
+    """C calls of one integration method in the Python binding.
+
+    Attributes
+    ----------
+    step, run, batch
+        Calls for one step, for a run, and for a run of many instances.
+    derivative
+        Call for the derivatives of a step from the state with index k; "" if these are not
+        generated.
+    step_between, derivative_between
+        Calls for each further step and its derivatives, where the derivatives of several steps are
+        multiplied; "" as for `derivative`.
+    """
+
+    name: str
+    implicit: bool
+    step: str
+    run: str
+    batch: str
+    derivative: str
+    step_between: str
+    derivative_between: str
+
+
+@dataclass(frozen=True)
+class BoundAdaptive:
+    """Adaptive steps in the Python binding.
+
+    Attributes
+    ----------
+    memory
+        C type of the workspace.
+    run, batch
+        C calls for a run, and for runs of many instances.
+    events
+        Whether the scene has events.
+    """
+
+    memory: str
+    run: str
+    events: bool
+    batch: str
+
+
+@dataclass(frozen=True)
+class BindingView:
+    """Data for the template python/binding.c.jinja: C functions that Python calls for many states.
+
+    Attributes
+    ----------
+    evaluations
+        The evaluation functions, such as D or energy.
+    acceleration, project, linearization
+        C calls for the accelerations, the projection onto the constraints and the linearization;
+        "" for those that are not generated.
+    batch
+        Whether runs of many instances are generated.
+    methods, adaptive
+        Integration methods with steps of fixed size, and adaptive steps (None without a tolerance).
+    parameter_count, input_count
+        Number of parameters and inputs of the scene.
+    timed
+        Whether the C functions of steps take the time.
+    """
+
+    TEMPLATE: ClassVar[str] = "python/binding.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    evaluations: tuple[BoundFunction, ...]
+    acceleration: str
+    project: str
+    linearization: str
+    batch: bool
+    methods: tuple[BoundMethod, ...]
+    adaptive: BoundAdaptive | None
+    parameter_count: int
+    input_count: int
+    timed: bool  # whether steps depend on the time
+
+
+@dataclass(frozen=True)
+class DeclarationsView:
+    """Data for the template python/binding.cdef.jinja: declarations of the Python binding for cffi.
+
+    The fields are those of `BindingView` with the same names.
+    """
+
+    TEMPLATE: ClassVar[str] = "python/binding.cdef"
+    real: str
+    evaluations: tuple[BoundFunction, ...]
+    project: str
+    linearization: str
+    batch: bool
+    methods: tuple[BoundMethod, ...]
+    adaptive: BoundAdaptive | None
+
+
+@dataclass(frozen=True)
+class ListedItem:
+    """A coordinate, parameter, input or output, as listed in the Python package.
+
+    Attributes
+    ----------
+    written
+        Its name in the scene, which may differ from the name in C.
+    words
+        Its unit and note.
+    number
+        Value of a parameter as Python text; otherwise "".
+    """
+
+    written: str
+    words: FreeText
+    number: str = ""
+
+
+@dataclass(frozen=True)
+class FaceView:
+    """Data for the template python/face.py.jinja: the __init__.py of the generated Python package.
+
+    Attributes
+    ----------
+    extension
+        Name of the compiled extension module.
+    digest
+        Digest (SHA-256) of the scene.
+    coordinate_units, input_units, output_units, units
+        Units by name; `units` has all that are not empty, also of parameters.
+    plane
+        Whether frames, momentum or reactions are planar.
+    start
+        Initial values of the coordinates and of the velocities.
+    follows
+        Formulas of the initial values that depend on parameters, by name.
+    h, duration, tolerance
+        Default step size (s), duration (s) and error tolerance of a simulation.
+    fixed
+        Whether assembly keeps the initial value of each coordinate, then of each velocity.
+    holonomic, redundant
+        Number of holonomic constraint equations, and indices of the redundant ones.
+    modes
+        For each coordinate with stick-slip friction, the index of the discrete coordinate that
+        stores whether it slides or sticks, and its own index.
+    discrete
+        Number of discrete coordinates that are parameters set by state jumps.
+    functions
+        Names of the model's public functions in the package.
+    optional
+        Option of [run] and the functions that it would add, for options that are off.
+    from_python
+        Whether the model was made in Python rather than from a scene.
+    """
+
+    TEMPLATE: ClassVar[str] = "python/face.py"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    extension: str
+    digest: str
+    dtype: str
+    coordinates: tuple[ListedItem, ...]
+    parameters: tuple[ListedItem, ...]
+    inputs: tuple[ListedItem, ...]
+    outputs: tuple[ListedItem, ...]
+    coordinate_units: FreeText
+    parameter_values: Mapping[str, float]
+    input_units: FreeText
+    output_units: FreeText
+    frames: tuple[str, ...]
+    plane: bool
+    units: FreeText
+    start: tuple[list[float], list[float]]
+    follows: FreeText
+    h: float
+    duration: float
+    tolerance: float | None
+    events: tuple[str, ...]
+    constraints: tuple[str, ...]
+    fixed: tuple[bool, ...]
+    holonomic: int
+    redundant: tuple[int, ...]
+    modes: tuple[tuple[int, int], ...]
+    discrete: int
+    reactions: tuple[str, ...]
+    batch: bool
+    methods: tuple[Method, ...]
+    functions: tuple[str, ...]
+    optional: tuple[tuple[str, tuple[str, ...]], ...]
+    from_python: bool
+
+
+@dataclass(frozen=True)
+class StubView:
+    """Data for the template python/stub.pyi.jinja: type stubs of the generated Python package."""
+
+    TEMPLATE: ClassVar[str] = "python/stub.pyi"
+    stamp: tuple[FreeText, ...]
+    batch: bool
+    functions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """A variant of the compiled extension in a wheel, for processors with certain features.
+
+    Attributes
+    ----------
+    name
+        Name of the variant.
+    extension
+        Name of the extension module.
+    needs
+        CPU features that the variant requires, as named by /proc/cpuinfo in Linux.
+    """
+
+    name: str
+    extension: str
+    needs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CompiledView:
+    """Data for the template python/compiled.py.jinja: a module that imports one of the variants.
+
+    By default it imports the first of `forms` whose features the processor has.
+    """
+
+    TEMPLATE: ClassVar[str] = "python/compiled.py"
+    prefix: str
+    version: str
+    forms: tuple[Form, ...]
+
+
+_OF_STEPS = ("Phi", "Gamma")
+
+
+def binding(target: Target) -> BindingView:
+    """Return the data for the Python binding, C functions that Python calls.
+
+    All functions have the same signature, and each evaluates many states in one call.
+    """
+    public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
+    linear = public.linearization
+    matrices = {a.name: f"{a.name} + {a.extent}*k" for a in linear.arguments if a.name[0] in "AB"}
+    return BindingView(
         prefix=target.prefix,
         PREFIX=target.PREFIX,
         real=target.real.name,
-        has_p=target.needs_p,
-        method=method,
-        adaptive=s.run.tolerance is not None,
-        rows=ROWS,
-        t_end=target.literal(s.run.duration),
-        tolerance=target.literal(s.run.tolerance or 0.0),
-        events=bool(s.events),
-        h=target.literal(s.run.h),
-        steps=steps,
-        every=max(1, steps // ROWS),
-        columns=tuple(line.replace(" ", "") for line in textwrap.wrap(columns, LINE)),
-        run=run,
-        energy=public.evaluation("energy").call(),
-        outputs=outputs,
-        accelerations=public.acceleration.call(u="NULL") if solved else "",
-        refuses=bool(output_names and refuses(target, "outputs")),
-    )  # fmt: skip
+        evaluations=_bound(target),
+        acceleration=public.acceleration.call(qdd=f"out + {NQ}*k", **at),
+        project=public.project.call(**at) if target.system.constraints else "",
+        linearization=linear.call(**at, **matrices) if _linearized(target) else "",
+        batch=target.system.run.batch,
+        methods=_methods(target),
+        adaptive=_adaptive(target),
+        parameter_count=len(target.system.parameters),
+        input_count=len(target.system.inputs),
+        timed=any(a.name == "t0" for a in public.batch(target.system.run.methods[0]).arguments),
+    )
 
 
-def _bound(target: Target) -> tuple[Bound, ...]:
+def _bound(target: Target) -> tuple[BoundFunction, ...]:
     """Return the evaluation functions for the Python binding, with their C calls for state k."""
     state_arguments, bindings = _rows(target), []
     for function in Public(target).evaluations():
@@ -110,7 +338,7 @@ def _bound(target: Target) -> tuple[Bound, ...]:
         at_x = function.call(q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target))
         text = call if kind.out else f"out[k] = {call}"
         size = extents[kind.out] if refuses(target, name) else ""
-        bindings.append(Bound(name, text, solve, at_x if state_only else "", size))
+        bindings.append(BoundFunction(name, text, solve, at_x if state_only else "", size))
     return tuple(bindings)
 
 
@@ -198,76 +426,20 @@ def _derivative(target: Target, method: str) -> tuple[str, str, str]:
     )
 
 
-def binding(target: Target) -> Binding:
-    """Return the data for the Python binding, C functions that Python calls.
-
-    All functions have the same signature, and each evaluates many states in one call.
-    """
-    public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
-    linear = public.linearization
-    matrices = {a.name: f"{a.name} + {a.extent}*k" for a in linear.arguments if a.name[0] in "AB"}
-    return Binding(
-        prefix=target.prefix,
-        PREFIX=target.PREFIX,
-        real=target.real.name,
-        evaluations=_bound(target),
-        acceleration=public.acceleration.call(qdd=f"out + {NQ}*k", **at),
-        project=public.project.call(**at) if target.system.constraints else "",
-        linearization=linear.call(**at, **matrices) if _linearized(target) else "",
-        batch=target.system.run.batch,
-        methods=_methods(target),
-        adaptive=_adaptive(target),
-        parameter_count=len(target.system.parameters),
-        input_count=len(target.system.inputs),
-        timed=any(a.name == "t0" for a in public.batch(target.system.run.methods[0]).arguments),
-    )
-
-
 def _linearized(target: Target) -> bool:
     """Return True if the program has a linearization."""
     return bool({"linearization", "linearization_column"} & set(target.program.functions))
 
 
-def declarations(bound: Binding) -> Declarations:
+def declarations(bound: BindingView) -> DeclarationsView:
     """Return the data for the C declarations from which cffi makes the Python binding."""
-    return Declarations(
+    return DeclarationsView(
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
         bound.methods, bound.adaptive,
     )  # fmt: skip
 
 
-def _functions(target: Target) -> tuple[str, ...]:
-    """Return the sorted names of the model's public functions in the Python package."""
-    s, run = target.system, target.system.run
-    functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
-    functions += CONSTRAINED if s.constraints else ()
-    functions += ["reactions"] if s.reactions else ()
-    functions += [n for key, names in OPTIONAL.items() if getattr(run, key) for n in names]
-    return tuple(sorted(functions))
-
-
-def stub(target: Target) -> Stub:
-    """Return the data for the type stubs of the Python package."""
-    return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
-
-
-def start_formulas(target: Target) -> dict[str, str]:
-    """Return the formulas of those initial values that depend on parameters.
-
-    They are given by the name of a coordinate (`theta`) or velocity (`theta_dot`) in the scene.
-    Parameters that state jumps change are replaced by their values.
-    """
-    s, written = target.system, target.as_written
-    set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
-    return {
-        f"{written(c.name)}{end}": fold_values(parse(text), set_by_jumps)
-        for c in s.coordinates
-        for end, text in (("", c.follows), ("_dot", c.rate_follows))
-        if text
-    }
-
-
-def face(target: Target, extension: str) -> Face:
+def face(target: Target, extension: str) -> FaceView:
     """Return the data for the __init__.py of the Python package.
 
     extension: name of the compiled extension module, which it imports.
@@ -275,19 +447,21 @@ def face(target: Target, extension: str) -> Face:
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
-    return Face(
+    return FaceView(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
         prefix=target.prefix,
         extension=extension,
         digest=s.digest,
         dtype=target.real.dtype,
-        coordinates=tuple(Named(written(c.name), words(c.unit, c.note)) for c in s.coordinates),
-        parameters=tuple(
-            Named(written(p.name), words(p.unit, p.note), repr(p.value)) for p in s.parameters
+        coordinates=tuple(
+            ListedItem(written(c.name), words(c.unit, c.note)) for c in s.coordinates
         ),
-        inputs=tuple(Named(written(i.name), words(i.unit, i.note)) for i in s.inputs),
-        outputs=tuple(Named(o.name, words(o.unit, o.note)) for o in s.outputs),
+        parameters=tuple(
+            ListedItem(written(p.name), words(p.unit, p.note), repr(p.value)) for p in s.parameters
+        ),
+        inputs=tuple(ListedItem(written(i.name), words(i.unit, i.note)) for i in s.inputs),
+        outputs=tuple(ListedItem(o.name, words(o.unit, o.note)) for o in s.outputs),
         coordinate_units=FreeText({written(c.name): c.unit for c in s.coordinates}),
         parameter_values={written(p.name): p.value for p in s.parameters},
         input_units=FreeText({written(i.name): i.unit for i in s.inputs}),
@@ -314,3 +488,34 @@ def face(target: Target, extension: str) -> Face:
         optional=tuple(x for x in OPTIONAL.items() if not getattr(s.run, x[0])),
         from_python=s.scene is None,
     )
+
+
+def start_formulas(target: Target) -> dict[str, str]:
+    """Return the formulas of those initial values that depend on parameters.
+
+    They are given by the name of a coordinate (`theta`) or velocity (`theta_dot`) in the scene.
+    Parameters that state jumps change are replaced by their values.
+    """
+    s, written = target.system, target.as_written
+    set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
+    return {
+        f"{written(c.name)}{end}": fold_values(parse(text), set_by_jumps)
+        for c in s.coordinates
+        for end, text in (("", c.follows), ("_dot", c.rate_follows))
+        if text
+    }
+
+
+def stub(target: Target) -> StubView:
+    """Return the data for the type stubs of the Python package."""
+    return StubView(tuple(stamp(target)), target.system.run.batch, _functions(target))
+
+
+def _functions(target: Target) -> tuple[str, ...]:
+    """Return the sorted names of the model's public functions in the Python package."""
+    s, run = target.system, target.system.run
+    functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
+    functions += CONSTRAINED if s.constraints else ()
+    functions += ["reactions"] if s.reactions else ()
+    functions += [n for key, names in OPTIONAL.items() if getattr(run, key) for n in names]
+    return tuple(sorted(functions))

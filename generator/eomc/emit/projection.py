@@ -1,15 +1,15 @@
-"""Views of the projection onto the constraints, for both forms of C."""
+"""Projection onto the constraints, in both forms of C."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any, ClassVar
 
-from eomc.emit.c_function import CFunction, in_braces
+from eomc.emit.c_function import CFunction, Computed, in_braces
 from eomc.emit.c_names import Target
-from eomc.emit.functions import Functions
-from eomc.emit.portable.constraint_views import Project, Projection
-from eomc.emit.portable.parts import Computed
+from eomc.emit.functions import SceneFunctions
+from eomc.emit.views import NameFields
 
 # Near singular configurations: square of the largest relative correction; factor on rounding errors
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
@@ -22,6 +22,159 @@ NEAREST_TOLERANCE = (
     1e-14  # of the squared distance to the nearest state: the square of the last change
 )
 STARTS = 16  # random starts, if the search from a state does not converge
+
+
+@dataclass(frozen=True)
+class ProjectionView:
+    """Data for c/projection.c: projection of the end of a step onto the constraints.
+
+    Attributes
+    ----------
+    L, lane, mask
+        The template is printed for one instance and for a lane, a vector register with one value of
+        each of several instances. L: suffix of C names ("" for one instance); lane: C type to
+        compute with; mask: C type that records failures.
+    extent, size
+        Length of vectors of coordinates, as a C expression, and number of results of `projection`.
+    increments
+        Whether the arguments r and v of `function` are the increments of q and q̇ in a step rather
+        than the state at its end.
+    projection, call
+        The function that computes corrections of q and q̇ and the inverse pivots of the constraint
+        equations, and its C call.
+    function
+        Prototype of the function that applies these corrections.
+    rate_terms, rate_terms_call, rows
+        The function for the rates of constraint equations that may be dropped as dependent, its C
+        call, and the number of these equations.
+    tolerance, part
+        Largest rate of a dropped constraint equation, relative to the largest terms of all
+        equations and to its own terms.
+    near, scale_floor
+        Square of the relative correction above which a correction counts as large; square of the
+        least scale of a coordinate, relative to that of all coordinates.
+    crossed
+        Bound on the product of the squared relative corrections of q and q̇; above it, another
+        correction is made.
+    little, slight, rounded
+        Squares of relative corrections: bounds for coordinates and for velocities near a singular
+        configuration, and the bound below which a correction of a coordinate may be rounding.
+    sines, sines_call
+        C type of the sines and cosines that a caller may supply ("" for none), and the C call that
+        computes them.
+    onto
+        Prototype of the function that projects a stage of an implicit step onto the constraints, by
+        a single correction; None if not needed.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/projection.c"
+    PREFIX: str
+    real: str
+    L: str
+    lane: str
+    mask: str
+    extent: str
+    size: int
+    increments: bool
+    projection: Computed
+    function: CFunction
+    call: str
+    rate_terms: Computed | None
+    rate_terms_call: str
+    rows: int
+    tolerance: str
+    part: str
+    fabs: str
+    near: str
+    crossed: str
+    scale_floor: str
+    little: str
+    slight: str
+    rounded: str
+    sines: str
+    sines_call: str
+    onto: CFunction | None
+
+
+@dataclass(frozen=True)
+class ProjectView(NameFields):
+    """Data for c/project.c: the public projection of a state onto the constraints.
+
+    Attributes
+    ----------
+    count, holonomic
+        Number of constraint equations, and of holonomic ones.
+    function
+        Prototype of the function.
+    call_D, call_A, call_phi, call_rates
+        C calls of the mass matrix, the constraint Jacobian, the residuals and their rates.
+    dependent
+        Fraction of a gradient's square below which a constraint equation depends on others.
+    small, enough
+        Squares of relative changes of q that are rounding errors, and of sufficiently small
+        residuals.
+    tolerance, rounded
+        Largest residual of a projected state, and largest residual of a state that is left
+        unchanged, both relative to the terms of the constraint equation.
+    redundant
+        Indices of constraint equations that others imply.
+    weights
+        C initialiser of the weights of the constraint equations that are added to D where D alone
+        is singular; "" for none.
+    sums, sum_places
+        C initialisers of the sums of constraint equations that replace dependent equations, and the
+        indices of the equations that they replace.
+    pinned
+        Whether there may be coordinates that have neither inertia nor a holonomic constraint.
+    errors
+        The function of the rotation errors of closed loops; None if there are no such loops.
+    error_rows, error_ends
+        Indices of the constraint equations that have a rotation error, as a C initialiser with the
+        loops in sequence; for each loop, the position in it at which its indices end.
+    rotated, call_rotated, call_turn
+        The function that replaces these residuals by rotation vectors, its C call, and its C call
+        without gradients.
+    searched, starts
+        Whether random starts are tried if the search from a state fails, and their number.
+    converged
+        Square of the last change in the search for the nearest state, relative to the square of the
+        distance to it, below which the search has converged.
+    half_turn
+        Squared cosine of half an angle below which a rotation counts as half a turn.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/project.c"
+    fabs: str
+    sqrt: str
+    count: int
+    holonomic: int
+    function: CFunction
+    call_D: str
+    call_A: str
+    call_phi: str
+    call_rates: str
+    dependent: str
+    small: str
+    enough: str
+    tolerance: str
+    rounded: str
+    redundant: tuple[int, ...]
+    weights: str
+    sums: tuple[str, ...]
+    sum_places: tuple[int, ...]
+    pinned: bool
+    tiny: str
+    errors: Computed | None
+    error_rows: str
+    error_ends: tuple[int, ...]
+    rotated: CFunction | None
+    call_rotated: str
+    call_turn: str
+    atan: str
+    searched: bool
+    starts: int
+    converged: str
+    half_turn: str
 
 
 def near(target: Target) -> float:
@@ -42,88 +195,60 @@ def width(target: Target) -> int:
     return len(target.program["projection"].outputs)
 
 
-def view(
-    functions: Functions, projection: Computed, function: CFunction, call: str,
-    rate_terms: Computed | None = None, state: Mapping[str, str] | None = None, *,
-    lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
-    sines: str = "", sines_call: str = "", onto: CFunction | None = None,
-) -> Projection:  # fmt: skip
-    """Return the data for the template of the projection onto the constraints.
+def shared_fields(functions: SceneFunctions) -> dict[str, Any]:
+    """Return the fields of `ProjectionView` that are the same in portable and in optimised C.
 
-    Parameters
-    ----------
-    projection
-        The C function for the corrections of q and qd.
-    function
-        Prototype of the function that applies them.
-    call
-        C call of `projection`.
-    rate_terms, state
-        The C function for the rates of dropped constraint equations, and its arguments that differ
-        from their names.
-    lane, L, mask
-        C type of the numbers, suffix of C names and C type of failures, where several instances are
-        computed together in a vector register (a lane). The defaults are for a single instance.
-    extent
-        Length of C arrays for coordinates; the number of coordinates by default.
-    increments
-        Whether the state at the end of a step is passed as its increments in the step.
-    sines, sines_call
-        C type of precomputed sines and cosines, and the C call that computes them; "" for none.
-    onto
-        Prototype of the function that projects a stage to first order; None if not needed.
+    These are C names, numbers of equations, and tolerances.
     """
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
     row_fraction, largest_fraction = LEFT_OUT[target.system.run.real]
     large = near(target)
-    return Projection(
-        PREFIX=functions.PREFIX,
-        real=functions.real,
-        L=L,
-        lane=lane or functions.real,
-        mask=mask,
-        extent=extent or functions.NQ,
-        size=width(target),
-        increments=increments,
-        sines=sines,
-        sines_call=sines_call,
-        onto=onto,
-        projection=projection,
-        function=function,
-        call=call,
-        rate_terms=rate_terms,
-        rate_terms_call=rate_terms.function.call(**(state or {})) if rate_terms else "",
-        rows=width(target) - 2 * len(target.names),
-        tolerance=target.literal(largest_fraction),
-        part=target.literal(row_fraction),
-        fabs=f"fabs{target.real.function_suffix}",
-        near=target.literal(large),
-        crossed=target.literal((COUPLING_ROUNDINGS * target.real.epsilon) ** 2),
-        scale_floor=target.literal(ZERO_SQUARE),
-        little=target.literal(little),
-        slight=target.literal(1e4 * little),
-        rounded=target.literal(large**2 * noise),
-    )
+    return {
+        "PREFIX": functions.PREFIX,
+        "real": functions.real,
+        "size": width(target),
+        "rows": width(target) - 2 * len(target.names),
+        "tolerance": target.literal(largest_fraction),
+        "part": target.literal(row_fraction),
+        "fabs": f"fabs{target.real.function_suffix}",
+        "near": target.literal(large),
+        "crossed": target.literal((COUPLING_ROUNDINGS * target.real.epsilon) ** 2),
+        "scale_floor": target.literal(ZERO_SQUARE),
+        "little": target.literal(little),
+        "slight": target.literal(1e4 * little),
+        "rounded": target.literal(large**2 * noise),
+    }
 
 
-def plain(functions: Functions) -> Projection | None:
+def portable_view(functions: SceneFunctions) -> ProjectionView | None:
     """Return the data for the template of the projection onto the constraints, in portable C.
 
-    Returns None if the scene has no constraints. Portable C is the form for all compilers.
+    Returns None if the scene has no constraints.
     """
-    projection = functions.projection
+    projection, rate_terms = functions.projection, functions.rate_terms
     if projection is None:
         return None
     state = {"q": "r", "qd": "v"}
-    call = projection.function.call(**state)
-    return view(
-        functions, projection, functions.projected, call, functions.rate_terms, state,
-        onto=functions.onto if functions.swept else None,
-    )  # fmt: skip
+    return ProjectionView(
+        **shared_fields(functions),
+        L="",
+        lane=functions.real,
+        mask="",
+        extent=functions.NQ,
+        increments=False,
+        sines="",
+        sines_call="",
+        onto=functions.project_stage if functions.swept else None,
+        projection=projection,
+        function=functions.project_end,
+        call=projection.function.call(**state),
+        rate_terms=rate_terms,
+        rate_terms_call=rate_terms.function.call(**state) if rate_terms else "",
+    )
 
 
-def project(functions: Functions) -> Project:
+def project(functions: SceneFunctions) -> ProjectView:
     """Return the data for the public C function `project`, which projects a state onto the
     constraints.
     """
@@ -140,7 +265,7 @@ def project(functions: Functions) -> Project:
     summed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
     errors, rotated = functions.rotation_errors, functions.rotated
     rotations = target.system.rotations if errors else ()
-    return Project(
+    return ProjectView(
         **functions.names,
         fabs=f"fabs{end}",
         sqrt=f"sqrt{end}",

@@ -18,17 +18,13 @@ import jinja2
 from eomc.base import resources
 from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
-from eomc.emit import embedding, package, selftest, views
+from eomc.emit import embedding, package, portable, selftest
 from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_function import narrowed
-from eomc.emit.c_identifiers import rename_for_c
-from eomc.emit.c_names import Target
-from eomc.emit.fmu import files as fmu
-from eomc.emit.fmu import views as fmu_views
-from eomc.emit.optimised import files as fast
-from eomc.emit.optimised import views as fast_views
-from eomc.emit.portable import steppers
-from eomc.emit.portable import views as plain_views
+from eomc.emit.c_names import Target, rename_for_c
+from eomc.emit.fmu.unit import Unit, render_unit
+from eomc.emit.optimised import files as optimised
+from eomc.emit.views import View
 from eomc.program.outline import weight
 from eomc.program.program import Program
 
@@ -99,7 +95,7 @@ def _bytecode() -> jinja2.BytecodeCache | None:
     return jinja2.FileSystemBytecodeCache(str(folder), "eomc-template-%s.cache")
 
 
-def show(view: views.View | plain_views.View | fast_views.View | fmu_views.View) -> str:
+def show(view: View) -> str:
     """Return the text of a generated file.
 
     `view` has the data of the file. Its class attribute TEMPLATE names the Jinja template.
@@ -127,13 +123,13 @@ def render(program: Program, extension: str) -> Sources:
     target = Target(program, REALS[run.real], written)
     binding = package.binding(target)
     name = program.system.name
-    methods = fast.steppers(target)
+    methods = optimised.steppers(target)
     return Sources(
         name=name,
         files={
-            **steppers.files(program, show),
-            **{f"{FAST}/{file}": text for file, text in fast.files(methods, show).items()},
-            "main.c": narrowed(show(package.main(target))),
+            **portable.files(program, show),
+            **{f"{FAST}/{file}": text for file, text in optimised.files(methods, show).items()},
+            "main.c": narrowed(show(embedding.main(target))),
             "selftest.c": narrowed(show(selftest.view(target))),
             "CMakeLists.txt": show(embedding.cmake(target)),
             f"{name}.pc.in": show(embedding.pkg_config(target)),
@@ -148,10 +144,10 @@ def render(program: Program, extension: str) -> Sources:
     )
 
 
-def unit(program: Program, version: int) -> fmu.Unit:
+def unit(program: Program, version: int) -> Unit:
     """Return the functional mock-up unit (FMU) of a program: its C code and model description.
 
     version: version of the FMI standard, 2 or 3.
     """
     _plain_names(program)
-    return fmu.unit(program, version, show, show)
+    return render_unit(program, version, show)

@@ -13,17 +13,15 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property, partial
 from itertools import chain, islice
-from typing import Any
+from typing import Any, ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import CFunction, member
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, refuses
-from eomc.emit.heading import stamp
-from eomc.emit.public import Public
-from eomc.emit.views import Case, SelfTest, State, Tested
+from eomc.emit.public import KINDS, Public, refuses
+from eomc.emit.views import stamp
 from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.model.symbols import ALONG
 from eomc.program.interpret import evaluator, nearby
@@ -56,7 +54,6 @@ LONGEST = 4000  # operations of accelerations: of more there are few cases, expl
 START = 0.4  # s, the time of the first state: signals are not at their start
 # central differences of order 8: at which multiples of a width, and their weights
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-
 Vector = list[float]
 Values = dict[str, float]
 Happening = tuple[float, int]  # when, and which event
@@ -71,7 +68,119 @@ class NoCaseError(Exception):
 
 
 @dataclass(frozen=True)
-class Point:
+class TestArguments:
+    """Arguments of one test call in selftest.c, as C literals.
+
+    Attributes
+    ----------
+    arrays
+        Values of q and qd, then of each array in `SelfTestView.arrays`.
+    t
+        Time in s.
+    span
+        Size of a step or length of a run, in s.
+    u
+        Inputs; empty if the scene's signals supply them.
+    other
+        Whether the parameters are `SelfTestView.other` rather than those of the scene.
+    """
+
+    arrays: tuple[tuple[str, ...], ...]
+    t: str
+    span: str
+    u: tuple[str, ...]
+    other: bool
+
+
+@dataclass(frozen=True)
+class TestCase:
+    """Expected result of a C function for one state, with an error limit.
+
+    Attributes
+    ----------
+    state
+        Index into `SelfTestView.states`.
+    expected
+        Expected numbers as C literals.
+    limit
+        Largest permitted error, relative to the largest expected number.
+    """
+
+    state: int
+    expected: tuple[str, ...]
+    limit: float
+
+
+@dataclass(frozen=True)
+class TestFunction:
+    """A test function of selftest.c, which calls one function of the generated header.
+
+    Attributes
+    ----------
+    name
+        Name of the tested function without the scene's prefix.
+    kind
+        Form of the test's body in the template: "values", "number", "status", "moved", "run",
+        "batch", "derivative" or "adaptive".
+    call
+        The C call that is tested.
+    memory
+        C type of the workspace of an adaptive run; "" for other kinds.
+    cases
+        Expected results for several states.
+    """
+
+    name: str
+    kind: str
+    call: str
+    memory: str
+    cases: tuple[TestCase, ...]
+
+
+@dataclass(frozen=True)
+class SelfTestView:
+    """Data for c/selftest.c.jinja: a C program that tests the generated functions.
+
+    Attributes
+    ----------
+    states
+        Arguments of the test calls.
+    other
+        Values of a second set of parameters; empty if no state uses it.
+    has_p
+        Whether the C functions take parameters.
+    arrays
+        Name and size of each array of a state besides q and qd.
+    tested
+        The test functions with their expected results.
+    events, inputs
+        Whether the scene has events and inputs.
+    most
+        Largest number of expected numbers in a case.
+    large, large_limit
+        Whether some states have large angles, and their limit in rad, for a comment.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/selftest.c"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    states: tuple[TestArguments, ...]
+    other: tuple[str, ...]
+    has_p: bool
+    arrays: tuple[tuple[str, str], ...]
+    tested: tuple[TestFunction, ...]
+    events: bool
+    inputs: bool
+    most: int
+    large_limit: str
+    large: bool
+
+
+@dataclass(frozen=True)
+class TestPoint:
     """Arguments of a test call.
 
     Attributes
@@ -92,13 +201,13 @@ class Point:
     span: float = 0.0
 
 
-def view(target: Target) -> SelfTest:
+def view(target: Target) -> SelfTestView:
     """Return the data for selftest.c: test calls, their expected results and error limits."""
     cases = _Cases(target)
     double = target.real is DOUBLE
     tested = tuple(t for t in cases.tested() if t.cases)
     other = cases.other_parameters if cases.uses_other else ()
-    return SelfTest(
+    return SelfTestView(
         title=FreeText(target.system.title),
         stamp=tuple(stamp(target)),
         prefix=target.prefix,
@@ -128,7 +237,7 @@ class _Cases:
         self.target, self.public = target, Public(target)
         self.program, self.system = target.program, target.system
         self.double = target.real is DOUBLE
-        self.points: list[Point] = []
+        self.points: list[TestPoint] = []
         self.has_large = self.uses_other = False
         self.known: dict[str, Callable[[Mapping[str, float]], tuple[Vector, bool]]] = {}
 
@@ -159,7 +268,7 @@ class _Cases:
             self.known[name] = evaluator(self.program[name], unit=unit)
         return self.known[name]
 
-    def value(self, name: str, point: Point) -> Vector:
+    def value(self, name: str, point: TestPoint) -> Vector:
         """Return the results that the generated C function `name` should give, computed in Python.
 
         `point` has the arguments of the C function. If it specifies no inputs, the scene's signals
@@ -209,7 +318,7 @@ class _Cases:
         rows = [list(row) for row in zip(*columns, strict=True)]
         return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
 
-    def complete(self, point: Point) -> Values:
+    def complete(self, point: TestPoint) -> Values:
         """Return the values of a point by name, including the inputs.
 
         Inputs that the point does not specify are computed by the scene's signals, the functions of
@@ -233,24 +342,24 @@ class _Cases:
 
     # steps in Python
 
-    def acceleration(self, point: Point, x: Vector, t: float) -> Vector:
+    def acceleration(self, point: TestPoint, x: Vector, t: float) -> Vector:
         """Return the accelerations qdd at the state x = [q; qd] and time t (s).
 
         `point` supplies the inputs and the parameters.
         """
         return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
 
-    def shifted(self, point: Point, x: Vector, t: float) -> Point:
+    def shifted(self, point: TestPoint, x: Vector, t: float) -> TestPoint:
         """Return a copy of the point with the state x = [q; qd] and the time t (s)."""
         names = (s.name for s in (*self.system.q, *self.system.qd))
         values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
-        return Point(values, point.signals, point.other, point.span)
+        return TestPoint(values, point.signals, point.other, point.span)
 
-    def states(self, point: Point) -> Vector:
+    def states(self, point: TestPoint) -> Vector:
         """Return the state [q; qd] in a point's values as one list."""
         return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
 
-    def step(self, m: Method, point: Point, x: Vector, t: float, h: float) -> Vector:
+    def step(self, m: Method, point: TestPoint, x: Vector, t: float, h: float) -> Vector:
         """Return the state [q; qd] after one step of the integration method m.
 
         The step of size h (s) begins at time t (s) in the state x. `point` supplies the inputs and
@@ -296,7 +405,7 @@ class _Cases:
             end[n + k] += h * of_qd
         return self.projected(point, end, t + h)
 
-    def projected(self, point: Point, x: Vector, t: float) -> Vector:
+    def projected(self, point: TestPoint, x: Vector, t: float) -> Vector:
         """Return the state x = [q; qd], projected onto the constraints at time t (s).
 
         The projection iterates. `point` supplies the parameters. Without constraints, x is returned
@@ -311,7 +420,7 @@ class _Cases:
                 return x
         raise NoCaseError
 
-    def flow(self, point: Point, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
+    def flow(self, point: TestPoint, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
         """Return the state [q; qd] at time t + span (s), by integration from the state x at time t.
 
         The integration takes `steps` equal steps of order 8; `span` may be negative. `point`
@@ -337,7 +446,7 @@ class _Cases:
         return x if self.double else _single(x)
 
     @cached_property
-    def near(self) -> tuple[Point, ...]:
+    def near(self) -> tuple[TestPoint, ...]:
         """About three points near the initial state, at which functions are tested.
 
         In the last ones, the inputs are specified; otherwise the scene's signals supply them. One
@@ -355,7 +464,7 @@ class _Cases:
             points += [self.driven(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))]
         return tuple(points) if self.is_short else (points[1], points[2])
 
-    def point(self, k: int, t: float) -> Point:
+    def point(self, k: int, t: float) -> TestPoint:
         """Return the k-th test point around the initial state, at time t (s).
 
         It also has values for accelerations, multipliers and frame forces, which functions may
@@ -365,7 +474,7 @@ class _Cases:
         more = [x.name for x in (*self.system.qdd, *self.target.wrenches)]
         more += self.target.multipliers
         values |= {name: 0.4 + 0.3 * math.sin(1.7 * k + 2.1 * i) for i, name in enumerate(more)}
-        return Point({name: self.short(x) if name in self.moving else x if self.double
+        return TestPoint({name: self.short(x) if name in self.moving else x if self.double
                       else _single(x) for name, x in values.items()})  # fmt: skip
 
     @cached_property
@@ -377,7 +486,7 @@ class _Cases:
             | {*self.target.multipliers}
         )
 
-    def driven(self, point: Point, beyond: float) -> Point:
+    def driven(self, point: TestPoint, beyond: float) -> TestPoint:
         """Return a copy of the point in which the inputs are specified.
 
         In other points the scene's signals supply them. beyond: 0 for inputs within their
@@ -401,7 +510,7 @@ class _Cases:
         values = {n: self.short(x) for n, x in zip(names, u, strict=True)}
         return replace(point, values={**point.values, **values}, signals=False)
 
-    def index(self, point: Point) -> int:
+    def index(self, point: TestPoint) -> int:
         """Return the index of a point in the list of all test points.
 
         A point that is not yet in the list is appended to it.
@@ -417,14 +526,14 @@ class _Cases:
         sizes = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
         return tuple((n, sizes[n]) for n in ("qdd", "wrenches", "lambda") if n in sizes)
 
-    def state(self, point: Point) -> State:
+    def state(self, point: TestPoint) -> TestArguments:
         """Return the arguments of a test call at a point, with numbers as C literals."""
         s, literal = self.system, self.target.literal
         names = {"qdd": [x.name for x in s.qdd], "lambda": self.target.multipliers}
         names["wrenches"] = [x.name for x in self.target.wrenches]
         arrays = [[x.name for x in s.q], [x.name for x in s.qd]]
         arrays += [names[name] for name, _ in self.arrays]
-        return State(
+        return TestArguments(
             arrays=tuple(tuple(literal(point.values[n]) for n in row) for row in arrays),
             t=literal(point.values[TIME]),
             span=literal(point.span),
@@ -432,7 +541,7 @@ class _Cases:
             other=point.other,
         )
 
-    def input_names(self, point: Point) -> list[str]:
+    def input_names(self, point: TestPoint) -> list[str]:
         """Return the names of the inputs that a point specifies.
 
         The list is empty if the scene's signals supply the inputs.
@@ -442,9 +551,9 @@ class _Cases:
     # cases
 
     def case(
-        self, point: Point, compute: Callable[[Point], Vector], allowed: float = 0.0,
+        self, point: TestPoint, compute: Callable[[TestPoint], Vector], allowed: float = 0.0,
         sharp: bool = False,
-    ) -> Case | None:  # fmt: skip
+    ) -> TestCase | None:  # fmt: skip
         """Return a test case: the expected results at a point, with their error limit.
 
         `compute` returns the results at a point. The limit is relative to the largest result. It is
@@ -463,9 +572,11 @@ class _Cases:
         if not scale < 1e12 or limit > max(LOOSEST[self.double], allowed):
             return None
         literal = self.target.literal
-        return Case(self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}"))
+        return TestCase(
+            self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}")
+        )
 
-    def nudged(self, point: Point, turn: int) -> Point:
+    def nudged(self, point: TestPoint, turn: int) -> TestPoint:
         """Return a copy of the point with each coordinate and velocity changed by about one ulp.
 
         An ulp is the distance to the next floating-point number. turn: 0 or 1, for two different
@@ -479,7 +590,7 @@ class _Cases:
             moved[name] = x + sign * ulp * max(abs(x), 0.1)
         return replace(point, values={**point.values, **moved})
 
-    def tested(self) -> Iterator[Tested]:
+    def tested(self) -> Iterator[TestFunction]:
         """Yield a test of each function of the generated C header, in the order of the header."""
         for function in self.public.evaluations():
             name = function.name.removeprefix(f"{self.target.prefix}_")
@@ -502,14 +613,14 @@ class _Cases:
         yield from self.moves()
 
     def written(
-        self, name: str, kind: str, call: str, cases: Sequence[Case | None], type: str = ""
-    ) -> Tested:
+        self, name: str, kind: str, call: str, cases: Sequence[TestCase | None], type: str = ""
+    ) -> TestFunction:
         """Return the data of a test of the C function `name`; cases that are None are left out.
 
-        call: the tested C call. kind: form of the test's body in the template, see `views.Tested`.
+        call: the tested C call. kind: form of the test's body in the template, see `TestFunction`.
         type: C type of the workspace of an adaptive run, "" for other tests.
         """
-        return Tested(name, kind, call, type, tuple(filter(None, cases)))
+        return TestFunction(name, kind, call, type, tuple(filter(None, cases)))
 
     def call(self, f: CFunction, **passed: str) -> str:
         """Return a C call of f in which the arguments are members of the struct s, the test state.
@@ -521,12 +632,12 @@ class _Cases:
         at |= {"t0": member("s", "t"), "h": member("s", "span")}
         return f.call(**at | passed)
 
-    def far(self, name: str) -> list[Case | None]:
+    def far(self, name: str) -> list[TestCase | None]:
         """Return up to three test cases of function `name` with large angles."""
-        cases: list[Case | None] = []
+        cases: list[TestCase | None] = []
         for values in islice(self.large, FAR):
             allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
-            point = Point({n: x if self.double else _single(x) for n, x in values.items()})
+            point = TestPoint({n: x if self.double else _single(x) for n, x in values.items()})
             point = replace(point, values={**self.point(1, 0.0).values, **point.values})
             case = self.case(point, partial(self.value, name), allowed, sharp=True)
             self.has_large |= case is not None
@@ -546,7 +657,9 @@ class _Cases:
 
         x: state, time and parameters, as values by name.
         """
-        known = self.complete(Point({n: v if self.double else _single(v) for n, v in x.items()}))
+        known = self.complete(
+            TestPoint({n: v if self.double else _single(v) for n, v in x.items()})
+        )
         room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
         for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
             try:
@@ -560,7 +673,7 @@ class _Cases:
 
     # steps, runs, events
 
-    def moves(self) -> Iterator[Tested]:
+    def moves(self) -> Iterator[TestFunction]:
         """Yield the tests of steps, derivatives, runs, projections, adaptive runs and events."""
         run = self.system.run
         if self.system.constraints:
@@ -602,7 +715,7 @@ class _Cases:
         return weight(self.program["acceleration"]) <= LONGEST
 
     @cached_property
-    def starts(self) -> tuple[Point, ...]:
+    def starts(self) -> tuple[TestPoint, ...]:
         """Points near the initial state at which tested steps begin.
 
         With constraints, the only point is the initial state itself, which satisfies them.
@@ -613,7 +726,7 @@ class _Cases:
         point = replace(point, values={**point.values, **nearby(self.system, 0), TIME: START})
         return (replace(point, span=1.0),)
 
-    def spanned(self, m: Method, point: Point) -> Point | None:
+    def spanned(self, m: Method, point: TestPoint) -> TestPoint | None:
         """Return a copy of the point with a step size for the integration method m as its `span`.
 
         It is the largest of some step sizes with which a few steps can be tested accurately and the
@@ -629,7 +742,7 @@ class _Cases:
                     return tried
         return None
 
-    def stepped(self, m: Method, steps: int, point: Point) -> Vector:
+    def stepped(self, m: Method, steps: int, point: TestPoint) -> Vector:
         """Return, in one list, the state [q; qd] after each of several steps of method m.
 
         The first step begins at `point`. There are `steps` steps of size `point.span` (s).
@@ -640,7 +753,7 @@ class _Cases:
             found += x
         return found
 
-    def rows(self, m: Method, point: Point) -> Vector:
+    def rows(self, m: Method, point: TestPoint) -> Vector:
         """Return the results of a run of three steps of method m from a point, as C stores them.
 
         These are the last state [q; qd], then q after each step, then qd after each step.
@@ -650,7 +763,7 @@ class _Cases:
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
 
-    def twice(self, m: Method, point: Point) -> Vector:
+    def twice(self, m: Method, point: TestPoint) -> Vector:
         """Return the final states of a batch of two instances of the system, by method m.
 
         Both instances start at `point`. The order is that of C: q of both instances, then qd of
@@ -659,7 +772,7 @@ class _Cases:
         end = self.stepped(m, STEPS, point)[-2 * self.nq :]
         return [*end[: self.nq] * 2, *end[self.nq :] * 2]
 
-    def projection(self, point: Point) -> Vector:
+    def projection(self, point: TestPoint) -> Vector:
         """Return the state [q; qd] of a point, projected onto the constraints."""
         return self.projected(point, self.states(point), point.values[TIME])
 
@@ -693,7 +806,7 @@ class _Cases:
             event_rows="rows", memory="&memory", status="&status",
         )  # fmt: skip
 
-    def derivative(self, m: Method, point: Point) -> Case | None:
+    def derivative(self, m: Method, point: TestPoint) -> TestCase | None:
         """Return the test case for the derivative of a step of method m along a direction.
 
         The step begins at `point`. The direction is constant: it has the components 1, 2, 3, 1, 2,
@@ -703,7 +816,7 @@ class _Cases:
         names = [x.name for x in (*self.system.q, *self.system.qd)]
         names += self.input_names(point)
 
-        def difference(x: Point, width: float) -> Vector:
+        def difference(x: TestPoint, width: float) -> Vector:
             derivative = [0.0] * (2 * self.nq)
             for k, w in STENCIL:
                 for sign in (-1, 1):
@@ -725,7 +838,7 @@ class _Cases:
 
     # adaptive runs and events
 
-    def adaptive_runs(self) -> Iterator[Tested]:
+    def adaptive_runs(self) -> Iterator[TestFunction]:
         """Yield a single test, which covers adaptive runs.
 
         Its cases are runs without events, and runs in which an event function crosses zero, for
@@ -743,7 +856,7 @@ class _Cases:
         """Return the lengths (s) of adaptive runs to try, from the longest to the shortest."""
         return tuple(self.short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
 
-    def quiet(self, point: Point) -> Case | None:
+    def quiet(self, point: TestPoint) -> TestCase | None:
         """Return the case of an adaptive run that starts at a point and in which no event occurs.
 
         The longest suitable run is used. Returns None if no run is suitable.
@@ -765,7 +878,7 @@ class _Cases:
         """The error limit of test cases for adaptive runs, relative to the largest result."""
         return 1e-8 if self.double else 2e-3
 
-    def ended(self, event: Happening | None, point: Point) -> Vector:
+    def ended(self, event: Happening | None, point: TestPoint) -> Vector:
         """Return the results of an adaptive run from a point, as C stores them.
 
         These are the final [q; qd] and time. If the scene has events, the number of events follows,
@@ -787,7 +900,7 @@ class _Cases:
             x = after[2 * self.nq * first : 2 * self.nq * (first + 1)]
         return [*self.sure(point, x, at, t + span - at), t + span, *numbers]
 
-    def sure(self, point: Point, x: Vector, t: float, span: float) -> Vector:
+    def sure(self, point: TestPoint, x: Vector, t: float, span: float) -> Vector:
         """Return the state at time t + span (s), by integration from the state x at time t.
 
         Raises NoCaseError if integration with shorter steps gives a different result.
@@ -797,14 +910,14 @@ class _Cases:
             raise NoCaseError
         return finer
 
-    def events(self, point: Point, x: Vector, t: float) -> Vector:
+    def events(self, point: TestPoint, x: Vector, t: float) -> Vector:
         """Return the values of the event functions at the state x = [q; qd] and time t (s).
 
         `point` supplies the inputs and the parameters.
         """
         return self.value("events", self.shifted(point, x, t))
 
-    def refuse_events(self, point: Point, x: Vector, t: float, span: float) -> None:
+    def refuse_events(self, point: TestPoint, x: Vector, t: float, span: float) -> None:
         """Raise NoCaseError if an event function changes sign, or nearly does, in a run.
 
         The run begins in the state x = [q; qd] at time t (s) and has the length `span` (s). `point`
@@ -818,12 +931,12 @@ class _Cases:
                 if a * b <= 0 or abs(b) < 0.02 * abs(a):
                     raise NoCaseError
 
-    def crossings(self, k: int) -> list[Case | None]:
+    def crossings(self, k: int) -> list[TestCase | None]:
         """Return test cases of runs in which the event function k crosses zero.
 
         There is at most one case in which the function rises, and one in which it falls.
         """
-        cases: dict[bool, Case] = {}
+        cases: dict[bool, TestCase] = {}
         for point in self.candidates(k):
             for span in self.spans():
                 try:
@@ -837,7 +950,7 @@ class _Cases:
                 break
         return [*cases.values()]
 
-    def candidates(self, k: int) -> Iterator[Point]:
+    def candidates(self, k: int) -> Iterator[TestPoint]:
         """Yield points near the initial state at which the event function k is zero.
 
         Each is found by changing the time, one coordinate or one velocity.
@@ -854,7 +967,7 @@ class _Cases:
                     except NoCaseError:
                         continue
 
-    def solved(self, k: int, point: Point, name: str) -> Point:
+    def solved(self, k: int, point: TestPoint, name: str) -> TestPoint:
         """Return a copy of the point at which the event function k is zero.
 
         The value of `name` (the time, a coordinate or a velocity) is changed by the secant method.
@@ -879,7 +992,7 @@ class _Cases:
             raise NoCaseError
         return replace(point, values={**point.values, name: b})
 
-    def crossing(self, k: int, on: Point, span: float) -> tuple[bool, Case | None]:
+    def crossing(self, k: int, on: TestPoint, span: float) -> tuple[bool, TestCase | None]:
         """Return whether event function k rises at its zero, and a test case of a run across it.
 
         on: a point at which the function is zero. The run starts half a `span` (s) before this

@@ -20,7 +20,7 @@ from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mpmath
 import numpy as np
@@ -30,13 +30,11 @@ from numpy.typing import NDArray
 from eomc import pipeline
 from eomc.base.errors import EomcError, FolderError
 from eomc.derive import lagrange
+from eomc.emit import portable
 from eomc.emit.c_expression import QUAD
-from eomc.emit.c_identifiers import rename_for_c
-from eomc.emit.c_names import Target
-from eomc.emit.functions import Functions
-from eomc.emit.portable import steppers as plain
+from eomc.emit.c_names import Target, rename_for_c
+from eomc.emit.functions import SceneFunctions
 from eomc.emit.render import show
-from eomc.emit.views import Quad
 from eomc.model.discrete import with_constant_parameters
 from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.numeric import compiled
@@ -58,6 +56,20 @@ MAX_PLAIN_SECONDS = 2.0  # computing time of the motion in mpmath
 PLAIN_DIGITS = 40
 PLAIN_STATES = 5
 MIN_PLAIN_DIGITS = 26.0  # of accelerations: with fewer, the equations differ
+
+
+@dataclass(frozen=True)
+class ProgramView:
+    """Data for the template report/reference_solution.c: a simulation in quadruple precision.
+
+    parameters: number of parameters. call: C call of the accelerations.
+    """
+
+    TEMPLATE: ClassVar[str] = "report/reference_solution.c"
+    prefix: str
+    PREFIX: str
+    parameters: int
+    call: str
 
 
 @dataclass(frozen=True)
@@ -204,12 +216,12 @@ def _compile(system: System, folder: Path) -> Path:
     """Compile the scene's C in __float128 with the integrator; return the executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
     lowered = rename_for_c(program.build(lagrange.derive(system)))[0]
-    shown = plain.files(lowered, show, QUAD)
-    functions = Functions(Target(lowered, QUAD))
+    shown = portable.files(lowered, show, QUAD)
+    functions = SceneFunctions(Target(lowered, QUAD))
     call = functions.acceleration.function.call(
         qdd="a", u="NULL", p=f"(const {system.name}_params *)p"
     )
-    main = show(Quad(system.name, system.name.upper(), len(system.parameters), call))
+    main = show(ProgramView(system.name, system.name.upper(), len(system.parameters), call))
     for name, text in (*shown.items(), ("quad.c", main)):
         (folder / name).write_text("#include <quadmath.h>\n" + text, encoding="utf-8")
     missing = (

@@ -15,7 +15,7 @@ from eomc.toolchain.files import write_archive, write_files
 from eomc.toolchain.subprocesses import run, try_load
 
 if TYPE_CHECKING:
-    from eomc.emit.fmu.files import Unit
+    from eomc.emit.fmu.unit import Unit
 
 _SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}

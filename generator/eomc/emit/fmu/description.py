@@ -2,24 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.base.version import __version__
 from eomc.emit.c_names import Target
 from eomc.emit.fmu import units
-from eomc.emit.fmu.dependencies import Dependencies, Names
 from eomc.emit.fmu.variables import Variable, Variables, has_signals, variables
-from eomc.emit.fmu.views import Attributes, Described, Description2, Description3, Unknown
 from eomc.emit.package import start_formulas
-from eomc.program.program import TIME
+from eomc.program.ir import Function
+from eomc.program.program import TIME, Program
 from eomc.scene.formulas import parse
 
+Attributes = tuple[tuple[str, FreeText], ...]
+Names = frozenset[str]
 
-def view(
+
+@dataclass(frozen=True)
+class XmlElement:
+    """An XML element of modelDescription.xml for a variable or a unit.
+
+    element: for a unit, the name of the element, "Unit"; for a variable, its type, such as "Real".
+    attributes: the main attributes as pairs (name, value), such as the name. inner: pairs for
+    further attributes, such as base units of a unit or the start of a variable; in FMI 2, and for
+    units, they belong to an element inside.
+    """
+
+    element: str
+    attributes: Attributes
+    inner: Attributes = ()
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A computed variable of an FMU, and the variables that it depends on.
+
+    reference, known: their value references, the numbers by which FMI identifies variables. In FMI
+    2 they also are positions in the list of variables, counted from 1: reference 0 is the time,
+    which that list does not contain.
+    """
+
+    reference: int
+    known: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class DescriptionFields:
+    """Fields that the templates of modelDescription.xml for FMI 2 and FMI 3 share.
+
+    Attributes
+    ----------
+    prefix, token, tool, about
+        Name of the model, text that identifies the build, name and version of eomc, and attributes
+        with title and version of the scene.
+    exchange
+        Whether a simulation tool may integrate the model itself (model exchange).
+    derivatives
+        "true" if the FMU provides directional derivatives, else "false".
+    experiment
+        Attributes of the default experiment: times in s, and step size or tolerance.
+    units, variables
+        The units and the variables.
+    outputs, rates, initial
+        Dependencies of outputs, of derivatives of the state, and of computed initial values.
+    """
+
+    prefix: str
+    token: str
+    tool: str
+    about: Attributes
+    exchange: bool
+    derivatives: str
+    experiment: Attributes
+    units: tuple[XmlElement, ...]
+    variables: tuple[XmlElement, ...]
+    outputs: tuple[Unknown, ...]
+    rates: tuple[Unknown, ...]
+    initial: tuple[Unknown, ...]
+
+
+@dataclass(frozen=True)
+class Description2View(DescriptionFields):
+    """Data for the template fmu/fmi2.xml: modelDescription.xml of FMI 2.
+
+    indicators: the number of event functions. sources: names of the C files to be compiled.
+    """
+
+    TEMPLATE: ClassVar[str] = "fmu/fmi2.xml"
+    indicators: int
+    sources: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Description3View(DescriptionFields):
+    """Data for the template fmu/fmi3.xml: modelDescription.xml of FMI 3.
+
+    crossings: the event functions, each with the variables that it depends on.
+    """
+
+    TEMPLATE: ClassVar[str] = "fmu/fmi3.xml"
+    crossings: tuple[Unknown, ...]
+
+
+def model_description(
     target: Target, version: int, token: str, sources: Sequence[str]
-) -> Description2 | Description3:
+) -> Description2View | Description3View:
     """Return the template data of modelDescription.xml, which describes an FMU to simulation tools.
 
     target: the scene's program and its C names. version: version of FMI, 2 or 3. token: text that
@@ -61,9 +151,9 @@ def view(
         "initial": structure.unknowns([*starts, *rates, *computed], initial=True),
     }
     if version == 2:
-        return Description2(**common, indicators=len(known.indicators), sources=tuple(sources))
+        return Description2View(**common, indicators=len(known.indicators), sources=tuple(sources))
     crossings = zip(known.indicators, dependencies.events, strict=True)
-    return Description3(**common, crossings=structure.unknowns(crossings))
+    return Description3View(**common, crossings=structure.unknowns(crossings))
 
 
 class _Structure:
@@ -100,16 +190,16 @@ def _free(pairs: Iterable[tuple[str, str]]) -> Attributes:
     return tuple((key, FreeText(text)) for key, text in pairs if text)
 
 
-def _units(known: Variables) -> tuple[Described, ...]:
+def _units(known: Variables) -> tuple[XmlElement, ...]:
     """Return the units that are used and that FMI can express."""
     meanings = {v.unit: meaning for v in known if (meaning := units.parsed(v.unit)) is not None}
     return tuple(
-        Described("Unit", _free([("name", text)]), _free(meaning.attributes))
+        XmlElement("Unit", _free([("name", text)]), _free(meaning.attributes))
         for text, meaning in meanings.items()
     )
 
 
-def _described(v: Variable, version: int) -> Described:
+def _described(v: Variable, version: int) -> XmlElement:
     unit = v.unit if units.parsed(v.unit) is not None else ""
     # the start of an input is always exact, and FMI 2 forbids the attribute
     initial = "" if v.causality == "input" else v.initial
@@ -127,5 +217,85 @@ def _described(v: Variable, version: int) -> Described:
     limits = [("min", v.minimum), ("max", v.maximum)]
     inner = _free([("unit", unit), *limits, ("start", v.start), ("derivative", derivative)])
     if version == 2:
-        return Described("Boolean" if v.boolean else "Real", outer, inner)
-    return Described("Boolean" if v.boolean else "Float64", outer, inner)
+        return XmlElement("Boolean" if v.boolean else "Real", outer, inner)
+    return XmlElement("Boolean" if v.boolean else "Float64", outer, inner)
+
+
+@dataclass(frozen=True)
+class Dependencies:
+    """Names of the variables that accelerations, outputs and event functions depend on.
+
+    Variables are coordinates, velocities, inputs, parameters and the time.
+
+    Attributes
+    ----------
+    program
+        The program that computes these results.
+    signals
+        Whether the scene's signals (formulas for its inputs) may replace the inputs. If so, results
+        that depend on an input also depend on the variables in its signal.
+    """
+
+    program: Program
+    signals: bool
+
+    @cached_property
+    def known(self) -> Names:
+        """The names of all variables that a simulation tool sets in the FMU, including the time.
+
+        These are coordinates, velocities, inputs, parameters and the time.
+        """
+        s = self.program.system
+        return frozenset(x.name for x in (*s.q, *s.qd, *s.u, *s.parameters)) | {TIME}
+
+    @cached_property
+    def accelerations(self) -> Sequence[Names]:
+        """For each acceleration, the names of the variables that it depends on."""
+        return self._results_of("acceleration")
+
+    @cached_property
+    def outputs(self) -> Sequence[Names]:
+        """For each output, the names of the variables that it depends on."""
+        return self._results_of("outputs")
+
+    @cached_property
+    def events(self) -> Sequence[Names]:
+        """For each event function, the names of the variables that it depends on."""
+        return self._results_of("events")
+
+    @cached_property
+    def _signals(self) -> Mapping[str, Names]:
+        """Dependencies of each input on the variables of the scene's signal for it."""
+        names = [x.name for x in self.program.system.u]
+        if not self.signals or "signal" not in self.program:
+            return {}
+        return dict(zip(names, read(self.program["signal"]), strict=True))
+
+    def _results_of(self, name: str) -> Sequence[Names]:
+        """Return the dependencies of each result of a function; [] where the program does not have
+        it.
+        """
+        return [self._resolved(x) for x in read(self.program[name])] if name in self.program else []
+
+    def _resolved(self, names: Names) -> Names:
+        """Return names with accelerations and signals replaced by their dependencies."""
+        qdd = [x.name for x in self.program.system.qdd]
+        result = set(names)
+        for name, dependencies in zip(
+            qdd, self.accelerations if names & {*qdd} else (), strict=False
+        ):
+            result |= dependencies if name in names else set()
+        for name, dependencies in self._signals.items():
+            result |= dependencies if name in result else set()
+        return frozenset(result) & self.known
+
+
+def read(function: Function) -> list[Names]:
+    """Return the names of the arguments that each result of a function depends on.
+
+    function: a function of the program, a list of elementary operations.
+    """
+    dependencies: dict[str, Names] = {}
+    for a in (*function.early, *function.body):
+        dependencies[a.name] = frozenset().union(*(dependencies.get(n, {n}) for n in a.value.names))
+    return [dependencies.get(o.name, frozenset({o.name} - {""})) for o in function.outputs]

@@ -7,26 +7,27 @@ vector register for batches and for iterated stages, two configurations for long
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
 
 from eomc.base import resources
-from eomc.emit import adaptive, events
+from eomc.emit import adaptive, events, sources
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
+from eomc.emit.c_function import CFunction, Computed
 from eomc.emit.c_names import Target
-from eomc.emit.derivatives import derivatives
-from eomc.emit.functions import Functions
-from eomc.emit.optimised import adaptive_lanes, projection, runs, views
+from eomc.emit.derivatives import linearization, step_derivatives
+from eomc.emit.functions import SceneFunctions
+from eomc.emit.optimised import runs
 from eomc.emit.optimised.accelerations import Accelerations
 from eomc.emit.optimised.lanes import INLINE, Lane
 from eomc.emit.optimised.runs import prediction_width
-from eomc.emit.optimised.steppers import Steppers
-from eomc.emit.portable import steppers as plain
-from eomc.emit.portable import views as plain_views
+from eomc.emit.optimised.steppers import LaneFields, Steppers
 from eomc.emit.projection import project
+from eomc.emit.sources import SourceFields
+from eomc.emit.views import PrefixFields, Show
 from eomc.integrators.tableaux import RK4
-
-Show = Callable[[views.View | plain_views.View], str]  # renders template data as text
 
 # Placeholders in csrc for names, types and sizes of a lane
 PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")
@@ -34,13 +35,200 @@ LANE_FUNCTIONS = frozenset({"exp", "tanh"})  # mathematical functions in csrc ov
 BINARY_FUNCTIONS = ("atan2", "pow", "min", "max", PIVOT)
 
 
+@dataclass(frozen=True)
+class OptimisedSourceView(SourceFields):
+    """Data for c/optimised/source.c: the source file of the optimised C.
+
+    Attributes
+    ----------
+    rolled
+        Whether loops over coordinates are left to the compiler to vectorise, not unrolled.
+    unroll, inline
+        Macros before loops over coordinates and before inlined functions.
+    extent
+        Length of vectors of coordinates, as a C expression.
+    wide
+        Whether the code uses vector registers with values of several instances.
+    csrc
+        Texts of the hand-written C that this scene needs.
+    lanes
+        Finished C texts of the accelerations, for one number and for vector registers.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/source.c"
+    rolled: bool
+    unroll: str
+    extent: str
+    inline: str
+    wide: bool
+    csrc: tuple[str, ...]
+    lanes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LibraryFunction:
+    """A function of the C mathematics library that is applied to each value of a vector register.
+
+    Attributes
+    ----------
+    name
+        Ending of the C name of the generated function, which takes registers.
+    c, two
+        Name of the library function, and whether it has two arguments.
+    whole
+        C expression for a single AVX-512 instruction that computes the whole register; "" for none.
+    """
+
+    name: str
+    c: str
+    two: bool
+    whole: str
+
+
+@dataclass(frozen=True)
+class LibraryView(PrefixFields, LaneFields):
+    """Data for c/optimised/library.c: mathematical functions for a vector register.
+
+    count: number of values in the register, as a C expression. calls: the functions.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/library.c"
+    count: str
+    calls: tuple[LibraryFunction, ...]
+
+
+@dataclass(frozen=True)
+class LaneView(LaneFields):
+    """Data for c/optimised/lane.c: C functions for the accelerations.
+
+    The template is printed for each *lane* type: one number, or a vector register with one value of
+    each of several instances. Angles are those whose sines and cosines the accelerations read.
+
+    Attributes
+    ----------
+    unroll, clear
+        Macro before loops over angles, and initialiser for "no failure".
+    constants
+        C text of the struct of precomputed expressions and of the function that computes it.
+    angles, count
+        Length of arrays of angles as C text ("" without angles), and the number of angles.
+    across
+        Whether the sines of four angles are computed in one vector register.
+    angles_at, changes
+        The C functions for the angles at q, and for changes of these from a change of q.
+    sincos
+        Name of the C function for sine and cosine of one angle.
+    signal, signal_call
+        The function for the scene's signals (None without signals), and its C call in the
+        accelerations ("" if all callers supply the inputs).
+    rates, rates_call
+        C text of the accelerations from the state, its sines and the inputs, and the C call of that
+        function.
+    accelerations
+        Prototype of the C function for the accelerations that also computes inputs (by the scene's
+        signals) and sines if its arguments for these are NULL.
+    two_point, takes_c
+        Whether the accelerations are split into two parts, see `TwoPointsView`, and whether these
+        read precomputed expressions.
+    alone
+        Whether some callers do not pass the sines, so that the function must compute them.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/lane.c"
+    prefix: str
+    PREFIX: str
+    unroll: str
+    clear: str
+    constants: str
+    angles: str
+    count: int
+    across: bool
+    angles_at: CFunction
+    changes: CFunction
+    sincos: str
+    signal: Computed | None
+    signal_call: str
+    rates: str
+    rates_call: str
+    accelerations: CFunction
+    two_point: bool
+    takes_c: bool
+    alone: bool
+
+
+@dataclass(frozen=True)
+class BlocksView:
+    """Data for c/optimised/blocks.c: the C types of blocks and tiles.
+
+    A block is the group of instances of a batch that share a vector register. A tile is a group of
+    blocks that are stepped together.
+
+    lane: C type of a vector register. inputs: whether the scene has inputs. constants: C type of
+    the precomputed expressions of the parameters; "" for none. blocks: number of blocks in a tile.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/blocks.c"
+    prefix: str
+    PREFIX: str
+    lane: str
+    inputs: bool
+    constants: str
+    blocks: int
+
+
+@dataclass(frozen=True)
+class TwoPointsView(PrefixFields):
+    """Data for c/optimised/two_point.c: accelerations that are split into two C functions.
+
+    The first one computes the position-dependent part for two configurations q in one vector
+    register. The second one computes the accelerations from it, at one of the two configurations.
+
+    Attributes
+    ----------
+    extent, inline
+        Length of vectors of coordinates as C text, and the macro before inlined functions.
+    members
+        C definition of the struct with the values that the first part hands to the second one.
+    angles
+        Length of arrays of angles as C text.
+    configuration, velocity
+        The functions for the two parts.
+    constants
+        Whether there are precomputed expressions of the parameters.
+    call
+        C call of `configuration`.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/two_point.c"
+    extent: str
+    inline: str
+    members: str
+    angles: str
+    configuration: Computed
+    constants: bool
+    call: str
+    velocity: Computed
+
+
+@dataclass(frozen=True)
+class LUView(PrefixFields):
+    """Data for c/optimised/lu.c: LU factorisation of a matrix, and solution of A x = b.
+
+    fabs: name of the C function for |x|. f: suffix of C literals.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/lu.c"
+    fabs: str
+    f: str
+
+
 def steppers(target: Target) -> Steppers:
     """Return the integration methods of a scene in optimised C, with its accelerations.
 
     target: the scene's program and its C names.
     """
-    functions = Functions(target)
-    return Steppers(Accelerations(target), functions, plain.linearization(functions))
+    functions = SceneFunctions(target)
+    return Steppers(Accelerations(target), functions, linearization(functions))
 
 
 def rooms(steppers: Steppers) -> list[int]:
@@ -61,10 +249,10 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
     """
     functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    header = show(plain.header(functions, slopes, stamp, rooms(steppers), fast=True))
+    header = show(sources.header(functions, slopes, stamp, rooms(steppers), fast=True))
     source = show(
-        views.Source(
-            **plain.source(functions, stamp, slopes, show),
+        OptimisedSourceView(
+            **sources.source_fields(functions, stamp, slopes, show),
             rolled=steppers.two_point,
             unroll=steppers.one.unroll,
             extent=steppers.one.extent,
@@ -160,10 +348,10 @@ def _lanes(steppers: Steppers, show: Show) -> Iterator[str]:
     if steppers.functions.projection:
         yield show(project(steppers.functions))
         for lane in (steppers.one, *([steppers.wide] * batch)):
-            yield show(projection.view(steppers.functions, lane))
+            yield show(lane.projection_view(steppers.functions))
     if batch:
         yield show(
-            views.Blocks(
+            BlocksView(
                 prefix=steppers.one.prefix,
                 PREFIX=steppers.one.target.PREFIX,
                 lane=steppers.wide.real.name,
@@ -185,7 +373,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
         lane.compute_constants.text if not lane.name and runs.constants_call(steppers) else ""
     )
     return show(
-        views.LaneText(
+        LaneView(
             prefix=target.prefix,
             PREFIX=target.PREFIX,
             unroll=lane.unroll,
@@ -220,7 +408,7 @@ def _library_text(lane: Lane, show: Show) -> str:
     if lane.name == "wide" and adaptive.steps_in_parallel(lane.accelerations.target):
         names.add("sqrt")
     return show(
-        views.LibraryText(
+        LibraryView(
             prefix=lane.prefix,
             real=lane.accelerations.target.real.name,
             **lane.names,
@@ -232,25 +420,25 @@ def _library_text(lane: Lane, show: Show) -> str:
     )
 
 
-def _library(s: Accelerations, name: str, wide: bool) -> views.Library:
+def _library(s: Accelerations, name: str, wide: bool) -> LibraryFunction:
     """Return the view of one mathematical function. wide: over a vector register."""
     if name == PIVOT:
-        return views.Library(name, name, True, "")
+        return LibraryFunction(name, name, True, "")
     called = C_NAMES.get(name, name)
     letter = "d" if s.target.real is DOUBLE else "s"
     whole = f"__builtin_ia32_sqrtp{letter}512_mask(x, x, -1, 4)" if wide and name == "sqrt" else ""
-    return views.Library(
+    return LibraryFunction(
         called, called + s.target.real.function_suffix, name in BINARY_FUNCTIONS, whole
     )
 
 
-def _two_points(steppers: Steppers) -> views.TwoPoints:
+def _two_points(steppers: Steppers) -> TwoPointsView:
     """Return the view of the accelerations of one trajectory in two parts."""
     s, one = steppers.accelerations, steppers.one
     two = Lane(s, "two")
     assert s.parts is not None
     configuration = two.configuration
-    return views.TwoPoints(
+    return TwoPointsView(
         prefix=one.prefix,
         real=one.real.name,
         extent=one.extent,
@@ -270,7 +458,7 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
     run = steppers.accelerations.target.system.run
     if run.tolerance is not None or any(m.newton for m in steppers.methods):
         fabs = f"fabs{real.function_suffix}"
-        yield show(views.Factors(steppers.one.prefix, steppers.one.real.name, fabs, real.suffix))
+        yield show(LUView(steppers.one.prefix, steppers.one.real.name, fabs, real.suffix))
     for m in steppers.methods:
         lanes = [steppers.one, *([steppers.wide] if run.batch else [])]
         if m is RK4:
@@ -296,10 +484,10 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
         if run.batch:
             side_by_side = adaptive.steps_in_parallel(steppers.accelerations.target)
             batch_view = (
-                adaptive_lanes.view(steppers, _adaptive(steppers)) if side_by_side else None
+                runs.adaptive_lanes(steppers, _adaptive(steppers)) if side_by_side else None
             )
             yield show(batch_view or adaptive.batch(steppers.functions))
-    yield from map(show, derivatives(steppers.functions))
+    yield from map(show, step_derivatives(steppers.functions))
 
 
 def _adaptive(steppers: Steppers) -> adaptive.SweepInterface:
@@ -310,7 +498,6 @@ def _adaptive(steppers: Steppers) -> adaptive.SweepInterface:
         steppers.stepping(one), sweep, steppers.accelerate(one, a="f"), one.extent,
         bool(steppers.accelerations.constants), runs.constants_call(steppers),
         f"{one.target.PREFIX}_LANES",
-        projection.ending(
-            steppers.functions, one, s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
+        one.project_end_call(s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
         ),
     )  # fmt: skip

@@ -1,7 +1,7 @@
 """Accelerations over a lane type: one number, a vector register, or two configurations at once.
 
-Every function of optimised C that a step calls is printed here for any lane. The lane determines
-types, arguments and the representation of failures.
+Every function of optimised C that a step calls is printed here for any lane, the corrections onto
+the constraints included. The lane determines types, arguments and the representation of failures.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ from typing import Any
 from sympy import Expr, S
 
 from eomc.emit import c_function as c
-from eomc.emit.c_expression import FOUR, Block, Body, Printer, Real
-from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit import projection
+from eomc.emit.c_expression import FOUR, Block, CBody, Printer, Real
+from eomc.emit.c_function import CArgument, CFunction, Computed
 from eomc.emit.c_names import Target, rename_reserved, sentence
+from eomc.emit.functions import RATE_TERMS, SceneFunctions
 from eomc.emit.optimised.accelerations import Accelerations
-from eomc.emit.portable.parts import Computed
+from eomc.emit.projection import ProjectionView
 from eomc.program import outline
 from eomc.program.ir import Call, Function, Sum
+from eomc.program.program import TIME
 from eomc.program.trig import Angle
 
 INLINE, NOINLINE = "INLINE", "NOINLINE"
@@ -112,7 +115,7 @@ class Lane:
 
     @property
     def names(self) -> dict[str, Any]:
-        """The fields of the template data class `views.Laned` for this lane type, by name."""
+        """The fields of the template data class `LaneFields` for this lane type, by name."""
         inline = self.qualifiers[INLINE]
         return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
@@ -374,12 +377,12 @@ class Lane:
         """
         return len(self.accelerations.function.checks)
 
-    def _fails(self, body: Body) -> bool:
+    def _fails(self, body: CBody) -> bool:
         """Return True if a body can fail."""
         return bool(body.failures or (self.name and body.sincos))
 
     def _statements(
-        self, function: Function, body: Body, places: Sequence[str], fails: bool = True
+        self, function: Function, body: CBody, places: Sequence[str], fails: bool = True
     ) -> tuple[Block, ...]:
         """Return loads, statements and results. Failures are returned if `fails`."""
         if list(places) == self.places and self.padded:
@@ -568,3 +571,102 @@ class Lane:
             parts.velocity, "velocities", self.out, self.places, extra, doc=doc, in_order=True,
             inline=parts.short,
         )  # fmt: skip
+
+    # projection onto the constraints
+
+    @cached_property
+    def project_end(self) -> CFunction:
+        """Prototype of the C function that makes the end of a step satisfy the constraints.
+
+        The C function changes r and v, the increments of q and q̇ in the step, in place.
+        """
+        out = tuple(c.output_array(self.real.name, n) for n in "rv")
+        singular_flag = () if self.name else (CArgument("int *", "singular"),)
+        return CFunction(
+            f"{self.prefix}_projected{self.end}",
+            self.mask if self.name else f"{self.prefix}_status",
+            (*out, *map(self.argument, self._constraint_arguments()), *singular_flag),
+            qualifier=self.qualifiers[NOINLINE],
+        )
+
+    def project_end_call(self, **passed: str) -> str:
+        """Return the C call of `project_end`, or "" if the scene has no constraints.
+
+        passed: C expressions for some arguments of the call, by name; the others are passed under
+        their names.
+        """
+        return self.project_end.call(**passed) if "projection" in self.target.program else ""
+
+    @cached_property
+    def project_stage(self) -> CFunction:
+        """Prototype of the C function that projects one stage onto the constraints.
+
+        A stage is an intermediate state (q, q̇) within a step. The function corrects the state once,
+        so that the constraint residuals vanish to first order.
+        """
+        state = tuple(c.output_array(self.real.name, n) for n in ("at", "moving"))
+        others = (n for n in self._constraint_arguments(sines=False) if n in "tc")
+        return CFunction(
+            f"{self.prefix}_onto", "int", (*state, *map(self.argument, others)),
+            qualifier=self.qualifiers[NOINLINE],
+        )  # fmt: skip
+
+    @cached_property
+    def correction(self) -> Computed:
+        """The C function for the corrections of q and q̇ that satisfy the constraints."""
+        function = self.accelerations.correction[0]
+        places = [f"d[{k}]" for k in range(len(function.outputs))]
+        return self.computed(
+            function, "projection", c.output_array(self.real.name, "d"), places,
+            doc=sentence(function), takes=self._constraint_arguments(),
+        )  # fmt: skip
+
+    @cached_property
+    def rate_terms(self) -> Computed | None:
+        """The C function for the rates of constraint equations that corrections may drop.
+
+        It also computes the sum of |terms| of each rate, as its scale. None if there are none.
+        """
+        function = self.target.program.functions.get("rate_terms")
+        if function is None:
+            return None
+        parameters = {n: c.member("c", n) for n in self.accelerations.parameter_names}
+        places = [f"rates[{k}]" for k in range(len(function.outputs))]
+        return self.computed(
+            function, "rate_terms", c.output_array(self.real.name, "rates"), places, doc=RATE_TERMS,
+            takes=self._constraint_arguments(sines=False), constants=parameters, inline=False,
+        )  # fmt: skip
+
+    def _constraint_arguments(self, sines: bool = True) -> tuple[str, ...]:
+        """Return the arguments that the constraints depend on, among q, qd, s, t, c."""
+        timed = TIME in self.target.program["projection"].uses
+        known = sines and self.accelerations.correction[1]
+        names = ("q", "qd", *(["s"] if known else []), *(["t"] if timed else []), "c")
+        return tuple(n for n in self.argument_names if n in names)
+
+    def projection_view(self, functions: SceneFunctions) -> ProjectionView:
+        """Return the template data of the projection of a step's end onto the constraints.
+
+        functions: the scene's C functions that do not depend on the lane.
+        """
+        state = {"q": "at", "qd": "moving"}
+        sines = self.accelerations.correction[1]
+        rate_terms = None if self.name else self.rate_terms
+        return ProjectionView(
+            **projection.shared_fields(functions),
+            L=self.end,
+            lane=self.real.name,
+            mask=self.mask,
+            extent=self.extent,
+            increments=True,
+            sines=f"{self.prefix}_sines{self.end}" if sines else "",
+            sines_call=f"{self.prefix}_sines_at{self.end}(&own, at)"
+            if sines and self.computes_own_sines
+            else "",
+            onto=self.project_stage if functions.swept and not self.name else None,
+            projection=self.correction,
+            function=self.project_end,
+            call=self.correction.function.call(**state),
+            rate_terms=rate_terms,
+            rate_terms_call=rate_terms.function.call(**state) if rate_terms else "",
+        )

@@ -1,4 +1,4 @@
-"""Integration methods in optimised C: their template data and C calls."""
+"""Integration methods in optimised C: one step of each."""
 
 from __future__ import annotations
 
@@ -7,20 +7,379 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import isfinite, sqrt
-from typing import Any
+from typing import Any, ClassVar
 
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.coefficients import literal, matrix, numbers, rounded, tableau
-from eomc.emit.functions import Functions
-from eomc.emit.optimised import views
+from eomc.emit.coefficients import TableauFields, literal, matrix, numbers, rounded, tableau
+from eomc.emit.derivatives import LinearizationView
+from eomc.emit.functions import SceneFunctions
 from eomc.emit.optimised.accelerations import Accelerations
 from eomc.emit.optimised.lanes import INLINE, NOINLINE, Lane
-from eomc.emit.optimised.projection import onto
-from eomc.emit.portable.views import Slopes
+from eomc.emit.views import NameFields, PrefixFields
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
 from eomc.program import two_point
+
+
+@dataclass(frozen=True)
+class LaneFields:
+    """Template fields for the C type that a template is printed for: the *lane* type.
+
+    It is one number, or a vector register with one value of each of several instances.
+
+    Attributes
+    ----------
+    inline
+        C macro before inlined functions.
+    lane, mask
+        The C type itself, and the C type that records failures: int for one number, a mask of the
+        failed values for a register.
+    L
+        Suffix of C names; "" for one number.
+    """
+
+    inline: str
+    lane: str
+    mask: str
+    L: str
+
+
+@dataclass(frozen=True)
+class StepFields:
+    """Template fields that state what steps of a scene read.
+
+    timed: the time t. inputs: the inputs u. constants: precomputed expressions of the parameters.
+    """
+
+    timed: bool
+    inputs: bool
+    constants: bool
+
+
+@dataclass(frozen=True)
+class OptimisedRK4View(NameFields, LaneFields, StepFields):
+    """Data for c/optimised/rk4.c: a step of the classical Runge-Kutta method.
+
+    It is printed for one instance, and for a vector register with values of several instances.
+
+    Attributes
+    ----------
+    unroll, extent, noinline
+        Macro before loops over coordinates, length of vectors of coordinates as C text, and macro
+        before functions that are not inlined.
+    constants_type
+        C type of the precomputed expressions.
+    title, source, stability
+        Title, reference and stability limits of the method, for comments.
+    angles, across, sincos
+        As in `LaneView`.
+    largest, small
+        Largest angles, in rad, by which sines and cosines are rotated from one stage to another: in
+        general, and for corrections.
+    shared_signals
+        Whether the signals depend on time only, so that they are computed once for several stages.
+    signal_call, signal_now
+        C calls of the signals (formulas for the inputs) at the start, middle and end of a step, and
+        at one stage; "" for none.
+    two_point, velocity_call
+        Whether the accelerations are split into two parts, see `files.TwoPointsView`, and the C
+        call of the velocity-dependent part.
+    stage_call
+        C call of the whole accelerations at a stage.
+    corrected
+        Whether the step returns the sines and cosines at its end for the projection.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/rk4.c"
+    unroll: str
+    extent: str
+    noinline: str
+    constants_type: str
+    title: str
+    source: str
+    stability: str
+    angles: str
+    across: bool
+    sincos: str
+    largest: str
+    small: str
+    shared_signals: bool
+    signal_call: str
+    signal_now: str
+    two_point: bool
+    velocity_call: str
+    stage_call: str
+    corrected: bool
+
+
+@dataclass(frozen=True)
+class PredictionsView(PrefixFields):
+    """Data for c/optimised/predictions.c: sines and cosines of predicted angles.
+
+    The C functions extrapolate the angles of the next RK4 step, and compute their sines and cosines
+    in advance. angles: number of angles. unroll, inline: C macros before loops and before inlined
+    functions.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/predictions.c"
+    unroll: str
+    inline: str
+    angles: int
+
+
+@dataclass(frozen=True)
+class PredictedStepsView(NameFields, StepFields):
+    """Data for c/optimised/predicted.c: a loop over steps of RK4 with predicted angles.
+
+    Predicted angles are extrapolated from the step before. The loop ends when they are not accurate
+    enough.
+
+    Attributes
+    ----------
+    angles
+        Number of angles.
+    shared_signals
+        Whether the signals depend on time only, so that they are computed once for several stages.
+    signal_first, signal_mid, signal_end
+        C calls of the signals at the start of the first step, and at the middle and the end of a
+        step; "" for none.
+    stage
+        C calls of the four stages.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/predicted.c"
+    unroll: str
+    noinline: str
+    angles: int
+    shared_signals: bool
+    signal_first: str
+    signal_mid: str
+    signal_end: str
+    stage: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ExplicitStage:
+    """C text of one stage of an explicit Runge-Kutta method.
+
+    Attributes
+    ----------
+    node
+        The time of the stage as a fraction of the step; "" at the start of the step.
+    positions, velocities
+        The weighted sums of accelerations of earlier stages in the position and the velocity of
+        this stage.
+    call
+        The call of the function for the accelerations.
+    """
+
+    node: str
+    positions: str
+    velocities: str
+    call: str
+
+
+@dataclass(frozen=True)
+class OptimisedExplicitView(PrefixFields, LaneFields, StepFields):
+    """Data for c/optimised/explicit.c: a step of an explicit method except RK4.
+
+    It is printed for one instance, and for a vector register with values of several instances.
+
+    Attributes
+    ----------
+    unroll, extent
+        Macro before loops over coordinates, and length of vectors of coordinates as C text.
+    clear, constants_type
+        Initialiser for "no failure", and C type of the precomputed expressions.
+    name, title, source, order, notes, stability
+        Name of the method in C, and what comments say about it.
+    stages
+        The stages.
+    position, velocity
+        C text of the sums over the stages in the increments of position and velocity.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/explicit.c"
+    unroll: str
+    extent: str
+    clear: str
+    constants_type: str
+    name: str
+    title: str
+    source: str
+    order: int
+    notes: tuple[str, ...]
+    stability: str
+    stages: tuple[ExplicitStage, ...]
+    position: str
+    velocity: str
+
+
+@dataclass(frozen=True)
+class OptimisedGaussView(TableauFields):
+    """Data for c/optimised/gauss.c: one step of a Gauss method with Newton's method.
+
+    Attributes
+    ----------
+    extent, f, fabs, eps
+        Length of vectors of coordinates as C text, suffix of C literals, name of the C function,
+        and the rounding unit.
+    nudge
+        Relative step of finite differences.
+    title, source, order, notes
+        What comments say about the method.
+    stages, extrapolation
+        Number of stages, and rows of the matrix that extrapolates the accelerations of the stages
+        of one step to those of the next.
+    width
+        Length of one row [da/dq, da/dqd, da/du], as a C expression.
+    factor, factor_unread
+        Prototype of the function that computes the factors of Newton's matrix, and the names of its
+        arguments that its body does not use.
+    signal_call, follows
+        C calls of the scene's signals (formulas for the inputs) at the state, and at a perturbed
+        state; "" for none.
+    slopes_call
+        C call of the derivatives of the accelerations.
+    solve
+        Prototype of the function for the step.
+    factor_now, factor_mid
+        C calls of `factor` with derivatives at the start and at the middle of the step.
+    start, stage
+        C calls of the accelerations at the start and at a stage.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/gauss.c"
+    extent: str
+    f: str
+    fabs: str
+    eps: str
+    nudge: str
+    title: str
+    source: str
+    order: int
+    notes: tuple[str, ...]
+    stages: int
+    extrapolation: tuple[str, ...]
+    width: str
+    factor: CFunction
+    factor_unread: tuple[str, ...]
+    signal_call: str
+    follows: str
+    slopes_call: str
+    solve: CFunction
+    factor_now: str
+    factor_mid: str
+    start: str
+    stage: str
+
+
+@dataclass(frozen=True)
+class StagesView(NameFields):
+    """Data for c/optimised/stages.c: one fixed-point iteration over all stages of a step.
+
+    The method is an implicit Runge-Kutta method, such as a Gauss method. The stages are computed
+    side by side in vector registers.
+
+    Attributes
+    ----------
+    members
+        Names of the precomputed expressions.
+    stages, padded, c
+        Number of stages; length of arrays over the stages, at least a whole register, as C text;
+        and the nodes of the method.
+    within
+        Rows of the transposes of A and A A, which weight the accelerations at the stages of this
+        step.
+    extrapolated
+        Rows of the transposed matrices that weight the accelerations at the stages of the step
+        before, extrapolated as a polynomial; None for methods of adaptive steps only.
+    sweep
+        Prototype of the function for an iteration.
+    together, alone
+        C calls of the accelerations at all stages of a register, and at one stage.
+    onto
+        C call that projects a stage onto the constraints; "" without constraints.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/stages.c"
+    extent: str
+    inputs: bool
+    constants: bool
+    members: tuple[str, ...]
+    name: str
+    stages: int
+    padded: str
+    c: tuple[str, ...]
+    within: tuple[tuple[str, ...], tuple[str, ...]]
+    extrapolated: tuple[tuple[str, ...], tuple[str, ...]] | None
+    sweep: CFunction
+    together: str
+    alone: str
+    onto: str
+
+
+@dataclass(frozen=True)
+class SweepsView(NameFields):
+    """Data for c/optimised/sweeps.c: a step of an implicit method.
+
+    The step makes a fixed number of fixed-point iterations over its stages. If these do not
+    converge, the C function `settle` iterates until they do.
+
+    Attributes
+    ----------
+    f, fabs, eps
+        Suffix of C literals, name of the C function, and the rounding unit.
+    enough
+        Relative error of velocities below which the iterations of `settle` have converged. If they
+        start from the accelerations at the start of the step, the limit is rounding error instead.
+    tolerance
+        Relative change of velocities in the last iteration above which the step is solved by
+        `settle` instead.
+    name, title, source, notes, stability
+        Name of the method in C, and what comments say about it.
+    stages, sweeps, b, bA
+        Number of stages and of iterations, and the weights of the method.
+    settle, settle_call
+        Prototype of the function that iterates until convergence, and its C call.
+    sweep_settling, sweep_first, sweep_back, sweep_forth
+        C calls of one iteration: in `settle`; the first one of a step, which extrapolates the
+        stages of the step before; and the later ones, from array a to b and from b to a.
+    start
+        C call of the accelerations at the start.
+    solve
+        Prototype of the function for the step.
+    constrained
+        Whether the scene has constraints.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/optimised/sweeps.c"
+    extent: str
+    f: str
+    fabs: str
+    eps: str
+    enough: str
+    tolerance: str
+    inputs: bool
+    name: str
+    title: str
+    source: str
+    notes: tuple[str, ...]
+    stability: str
+    stages: int
+    sweeps: int
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    settle: CFunction
+    settle_call: str
+    sweep_settling: str
+    sweep_first: str
+    sweep_back: str
+    sweep_forth: str
+    start: str
+    solve: CFunction
+    constrained: bool
 
 
 @dataclass(frozen=True)
@@ -35,8 +394,8 @@ class Steppers:
     """
 
     accelerations: Accelerations
-    functions: Functions
-    slopes: Slopes | None
+    functions: SceneFunctions
+    slopes: LinearizationView | None
 
     @cached_property
     def one(self) -> Lane:
@@ -119,7 +478,7 @@ class Steppers:
 
     @property
     def driven(self) -> dict[str, Any]:
-        """The fields of the template data class `views.Driven`, by name.
+        """The fields of the template data class `StepFields`, by name.
 
         They state whether steps read time, inputs and precomputed expressions.
         """
@@ -172,7 +531,7 @@ class Steppers:
 
     # methods
 
-    def rk4(self, lane: Lane) -> views.RungeKutta4:
+    def rk4(self, lane: Lane) -> OptimisedRK4View:
         """Return the template data of one step of RK4, the classical Runge-Kutta method.
 
         lane: the C type that the step computes with, one number or a vector register.
@@ -183,7 +542,7 @@ class Steppers:
         signal = lane.signal.function if lane.signal else None
         known = c.member("w", "k")
         here = {"a": c.member("w", "a[k]"), "q": "at", "qd": "moving", "t": "t + node"}
-        return views.RungeKutta4(
+        return OptimisedRK4View(
             **self.looping(lane),
             **lane.names,
             **self.driven,
@@ -209,18 +568,18 @@ class Steppers:
             corrected=self.corrected(RK4),
         )
 
-    def predictions(self) -> views.Predictions:
+    def predictions(self) -> PredictionsView:
         """Return the template data of the C functions that extrapolate angles to the next RK4 step.
 
         They compute the sines and cosines of these angles in advance.
         """
         lane, angles = self.one, len(self.accelerations.angles)
-        return views.Predictions(
+        return PredictionsView(
             prefix=lane.prefix, real=lane.real.name, unroll=lane.unroll,
             inline=lane.qualifiers[INLINE], angles=angles,
         )  # fmt: skip
 
-    def prediction(self) -> views.Predicted:
+    def prediction(self) -> PredictedStepsView:
         """Return the template data of the C loop over steps of RK4 that use predicted angles.
 
         Predicted angles are extrapolated from the step before.
@@ -239,7 +598,7 @@ class Steppers:
             return signal.call(u=place, t=time) if signal and shared else ""
 
         real = s.target.real.name
-        return views.Predicted(
+        return PredictedStepsView(
             **self.looping(lane),
             noinline=lane.qualifiers[NOINLINE],
             angles=len(s.angles),
@@ -251,7 +610,7 @@ class Steppers:
             stage=tuple(map(stage, range(4))),
         )
 
-    def explicit(self, lane: Lane, m: Method) -> views.Explicit:
+    def explicit(self, lane: Lane, m: Method) -> OptimisedExplicitView:
         """Return the template data of a step of an explicit Runge-Kutta method `m`.
 
         For RK4, `rk4` is used instead. lane: the C type that the step computes with, one number or
@@ -263,16 +622,16 @@ class Steppers:
             terms = [f"{literal(x, real)}*a[{k}][i]" for k, x in enumerate(row) if x]
             return " + ".join(terms).replace("+ -", "- ") or literal(Fraction(0), real)
 
-        def stage(k: int, node: Fraction, positions: Row, velocities: Row) -> views.Stage:
+        def stage(k: int, node: Fraction, positions: Row, velocities: Row) -> ExplicitStage:
             here = {"q": "at", "qd": "moving", "t": f"t + {literal(node, real)}*h"}
             start = k == 0 and not node
             call = self.accelerate(lane, a=f"a[{k}]", **({} if start else here))
-            return views.Stage(
+            return ExplicitStage(
                 "" if start else literal(node, real), total(positions), total(velocities), call
             )
 
         rows = zip(m.c, m.a_squared, m.a, strict=True)
-        return views.Explicit(
+        return OptimisedExplicitView(
             prefix=lane.prefix,
             real=real.name,
             unroll=lane.unroll,
@@ -317,7 +676,7 @@ class Steppers:
         """Whether the scene's signals (formulas for its inputs) depend on the state."""
         return self.accelerations.target.signal_state
 
-    def gauss(self, m: Method) -> views.Gauss:
+    def gauss(self, m: Method) -> OptimisedGaussView:
         """Return the template data of a step of a Gauss method that uses Newton's method."""
         lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
         assert slopes is not None
@@ -333,7 +692,7 @@ class Steppers:
         )  # fmt: skip
         arguments_read = {a.name for a in slopes.slopes.function.arguments}
         arguments_read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
-        return views.Gauss(
+        return OptimisedGaussView(
             **self.extended(lane),
             **self.literals,
             nudge=target.literal(sqrt(real.epsilon)),
@@ -362,7 +721,7 @@ class Steppers:
         )
 
     @property
-    def literals(self) -> dict[str, str]:
+    def literals(self) -> dict[str, Any]:
         """Template fields by name, for the C type of numbers.
 
         f: suffix of C literals. fabs: name of the C function for |x|. eps: the rounding unit.
@@ -386,7 +745,7 @@ class Steppers:
         others = (*self.stepping(self.one), *self.functions.moves_stages)
         return c.static(f"{P}_sweep", "int", out, *arguments, *others)
 
-    def stages(self, m: Method) -> views.Stages:
+    def stages(self, m: Method) -> StagesView:
         """Return the template data of the C function whose prototype `sweep` returns.
 
         It makes one fixed-point iteration over all stages of a step by the implicit method `m`.
@@ -398,7 +757,7 @@ class Steppers:
             return c.in_braces(numbers(column, real) for column in zip(*rows, strict=True))
 
         before = (by_stage(m.a_extrapolated), by_stage(m.a_squared_extrapolated)) if fixed else None
-        return views.Stages(
+        return StagesView(
             **self.extended(lane),
             inputs=bool(lane.target.system.inputs),
             constants=bool(self.accelerations.constants),
@@ -414,12 +773,12 @@ class Steppers:
                 wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? input : NULL", c="&wide"
             ),
             alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
-            onto=onto(lane).call(at="x", moving="v", t="t + c_[i + j]*h")
+            onto=lane.project_stage.call(at="x", moving="v", t="t + c_[i + j]*h")
             if self.functions.projection
             else "",
         )
 
-    def sweeps(self, m: Method) -> views.Sweeps:
+    def sweeps(self, m: Method) -> SweepsView:
         """Return the template data of a step of an implicit method `m` that iterates `sweep`.
 
         The number of iterations is fixed; if they do not converge, the step iterates further.
@@ -431,7 +790,7 @@ class Steppers:
         arguments = (values, CArgument("int", "fresh"), *self.stepping(lane), state)
         settle = c.static(f"{P}_settle", f"{lane.prefix}_status", *arguments)
         sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"
-        return views.Sweeps(
+        return SweepsView(
             **self.extended(lane),
             **self.literals,
             # Steps that need more than five iterations are long, with errors above this value.

@@ -1,1 +1,0 @@
-"""Portable C: strict C99 for any compiler."""
