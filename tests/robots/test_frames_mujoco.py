@@ -21,9 +21,8 @@ from robots.test_robots_mujoco import (
     turning,
 )
 
-from eomc.derive.frames import motions, wrenches
-from eomc.derive.inverse_dynamics import inverse_dynamics
-from eomc.derive.momentum import momentum
+from eomc.derive.frames import momentum, motions, wrenches
+from eomc.derive.lagrange import inverse_dynamics
 from eomc.derive.tape import Tape
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System

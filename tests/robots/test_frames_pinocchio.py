@@ -21,7 +21,7 @@ from robots.test_robots_mujoco import (  # noqa: E402
     stripped,
 )
 
-from eomc.derive.inverse_dynamics import inverse_dynamics  # noqa: E402
+from eomc.derive.lagrange import inverse_dynamics  # noqa: E402
 from eomc.robots.preparation import prepared_for_scene  # noqa: E402
 
 pytestmark = pytest.mark.slow

@@ -20,7 +20,7 @@ from conftest import ROOT, tiers
 import eomc
 from eomc.base import resources
 from eomc.derive import lagrange
-from eomc.derive.equations import Equations
+from eomc.derive.lagrange import EquationsOfMotion
 from eomc.emit import c_expression, render
 from eomc.model.system import System
 from eomc.program import admissible, program
@@ -49,7 +49,7 @@ def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
 
 
-def derived(change: Callable[[Equations], Equations]) -> Breakage:
+def derived(change: Callable[[EquationsOfMotion], EquationsOfMotion]) -> Breakage:
     """The equations of motion are changed before they become a program."""
 
     def breakage(patch: pytest.MonkeyPatch) -> None:
@@ -65,7 +65,7 @@ def derived(change: Callable[[Equations], Equations]) -> Breakage:
     return breakage
 
 
-def negated(e: Equations, field: str, *at: int) -> Equations:
+def negated(e: EquationsOfMotion, field: str, *at: int) -> EquationsOfMotion:
     """One entry of a vector or matrix with the other sign."""
     value = getattr(e, field)
     if len(at) == 1:

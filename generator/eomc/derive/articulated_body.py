@@ -15,9 +15,9 @@ from itertools import combinations_with_replacement
 
 from sympy import Expr, S
 
+from eomc.derive.links import AXES, ZERO, Vector
 from eomc.derive.newton_euler import Inertia, Recursion
 from eomc.derive.tape import Stage
-from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.rational import Matrix
 
 Rows = list[list[Expr]]

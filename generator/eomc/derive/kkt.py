@@ -114,12 +114,29 @@ class KktFactors:
         return tuple(x[i] for i in range(n)), multipliers, tuple(residuals)
 
 
-def factors(
+@dataclass(frozen=True)
+class PivotTolerance:
+    """Bounds below which the pivot of a constraint equation counts as zero.
+
+    An equation with a smaller pivot is dropped: it depends on the equations before it.
+
+    Attributes
+    ----------
+    relative : Expr
+        Fraction of the initial value of the pivot.
+    absolute : sequence of Expr
+        For each equation, the pivot below which its gradient counts as zero.
+    """
+
+    relative: Expr
+    absolute: Sequence[Expr]
+
+
+def factorize(
     tape: Tape,
     D: Rows,
     A: Rows,
-    drop: Expr,
-    faded: Sequence[Expr],
+    tolerance: PivotTolerance,
     short: Callable[[Expr], Expr] = lambda atom: atom,
     switched: Container[int] = (),
     last: Container[int] = (),
@@ -132,11 +149,8 @@ def factors(
         List of elementary operations, to which those of the factorization are added.
     D, A : Rows
         Mass matrix and Jacobian of the constraint equations.
-    drop : Expr
-        Pivot tolerance of a constraint equation, relative to the initial value of the pivot. An
-        equation with a smaller pivot is dropped: it depends on the equations before it.
-    faded : sequence of Expr
-        Absolute pivot tolerance of each constraint equation.
+    tolerance : PivotTolerance
+        Bounds below which the pivot of a constraint equation counts as zero.
     short
         Function that is applied to intermediate results. It may return a shorter expression with
         the same value.
@@ -179,8 +193,8 @@ def factors(
         else:
             initial = M[k, k] = short(tape.total(alone.get(k, [])))
             pivot = tape.define(-read(k, k))
-            limit = tape.define(-drop * initial) if pivot != -initial else S.Zero
-            limit = tape.total([limit, faded[k - n]])
+            limit = tape.define(-tolerance.relative * initial) if pivot != -initial else S.Zero
+            limit = tape.total([limit, tolerance.absolute[k - n]])
             inverses[k] = tape.define(pivot_inverse(pivot, limit))
             inverse = tape.define(-inverses[k])
             if k - n in switched:
@@ -265,7 +279,8 @@ def accelerations(
     c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
     switched = _switched(rows)
-    factored = factors(tape, D, A, rows.drop[0], rows.pivot_limits, short, switched, switched)
+    tolerance = PivotTolerance(rows.drop[0], rows.pivot_limits)
+    factored = factorize(tape, D, A, tolerance, short, switched, switched)
     a, solved_multipliers, residuals = factored.solve(b, c, short)
     parts: dict[int, list[Expr]] = {}
     for row, x in zip(rows.solved, solved_multipliers, strict=True):
@@ -332,7 +347,8 @@ def projection(
     """
     n, A = len(D), jacobian(tape, rows)
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
-    factored = factors(tape, D, A, rows.drop[1], rows.pivot_limits, last=_switched(rows))
+    tolerance = PivotTolerance(rows.drop[1], rows.pivot_limits)
+    factored = factorize(tape, D, A, tolerance, last=_switched(rows))
     indices = [row[0][0] for row in rows.solved]  # sums of constraints are all holonomic
     position_residuals = [
         tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.values, rows)

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NoReturn
 
 import sympy
 from sympy import Expr, S, Symbol
@@ -30,12 +31,11 @@ from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
 from eomc.derive.constraints import Constraints, constraints
 from eomc.derive.energies import Energies, energies_on_tape, tangent_symbols
-from eomc.derive.equations import Equations, MotionTerms, equations, raise_no_inertia
 from eomc.derive.ldl import Rows, Solution, SolveResult, Vector, count_operations, solve
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 from eomc.model.symbols import needed
-from eomc.model.system import System, t
+from eomc.model.system import System, symbol, t
 from eomc.model.tree import Tree
 
 # Up to this many world coordinates of a tree, Lagrange's method may need fewer operations than the
@@ -43,8 +43,83 @@ from eomc.model.tree import Tree
 MAX_LAGRANGE_DEFINITIONS = 12
 # With more coordinates D is given as a product with a direction, unless elimination needs it whole.
 MAX_UNROLLED_COORDINATES = 16
+# Matrices with more names on the tape than this are not unrolled: they are given as the product
+# with a symbolic direction, from which the C code computes one column per call.
+UNROLLED_SIZE_LIMIT = 2500
 # The reason why articulated bodies are not used.
 MASSLESS = "a motion that nothing resists"
+
+
+@dataclass(frozen=True)
+class MotionTerms:
+    """Terms of the equations of motion D qdd + bias = tau, as atoms of a tape.
+
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
+
+    Attributes
+    ----------
+    D : (nq, nq) or (1, nq)
+        Mass matrix by rows. If its expressions would be too long: the single row D v, where the
+        entries of the vector v are symbols, see `tangent_symbols`.
+    bias : (nq,)
+        C qd + g.
+    g : (nq,)
+        The bias at qd = 0.
+    tau : (nq,)
+        Generalized forces.
+    balance : (nq,)
+        tau - bias, the right-hand side of D qdd = tau - bias.
+    quadratic : bool
+        Whether the kinetic energy K is a quadratic form of qd and does not depend on t explicitly.
+    notes : tuple of str
+        Sentences that say where the parts of K that are not quadratic appear in the equations.
+    """
+
+    D: Rows
+    bias: Vector
+    g: Vector
+    tau: Vector
+    balance: Vector
+    quadratic: bool  # K = qd . D(q) . qd/2, without lower terms and explicit time
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EquationsOfMotion(MotionTerms):
+    """The equations of motion of a system, as atoms of the attribute `tape`.
+
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
+
+    Attributes
+    ----------
+    tape : Tape
+        The definitions of all names that the attributes contain.
+    C : (nq, nq) or (1, nq)
+        Coriolis matrix by rows, or the single row C v if D is given as D v.
+    signals : (nu,)
+        Values of the inputs, by their formulas in the scene.
+    kinetic, potential : Expr
+        Energies K and P (J).
+    jacobi : Expr or None
+        Jacobi's integral p . qd - K + P, with p = dK/dqd. It is conserved without forces and
+        explicit time. None where it equals K + P.
+    power : Expr
+        Time derivative of Jacobi's integral (of K + P if `jacobi` is None), without the power of
+        constraint forces (W). It is 0 for a conservative system.
+    rows : Constraints or None
+        The constraint equations; None without constraints.
+    """
+
+    tape: Tape
+    C: Rows
+    signals: Vector
+    kinetic: Expr
+    potential: Expr
+    jacobi: Expr | None
+    power: Expr
+    rows: Constraints | None
 
 
 @dataclass(frozen=True)
@@ -55,9 +130,9 @@ class Derivation:
 
     Attributes
     ----------
-    lagrange : Equations or None
+    lagrange : EquationsOfMotion or None
         By differentiation of K and P; None where that method was not used.
-    newton_euler : Equations or None
+    newton_euler : EquationsOfMotion or None
         By the recursive Newton-Euler algorithm; None for a system without bodies on joints.
     ldl : SolveResult
         Accelerations by L D L^T factorization of the mass matrix that Lagrange's method gives.
@@ -73,8 +148,8 @@ class Derivation:
     """
 
     system: System
-    lagrange: Equations | None
-    newton_euler: Equations | None
+    lagrange: EquationsOfMotion | None
+    newton_euler: EquationsOfMotion | None
     ldl: SolveResult
     composite: SolveResult
     articulated: SolveResult
@@ -132,7 +207,7 @@ def _rough_rows(system: System) -> list[Problem]:
     return problems
 
 
-def _by_lagrange(system: System) -> tuple[Equations, SolveResult, SolveResult]:
+def _by_lagrange(system: System) -> tuple[EquationsOfMotion, SolveResult, SolveResult]:
     """Return the equations, and the accelerations by L D L^T and by link multipliers."""
     e = energies_on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
@@ -152,7 +227,9 @@ def _by_lagrange(system: System) -> tuple[Equations, SolveResult, SolveResult]:
     return equations(system, e, motion), ldl, multipliers
 
 
-def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, SolveResult, SolveResult]:
+def _by_newton_euler(
+    system: System, tree: Tree
+) -> tuple[EquationsOfMotion, SolveResult, SolveResult]:
     """Return the equations, and the accelerations by articulated and by composite bodies.
 
     Bodies on joints by the recursive Newton-Euler algorithm, all other energies by Lagrange's
@@ -239,7 +316,42 @@ def _refuse_massless(system: System, D: Rows, rows: Constraints | None = None) -
     for k, (c, row) in enumerate(zip(system.coordinates, D, strict=True)):
         is_constrained = rows is not None and any(row[k] != 0 for row in rows.jacobian)
         if all(entry == 0 for entry in row) and not is_constrained:
-            raise_no_inertia(system, c.name)
+            _raise_no_inertia(system, c.name)
+
+
+def _raise_no_inertia(system: System, name: str) -> NoReturn:
+    """Raise a SceneError which says that the coordinate `name` has no inertia.
+
+    The message suggests a remedy. It depends on whether the inertia of the coordinate should come
+    from bodies on joints or from a formula of the kinetic energy.
+    """
+    links = system.tree.links if system.tree else ()
+    body = next((link.name for link in links if symbol(name) in link.q.free_symbols), "")
+    if body:
+        key = f"body.{body}"
+        message = (
+            f"coordinate '{name}' has no inertia: nothing that the joint moves resists it, such as "
+            "a point mass on its axis; give the body inertia about it, or fix the joint"
+        )
+    elif links:
+        key = f"coordinates.{name}"
+        message = (
+            f"coordinate '{name}' has no inertia: neither a joint nor the kinetic energy has it; "
+            "name it in a body's joint, or take it out"
+        )
+    else:
+        key = "energy.kinetic"
+        message = (
+            f"coordinate '{name}' has no inertia: the kinetic energy does not depend on "
+            f"{name}_dot, so nothing can be solved for its acceleration; "
+            "give it a mass, or make it an input"
+        )
+        if symbol(f"{name}_dot") in system.kinetic.free_symbols:
+            message = (
+                f"coordinate '{name}' has no inertia: the kinetic energy has {name}_dot, but not "
+                f"its square, so nothing can be solved for its acceleration; write {name}_dot**2"
+            )
+    raise SceneError([system.problem(key, message)])
 
 
 def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
@@ -247,37 +359,7 @@ def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
     return tuple(tape.total(pair) for pair in zip(first, second, strict=True))
 
 
-def inertial_forces(
-    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
-) -> list[Expr]:
-    """Return the generalized force D qdd + bias of each coordinate, derived from the energies `e`.
-
-    It is computed by Lagrange's operator. `accelerations` maps each velocity symbol to the
-    expression of its time derivative.
-    """
-    tape, q = e.tape, system.q
-    momentum_rates = _momenta(system, e, accelerations)[1]
-    seeds = [*_lagrangian(e), *zip(e.points.values(), momentum_rates[len(q) :], strict=True)]
-    projected = tape.gradient(seeds, q, frozenset(e.points))
-    return [tape.total(x) for x in zip(momentum_rates[: len(q)], projected, strict=True)]
-
-
-def _momenta(
-    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
-) -> tuple[list[Expr], list[Expr]]:
-    """Return dL/dqd and dL/dw, and their time derivatives. The rate of a velocity not in
-    `accelerations` is 0.
-    """
-    rates: dict[Symbol, Expr] = {**system.rates, t: S.One, **accelerations}
-    velocities = [*system.qd, *e.points]
-    lagrangian = [(e.kinetic, S.One), (e.linear_potential, S.NegativeOne)]
-    momenta = e.tape.gradient(lagrangian, velocities, frozenset(e.points))
-    return momenta, e.tape.forward(momenta, rates)
-
-
-def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
-    """Return -L = P - K as (output, seed) pairs of a gradient."""
-    return [(e.kinetic, S.NegativeOne), (e.potential, S.One), (e.linear_potential, S.One)]
+# --- Lagrange's operator --------------------------------------------------------------------------
 
 
 def _lagrange(system: System, e: Energies) -> MotionTerms:
@@ -330,6 +412,24 @@ def _lagrange(system: System, e: Energies) -> MotionTerms:
     return MotionTerms(D, tuple(bias), tuple(g), tuple(tau), tuple(b), quadratic, notes)
 
 
+def _momenta(
+    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
+) -> tuple[list[Expr], list[Expr]]:
+    """Return dL/dqd and dL/dw, and their time derivatives. The rate of a velocity not in
+    `accelerations` is 0.
+    """
+    rates: dict[Symbol, Expr] = {**system.rates, t: S.One, **accelerations}
+    velocities = [*system.qd, *e.points]
+    lagrangian = [(e.kinetic, S.One), (e.linear_potential, S.NegativeOne)]
+    momenta = e.tape.gradient(lagrangian, velocities, frozenset(e.points))
+    return momenta, e.tape.forward(momenta, rates)
+
+
+def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
+    """Return -L = P - K as (output, seed) pairs of a gradient."""
+    return [(e.kinetic, S.NegativeOne), (e.potential, S.One), (e.linear_potential, S.One)]
+
+
 def _mass_matrix(
     system: System, e: Energies, momenta: list[Expr], projected: Callable[[list[Expr]], list[Expr]]
 ) -> Rows:
@@ -376,3 +476,109 @@ def _notes(
             "D depends on time: C includes dD/dt, and Ddot - 2 C + dD/dt is skew-symmetric."
         )
     return tuple(notes)
+
+
+# --- the Coriolis matrix, the energy integral and its rate ----------------------------------------
+
+
+def equations(system: System, e: Energies, motion: MotionTerms) -> EquationsOfMotion:
+    """Return the equations of motion of a system, completed from `motion` (D, bias and tau).
+
+    The Coriolis matrix, Jacobi's integral with its time derivative, and the constraint equations
+    are derived and added. `e` contains the energies and the residuals of the constraints.
+    """
+    tape, qd = e.tape, system.qd
+
+    def add(*terms: Expr) -> Expr:
+        return tape.define(sympy.Add(*terms))
+
+    velocities = dict(zip(qd, qd, strict=True))
+    jacobi = None
+    if not motion.quadratic:
+        twice, once = tape.forward([e.kinetic, e.linear_potential], velocities)
+        jacobi = add(twice, -once, -e.kinetic, e.potential, e.linear_potential)
+        if e.linear_potential != 0 and jacobi == add(e.kinetic, e.potential):
+            jacobi = None
+    explicit = tape.forward([e.kinetic, e.potential, e.linear_potential], {t: S.One})
+    (dissipated,) = tape.forward([e.dissipation], velocities)
+    powers = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
+    velocities_of_points = tape.forward([v for v, _ in e.applied], velocities)
+    powers += [
+        tape.define(f * v) for v, (_, f) in zip(velocities_of_points, e.applied, strict=True)
+    ]
+    power = add(*powers, -dissipated, explicit[1], explicit[2], -explicit[0])
+    return EquationsOfMotion(
+        **vars(motion),
+        tape=tape,
+        C=_coriolis(system, tape, motion.bias, motion.quadratic),
+        signals=tuple(e.signals),
+        kinetic=e.kinetic,
+        potential=e.potential,
+        jacobi=jacobi,
+        power=power,
+        rows=constraints(system, e),
+    )
+
+
+def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool) -> Rows:
+    """Return C = (J(qd) + J(0))/2 with J = d(bias)/dqd, or C v for a direction v where C would be
+    long.
+
+    The part of bias that is quadratic in qd is sum_jk c_ijk qd_j qd_k with Christoffel's symbols of
+    the first kind, symmetric in j and k, so half its Jacobian is the Christoffel form of C. The
+    linear part (gyroscopic terms, explicit time in D) is J(0) qd and enters with the factor 1.
+    """
+    at_rest = dict.fromkeys(system.qd, S.Zero)
+
+    def column(seeds: Mapping[Symbol, Expr]) -> list[Expr]:
+        derivative = tape.forward(bias, seeds)
+        at_zero = [S.Zero] * len(derivative) if quadratic else tape.substitute(derivative, at_rest)
+        return [tape.define((a + b) / 2) for a, b in zip(derivative, at_zero, strict=True)]
+
+    if len(bias) * len(tape.live(bias)) > UNROLLED_SIZE_LIMIT:
+        entries = tangent_symbols(system)
+        return (tuple(column({qd: entries[q] for q, qd in zip(system.q, system.qd, strict=True)})),)
+    columns = [column({velocity: S.One}) for velocity in system.qd]
+    return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
+
+
+# --- inverse dynamics -----------------------------------------------------------------------------
+
+
+def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
+    """Return the pair (tape, tau) with the generalized forces tau = D qdd + C qd + g, shape (nq,).
+
+    The tape is the list of elementary operations that compute tau from q, qd, qdd, t and the
+    parameters. tau is derived without forming the matrix D: for trees of bodies by the recursive
+    Newton-Euler algorithm (newton_euler.py), for energies that are written as K and P by Lagrange's
+    operator.
+    """
+    tree = system.tree
+    kinetic, potential = (
+        (tree.other_kinetic, tree.other_potential) if tree else (system.kinetic, system.potential)
+    )
+    e = energies_on_tape(system, kinetic, potential, accelerations=True)
+    accelerations = dict(zip(system.qd, system.qdd, strict=True))
+    terms_of = [[x] for x in _inertial_forces(system, e, accelerations)]
+    if tree:
+        r = Recursion(e.tape, tree)
+        joint_accelerations = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
+        tree_forces = r.projected(r.inverse_dynamics(joint_accelerations))
+        for terms, q in zip(terms_of, system.q, strict=True):
+            terms.append(tree_forces.get(q, S.Zero))
+    return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in terms_of]
+
+
+def _inertial_forces(
+    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
+) -> list[Expr]:
+    """Return the generalized force D qdd + bias of each coordinate, derived from the energies `e`.
+
+    It is computed by Lagrange's operator. `accelerations` maps each velocity symbol to the
+    expression of its time derivative.
+    """
+    tape, q = e.tape, system.q
+    momentum_rates = _momenta(system, e, accelerations)[1]
+    seeds = [*_lagrangian(e), *zip(e.points.values(), momentum_rates[len(q) :], strict=True)]
+    projected = tape.gradient(seeds, q, frozenset(e.points))
+    return [tape.total(x) for x in zip(momentum_rates[: len(q)], projected, strict=True)]

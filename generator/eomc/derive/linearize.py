@@ -8,7 +8,7 @@ from sympy import Expr, Rational, S, Symbol
 
 from eomc.base.errors import SceneError
 from eomc.derive.energies import tangent_symbols
-from eomc.derive.equations import UNROLLED_SIZE_LIMIT
+from eomc.derive.lagrange import UNROLLED_SIZE_LIMIT
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import NotDifferentiableError, Tape
 from eomc.model.system import System

@@ -26,11 +26,10 @@ from sympy.polys.domains import QQ
 from sympy.polys.matrices import DomainMatrix
 from sympy.polys.matrices.exceptions import DMNonInvertibleMatrixError
 
-from eomc.derive.atoms import is_negative, split
 from eomc.derive.energies import Energies, energies_on_tape
 from eomc.derive.ldl import Pairs, Solution, Vector, solve
-from eomc.derive.tape import Stage
-from eomc.derive.vectors import Vectors
+from eomc.derive.links import Vectors
+from eomc.derive.tape import Stage, is_negative, split
 from eomc.model.system import System, dot, t
 
 Row = dict[int, Expr]  # nonzero entries of a sparse row, by column

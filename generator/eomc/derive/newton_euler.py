@@ -21,9 +21,8 @@ from itertools import combinations_with_replacement
 from sympy import Expr, S
 
 from eomc.base.spatial import ENTRIES
-from eomc.derive.links import Links
+from eomc.derive.links import AXES, ZERO, Links, Vector
 from eomc.derive.tape import Tape
-from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.rational import Matrix
 from eomc.model.tree import Link, Tree
 

@@ -16,7 +16,6 @@ import sympy
 from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 
 from eomc.base.errors import EomcError
-from eomc.derive.atoms import expand_sums, is_negative, split
 
 _CORNERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.sign)
 _NOT_DIFFERENTIABLE = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
@@ -681,3 +680,54 @@ class Tape:
             if changed:
                 new[symbol] = self.define(self.rhs(symbol).xreplace(changed))
         return [self.define(output.xreplace(new)) for output in outputs]
+
+
+# --- atoms: a number, a name, or a number times a name --------------------------------------------
+
+
+def split(atom: Expr) -> tuple[Expr, Symbol | None]:
+    """Return the pair (number, name) whose product is `atom`.
+
+    An atom is a number, a symbol (the name of a value), or a number times a symbol. The returned
+    number is 1 if `atom` is a symbol. The returned name is None if `atom` is a number.
+    """
+    if atom.is_Symbol:
+        return S.One, atom
+    if atom.is_number:
+        return atom, None
+    if len(atom.args) == 2 and atom.args[1].is_Symbol:
+        return atom.args[0], atom.args[1]
+    symbol = next(iter(atom.free_symbols))
+    return Mul(*(f for f in atom.args if f is not symbol)), symbol
+
+
+def is_negative(number: Expr) -> bool:
+    """Return True if `number`, a SymPy number, is negative.
+
+    For a rational number the sign of its numerator is tested, which is faster than SymPy's test.
+    """
+    return bool(number.p < 0 if number.is_Rational else number.is_negative)
+
+
+def expand_sums(
+    weights: dict[Symbol, Expr], constant: Expr, sums: Tape
+) -> tuple[dict[Symbol, Expr], Expr]:
+    """Return the sum sum_k weights[k] k + constant, simplified, as the pair (weights, constant).
+
+    A name in the sum may itself be defined as a sum of leaves (symbols without definition). It is
+    replaced by its terms if the result is then shorter. For example, q1 + (q2 - q1) becomes q2,
+    which also avoids a large rounding error for large q1. The names are defined on the tape
+    `sums`.
+    """
+    for symbol, weight in weights.items():
+        inner = sums.weights.get(symbol)
+        if not inner or inner.keys().isdisjoint(weights) or inner.keys() - sums.leaves.keys():
+            continue
+        expanded = {name: w for name, w in weights.items() if name is not symbol}
+        for name, w in inner.items():
+            expanded[name] = expanded.get(name, S.Zero) + weight * w
+        expanded = {name: w for name, w in expanded.items() if w != 0}
+        new_constant = constant + weight * sums.constant[symbol]
+        if len(expanded) + (new_constant != 0) < len(weights) + (constant != 0):
+            return expand_sums(expanded, S.Zero if new_constant == 0 else new_constant, sums)
+    return weights, constant

@@ -12,8 +12,7 @@ import sympy
 from sympy import Expr, S
 
 from eomc.base.errors import EomcError
-from eomc.derive.atoms import is_negative
-from eomc.derive.tape import Stage
+from eomc.derive.tape import Stage, is_negative
 from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.program.trig import names_of_pair
 

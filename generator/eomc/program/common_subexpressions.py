@@ -9,8 +9,7 @@ from itertools import combinations
 
 from sympy import Expr, S
 
-from eomc.derive.atoms import is_negative
-from eomc.derive.tape import Stage
+from eomc.derive.tape import Stage, is_negative
 from eomc.program.ir import Operand, Product, Sum
 from eomc.program.schedule_builder import ScheduleBuilder
 

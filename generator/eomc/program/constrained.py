@@ -9,8 +9,7 @@ from sympy import S
 
 from eomc.derive import kkt, outputs
 from eomc.derive.constraints import rate_terms
-from eomc.derive.equations import Equations
-from eomc.derive.lagrange import Derivation
+from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Pairs, Vector
 from eomc.derive.linearize import directional_derivatives
 from eomc.model.symbols import Output
@@ -78,19 +77,21 @@ def of_rows(derived: Derivation) -> Iterator[Function]:
         yield lower("rotation_errors", e.tape, [*values, *slopes], system.names)
 
 
-def _equations(derived: Derivation) -> Equations:
+def _equations(derived: Derivation) -> EquationsOfMotion:
     """Return the equations with the constraints: the shorter ones if there are two."""
     return min(
         _all_equations(derived), key=lambda e: len(e.tape.live([x for row in e.D for x in row]))
     )
 
 
-def _all_equations(derived: Derivation) -> list[Equations]:
+def _all_equations(derived: Derivation) -> list[EquationsOfMotion]:
     """Return the equations of motion by Lagrange and by Newton-Euler, where they exist."""
     return [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
 
 
-def _correction(system: System, e: Equations) -> tuple[Equations, Vector, Pairs, Function]:
+def _correction(
+    system: System, e: EquationsOfMotion
+) -> tuple[EquationsOfMotion, Vector, Pairs, Function]:
     """Derive the projection onto the constraints: the equations, corrections, pivots and the
     function.
     """

@@ -8,8 +8,7 @@ from dataclasses import replace
 import sympy
 from sympy import Expr, S, Symbol
 
-from eomc.derive.atoms import split
-from eomc.derive.tape import Stage, Tape
+from eomc.derive.tape import Stage, Tape, split
 from eomc.program.common_subexpressions import reduce_operations
 from eomc.program.ir import Assignment, Call, Cost, Function, Operand, Product, Sum, Value, rename
 from eomc.program.schedule_builder import ScheduleBuilder

@@ -13,8 +13,7 @@ from fractions import Fraction
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
-from eomc.derive.atoms import split
-from eomc.derive.tape import Stage, Tape
+from eomc.derive.tape import Stage, Tape, split
 
 Exponent = int | Fraction  # integers are int, which hashes faster
 Monomial = tuple[tuple[str, Exponent], ...]  # sorted by name

@@ -10,12 +10,10 @@ from sympy import S
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
 from eomc.derive import outputs
-from eomc.derive.frames import motions
-from eomc.derive.inverse_dynamics import inverse_dynamics
-from eomc.derive.lagrange import MASSLESS, Derivation
+from eomc.derive.frames import momentum, motions
+from eomc.derive.lagrange import MASSLESS, Derivation, inverse_dynamics
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import STICKS, linearization, sensitivity
-from eomc.derive.momentum import momentum
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG, Output, symbol

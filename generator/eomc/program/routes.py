@@ -14,8 +14,7 @@ from functools import cached_property
 from sympy import Expr
 
 from eomc.derive import kkt
-from eomc.derive.equations import Equations
-from eomc.derive.lagrange import Derivation
+from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Rows, SolveResult, solve
 from eomc.derive.link_multipliers import prefer_short_chains
 from eomc.derive.tape import Tape
@@ -115,7 +114,7 @@ class Route:
     penalty: float = 1.0
 
 
-def _power(e: Equations) -> Expr:
+def _power(e: EquationsOfMotion) -> Expr:
     """Return the power supplied to the system, including that of moving constraints, lambda . A
     qd.
     """
@@ -126,7 +125,7 @@ def _power(e: Equations) -> Expr:
     return e.tape.total([e.power, *powers])
 
 
-def _functions(e: Equations | None) -> Functions | None:
+def _functions(e: EquationsOfMotion | None) -> Functions | None:
     """Return all functions of the equations of motion other than the accelerations."""
     if e is None:
         return None
@@ -193,7 +192,7 @@ def _cancelled(material: RouteInputs) -> SolveResult:
     return solve(*material.expanded, short)
 
 
-def _constrained(e: Equations | None) -> SolveResult:
+def _constrained(e: EquationsOfMotion | None) -> SolveResult:
     """Return the constrained accelerations from equations that are not expanded."""
     return kkt.accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
 

@@ -15,8 +15,7 @@ from itertools import count
 
 from sympy import Expr, S
 
-from eomc.derive.atoms import is_negative
-from eomc.derive.tape import Stage
+from eomc.derive.tape import Stage, is_negative
 from eomc.model.system import System
 from eomc.program import outline
 from eomc.program.ir import Assignment, Function, Operand, Product, Sum, rename
