@@ -18,7 +18,7 @@ from payloads import FEW, PAYLOADS, RAW, derived, tokens, with_texts
 from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.emit import render
-from eomc.emit.fmu import units
+from eomc.emit.fmu import variables
 from eomc.emit.fmu.unit import Unit
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
@@ -77,7 +77,7 @@ def described(unit: Unit) -> ET.Element:
     ],
 )
 def test_units_mean_what_they_say(text: str, attributes: dict[str, str]) -> None:
-    meaning = units.parsed(text)
+    meaning = variables.parse_unit(text)
     assert meaning is not None and dict(meaning.attributes) == attributes
 
 
@@ -87,7 +87,7 @@ def test_units_mean_what_they_say(text: str, attributes: dict[str, str]) -> None
      "m" + "/s" * 30, "((((", "^", "kkg", "k", "m^1.5"],
 )  # fmt: skip
 def test_other_texts_mean_nothing(text: str) -> None:
-    assert units.parsed(text) is None
+    assert variables.parse_unit(text) is None
 
 
 @pytest.mark.parametrize("version", [2, 3])

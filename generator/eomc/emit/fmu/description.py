@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 from eomc.base.texts import FreeText
 from eomc.base.version import __version__
 from eomc.emit.c_names import Target
-from eomc.emit.fmu import units
-from eomc.emit.fmu.variables import Variable, Variables, has_signals, variables
+from eomc.emit.fmu.variables import Variable, Variables, has_signals, parse_unit, variables
 from eomc.emit.package import start_formulas
 from eomc.program.ir import Function
 from eomc.program.program import TIME, Program
@@ -192,7 +191,7 @@ def _free(pairs: Iterable[tuple[str, str]]) -> Attributes:
 
 def _units(known: Variables) -> tuple[XmlElement, ...]:
     """Return the units that are used and that FMI can express."""
-    meanings = {v.unit: meaning for v in known if (meaning := units.parsed(v.unit)) is not None}
+    meanings = {v.unit: meaning for v in known if (meaning := parse_unit(v.unit)) is not None}
     return tuple(
         XmlElement("Unit", _free([("name", text)]), _free(meaning.attributes))
         for text, meaning in meanings.items()
@@ -200,7 +199,7 @@ def _units(known: Variables) -> tuple[XmlElement, ...]:
 
 
 def _described(v: Variable, version: int) -> XmlElement:
-    unit = v.unit if units.parsed(v.unit) is not None else ""
+    unit = v.unit if parse_unit(v.unit) is not None else ""
     # the start of an input is always exact, and FMI 2 forbids the attribute
     initial = "" if v.causality == "input" else v.initial
     outer = _free(
