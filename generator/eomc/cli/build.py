@@ -1,4 +1,4 @@
-"""eomc build: packages and embeddable C."""
+"""eomc build and eomc export: write packages, C, wheels and FMUs of scenes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from eomc.cli.terminal import say, shown, status_line, warn
 )
 @options.QUIET
 @options.JSON
-def command(
+def build_command(
     scenes: Sequence[Path], root: Path, folder: Path | None, prefix: str | None, wheel: bool,
     quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
@@ -125,3 +125,41 @@ def _write_c(
         )
     elif not quiet:
         say(f"wrote {shown(folder)}/: {', '.join(files)}")
+
+
+# --- export ---------------------------------------------------------------------------------------
+
+
+@click.group("export")
+def export_command() -> None:
+    """Write a scene for other programs.
+
+    \b
+    eomc export fmu scenes/cartpole.toml
+    """
+
+
+@export_command.command("fmu")
+@options.SCENE
+@click.option(
+    "--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True,
+    help="Version 2.0, which most tools read, or 3.0.",
+)  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), help="The file, by default NAME.fmu.")
+@click.option("--sources", is_flag=True, help="Sources only, no binary.")
+@options.QUIET
+def export_fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> None:
+    """Write a unit of FMI: co-simulation and model exchange, binary and source.
+
+    \b
+    eomc export fmu scenes/cartpole.toml
+    eomc export fmu scenes/cartpole.toml --fmi 3 --out cartpole3.fmu
+    """
+    options.check_target(out, (".fmu",), "--out")
+    with status_line("exporting", quiet):
+        exported = pipeline.export_fmu(scene, out, int(fmi), binary=not sources, warn=warn)
+    if exported.why:
+        say(f"sources only: {exported.why}", err=True)
+    if not quiet:
+        inside = f"sources and a binary for {exported.binary}" if exported.binary else "sources"
+        say(f"{shown(exported.file)}: FMI {fmi}.0, {inside}")

@@ -22,7 +22,9 @@ from eomc.cli.terminal import progress_bar, say, warn
 )
 @options.QUIET
 @options.JSON
-def command(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool) -> None:
+def check_command(
+    scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool
+) -> None:
     """Compare the compiled module with the pure-Python reference, and test what must hold.
 
     So too the plain form of C, compiled for this; the first time in some seconds.

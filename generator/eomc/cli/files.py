@@ -1,22 +1,21 @@
-"""Write the files of commands."""
+"""Write text files, such as new scenes and reports."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from eomc.base.errors import EomcError, writing
 from eomc.cli.terminal import shown
-from eomc.runtime.atomic_write import atomic_write, check_replaceable
+from eomc.runtime.atomic_write import atomic_write
 
 
 def scene_path(name: str) -> Path:
-    """Return the path of a new scene, in scenes/ if that folder exists."""
+    """Return the path of a new scene file, <name>.toml, in scenes/ if that folder exists."""
     return (Path("scenes") if Path("scenes").is_dir() else Path()) / f"{name}.toml"
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist yet."""
+    """Write a text file. Raises EomcError if the file exists already, or can't be written."""
     incomplete = False
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -32,17 +31,10 @@ def write_new(path: Path, text: str) -> None:
             path.unlink(missing_ok=True)
 
 
-def check_target(path: Path | None, endings: Sequence[str], option: str) -> None:
-    """Raise EomcError if an option names a file with a wrong suffix or one not replaceable."""
-    if path is None:
-        return
-    if path.suffix not in endings:
-        raise EomcError(f"{option} {shown(path)}: give a name that ends in {' or '.join(endings)}")
-    with writing(f"{option} {shown(path)}"):
-        check_replaceable(path)
-
-
 def write_text(path: Path, text: str) -> None:
-    """Write a file, replacing an existing one once the new one is complete."""
+    """Write a text file; an existing file is replaced once the new one is complete.
+
+    Raises EomcError if the file can't be written.
+    """
     with writing(shown(path)), atomic_write(path) as new:
         new.write_text(text, encoding="utf-8")

@@ -19,7 +19,12 @@ from eomc.base.version import __version__
 from eomc.cli import terminal
 from eomc.cli.terminal import fail, say
 
-COMMANDS = "build check dof export import list new report run show".split()
+# name of each command, and the module with the function <name>_command
+COMMANDS = {
+    "build": "build", "check": "check", "dof": "description", "export": "build",
+    "import": "scenes", "list": "scenes", "new": "scenes", "report": "report", "run": "run",
+    "show": "description",
+}  # fmt: skip
 
 
 class _Group(terminal.CommandGroup):
@@ -27,14 +32,14 @@ class _Group(terminal.CommandGroup):
 
     def list_commands(self, context: click.Context) -> list[str]:
         """Return all commands in the order of the help text."""
-        return COMMANDS
+        return [*COMMANDS]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         """Import and return a command."""
         if name not in COMMANDS:
             return None
-        module = "import_robot" if name == "import" else name  # which Python can't import
-        command: click.Command = import_module(f"eomc.cli.{module}").command
+        module = import_module(f"eomc.cli.{COMMANDS[name]}")
+        command: click.Command = getattr(module, f"{name}_command")
         return command
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
@@ -42,7 +47,7 @@ class _Group(terminal.CommandGroup):
         if args[0] not in COMMANDS:
             from eomc.scene.formulas import suggest
 
-            near = suggest(args[0], COMMANDS) or f": they are {', '.join(COMMANDS)}"
+            near = suggest(args[0], [*COMMANDS]) or f": they are {', '.join(COMMANDS)}"
             context.fail(f"No such command '{texts.line(args[0])}'{near}")
         return super().resolve_command(context, args)
 

@@ -20,7 +20,7 @@ from eomc.cli.terminal import progress_bar, say, shown, status_line
 @click.option("--digits", type=click.IntRange(1, 17), help="Recommend for so many digits only.")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
 @options.QUIET
-def command(
+def report_command(
     scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool
 ) -> None:
     """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
@@ -36,7 +36,7 @@ def command(
     from eomc.report import page as pages
     from eomc.report.plot import without_pictures
 
-    files.check_target(file, (".json",), "--json")
+    options.check_target(file, (".json",), "--json")
     measured = []
     for scene in scenes:
         system = pipeline.read(scene)

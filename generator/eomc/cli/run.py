@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,8 @@ import click
 from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
-from eomc.cli import files, options
-from eomc.cli.pairs import parse_pairs
+from eomc.cli import options
+from eomc.cli.options import parse_pairs
 from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
 
 if TYPE_CHECKING:
@@ -48,6 +48,53 @@ class _RunCommand(click.Command):
                 raise
             words = f"No such option '{fault.option_name}': {hint}"
             raise click.UsageError(words, context) from None
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Arguments of `eomc run`; the help texts of its options describe them."""
+
+    scene: Path
+    root: Path
+    parameters: Sequence[str]
+    start: Sequence[str]
+    inputs: Sequence[str]
+    h: float | None
+    duration: float | None
+    method: str | None
+    tol: float | None
+    event: Sequence[str]
+    every: int
+    out: Path | None
+    plot: Path | None
+    wrap: bool
+    animate: Path | None
+    quiet: bool
+    as_json: bool
+
+    @property
+    def silent(self) -> bool:
+        """True if no progress is shown."""
+        return self.quiet or self.as_json
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A run, the computing time in s, and remarks on its step size and its duration.
+
+    beyond_stability: remark if the step size is beyond the stability limit; else None.
+    beyond_duration: remark if the step size is longer than the duration; else None.
+    """
+
+    run: Run
+    seconds: float
+    beyond_stability: str | None
+    beyond_duration: str | None
+
+    @property
+    def is_short(self) -> bool:
+        """True if an error estimate and an energy balance, which take longer, are affordable."""
+        return self.seconds < 2
 
 
 @click.command("run", cls=_RunCommand)
@@ -81,12 +128,8 @@ class _RunCommand(click.Command):
 )
 @options.QUIET
 @options.JSON
-def command(
-    scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str],
-    inputs: Sequence[str], h: float | None, duration: float | None, method: str | None,
-    tol: float | None, event: Sequence[str], every: int, out: Path | None, plot: Path | None,
-    wrap: bool, animate: Path | None, quiet: bool, as_json: bool,
-) -> None:  # fmt: skip
+@options.parsed_as(RunArguments)
+def run_command(arguments: RunArguments) -> None:
     """Simulate a scene; print the end, the error and the speed.
 
     \b
@@ -94,79 +137,94 @@ def command(
     eomc run scenes/cartpole.toml --animate cartpole.html
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
+    out, plot, animate = arguments.out, arguments.plot, arguments.animate
+    options.check_target(out, (".csv", ".npz"), "--out")
+    options.check_target(plot, (".png", ".svg", ".pdf"), "--plot")
+    options.check_target(animate, (".html", ".gif", ".mp4"), "--animate")
+    if arguments.wrap and not plot:
+        raise EomcError("--wrap: says how --plot draws angles: give --plot FILE.png too")
+    scene, silent = arguments.scene, arguments.silent
+    with status_line(f"building {scene.stem}", silent):
+        module = _with_events(pipeline.load(scene, arguments.root, warn=warn), arguments.event)
+    parameters, q0, qd0 = _overrides(scene, module, arguments.parameters, arguments.start)
+    u = _fixed_inputs(scene, module, arguments.inputs, parameters)
+    simulation = _simulate(module, arguments, {"params": parameters, "q0": q0, "qd0": qd0, "u": u})
+    run = simulation.run
+    interrupted = run.status == "interrupted"
+    if run.status == "ok" and simulation.is_short:
+        try:
+            with progress_bar("finding its error", silent) as progress, _without_warnings():
+                run.estimate(progress)
+        except module.Interrupted:  # the run itself is whole
+            interrupted = True
+    if out:
+        with writing(shown(out)):
+            run.save(out)
+    has_work = module._model.has_power or len(run.events) > 0  # forces, or jumps
+    balance = run.balance() if has_work and simulation.is_short else None
+    if plot:
+        _plot(module, run, arguments, parameters, balance.words if balance else "")
+    if animate:
+        with status_line(f"drawing {animate.name}", silent):
+            run.animate(animate)
+    files = [str(file) for file in (plot, animate, out) if file]
+    summary = _summary(module, simulation, balance, files)
+    if arguments.as_json:
+        say(json.dumps(summary, indent=1))
+    elif not arguments.quiet:
+        _print_summary(module, run, balance, summary)
+    complete = run.status in ("ok", "accumulated") and not run._broken
+    if run.status != "ok":
+        say(f"eomc: {run.message}", err=True)
+    if interrupted or not complete:
+        sys.exit(130 if interrupted else 1)
+
+
+def _simulate(module: Any, arguments: RunArguments, start: Mapping[str, Any]) -> Simulation:
+    """Simulate, and note whether the step size and the duration are suitable.
+
+    start: arguments of `simulate` for the parameters, the initial state and the inputs.
+    """
     from eomc.runtime.stability import beyond_end
 
-    files.check_target(out, (".csv", ".npz"), "--out")
-    files.check_target(plot, (".png", ".svg", ".pdf"), "--plot")
-    files.check_target(animate, (".html", ".gif", ".mp4"), "--animate")
-    if wrap and not plot:
-        raise EomcError("--wrap: says how --plot draws angles: give --plot FILE.png too")
-    with status_line(f"building {scene.stem}", quiet or as_json):
-        module = _with_events(pipeline.load(scene, root, warn=warn), event)
-    values, q0, qd0 = _overrides(scene, module, parameters, start)
-    u = _fixed_inputs(scene, module, inputs, values)
-    options: dict[str, Any] = {
-        "h": h, "duration": duration, "u": u, "params": values, "method": method, "tol": tol,
-    }  # fmt: skip
-    own, unstable, ends = module._model, None, None
+    h, method, tol, model = arguments.h, arguments.method, arguments.tol, module._model
+    beyond_stability = beyond_duration = None
     try:
-        adaptive = own.tolerance and h is None and method is None
+        adaptive = model.tolerance and h is None and method is None
         if tol is None and method != "auto" and not adaptive:
-            unstable = module.advice(q0, qd0, h, u, values, method)
-            span = own.duration if duration is None else duration
-            ends = beyond_end(own.h if h is None else h, span)
-        with progress_bar("running", quiet or as_json) as progress:
+            beyond_stability = module.advice(**start, h=h, method=method)
+            span = model.duration if arguments.duration is None else arguments.duration
+            beyond_duration = beyond_end(model.h if h is None else h, span)
+        with progress_bar("running", arguments.silent) as progress:
             started_at = time.perf_counter()
             with _without_warnings():
-                run = module.simulate(q0, qd0, every=every, progress=progress, **options)
+                run = module.simulate(
+                    **start, h=h, duration=arguments.duration, method=method, tol=tol,
+                    every=arguments.every, progress=progress,
+                )  # fmt: skip
             seconds = time.perf_counter() - started_at
     except module.Interrupted as stop:  # what was done is kept
         run, seconds = stop.run, time.perf_counter() - started_at
     except (ValueError, MemoryError, module.MotionError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None
-    stopped = run.status == "interrupted"
-    if run.status == "ok" and seconds < 2:
-        try:
-            with (
-                progress_bar("finding its error", quiet or as_json) as progress,
-                _without_warnings(),
-            ):
-                run.estimate(progress)
-        except module.Interrupted:  # the run itself is whole
-            stopped = True
-    if out:
-        _write(out, run)
-    has_work = own.has_power or len(run.events) > 0  # forces, or jumps
-    balance = run.balance() if has_work and seconds < 2 else None
-    if plot:
-        from eomc.report import plot as plots
+    return Simulation(run, seconds, beyond_stability, beyond_duration)
 
-        drawn = run._drawn
-        jacobi = drawn.jacobi if own.has_jacobi else None
-        system, rows = (
-            pipeline.read(scene).with_parameters(values),
-            (drawn.t, drawn.q, drawn.qd, drawn.energy),
-        )
-        words = balance.words if balance else ""
-        acted = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
-        plots.draw(
-            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=acted,
-            wrap=wrap,
-        )  # fmt: skip
-    if animate:
-        with status_line(f"drawing {animate.name}", quiet or as_json):
-            run.animate(animate)
-    written = {"plot": plot, "animate": animate, "out": out}
-    summary = _summary(module, run, balance, seconds, unstable, ends, **written)
-    if as_json:
-        say(json.dumps(summary, indent=1))
-    elif not quiet:
-        _print_summary(module, run, balance, summary)
-    complete = run.status in ("ok", "accumulated") and not run._broken
-    if run.status != "ok":
-        say(f"eomc: {run.message}", err=True)
-    if stopped or not complete:
-        sys.exit(130 if stopped else 1)
+
+def _plot(
+    module: Any, run: Run, arguments: RunArguments, parameters: Mapping[str, float], words: str
+) -> None:
+    """Write the figure of a run. words: the energy balance in words, or ""."""
+    from eomc.report import plot as plots
+
+    assert arguments.plot is not None
+    drawn = run._drawn
+    system = pipeline.read(arguments.scene).with_parameters(parameters)
+    jacobi = drawn.jacobi if module._model.has_jacobi else None
+    inputs = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
+    plots.draw(
+        system, drawn.t, drawn.q, drawn.qd, drawn.energy, arguments.plot, jacobi=jacobi,
+        outputs=drawn.outputs, words=words, inputs=inputs, wrap=arguments.wrap,
+    )  # fmt: skip
 
 
 def _with_events(module: ModuleType, arguments: Sequence[str]) -> ModuleType:
@@ -304,11 +362,12 @@ def _error(run: Run) -> dict[str, Any] | None:
 
 
 def _summary(
-    module: Any, run: Run, balance: Balance | None, seconds: float, unstable: str | None,
-    ends: str | None, **files: Path | None,
-) -> dict[str, Any]:  # fmt: skip
+    module: Any, simulation: Simulation, balance: Balance | None, files: Sequence[str]
+) -> dict[str, Any]:
+    """Return the results of a run for JSON. files: the files that were written."""
     import numpy as np
 
+    run, seconds = simulation.run, simulation.seconds
     energy, jacobi = run.energy, run.jacobi
     q, qd = run.q[-1] + 0.0, run.qd[-1] + 0.0  # no -0
     return {
@@ -326,19 +385,19 @@ def _summary(
             "start": _finite(float(energy[0])),
             "end": _finite(float(energy[-1])),
             "largest_change": _change(energy),
-            "balance": dataclasses.asdict(balance) if balance else None,
+            "balance": asdict(balance) if balance else None,
         },
         "events": {name: e.t.tolist() for name, e in run.events.items()},
         "stopped_by": getattr(run, "stopped", "") or None,
         "saturated": _saturated(module, run),
         "jacobi_change": None if np.array_equal(energy, jacobi) else _change(jacobi),
         "error_estimate": _error(run),
-        "beyond_stability": unstable,
-        "beyond_duration": ends,
+        "beyond_stability": simulation.beyond_stability,
+        "beyond_duration": simulation.beyond_duration,
         "remark": run._remark if run.status == "ok" else "",
         "seconds": seconds,
         "steps_per_second": run.steps / seconds if seconds else None,
-        "files": [str(path) for path in files.values() if path],
+        "files": files,
     }
 
 
@@ -414,9 +473,3 @@ def _print_error(module: Any, error: Estimate, run: Run) -> None:
     say(f"  right digits: {digits}{grown}")
     if error.warning:
         say(f"  {error.warning}")
-
-
-def _write(path: Path, run: Run) -> None:
-    """Write the rows as CSV with 17 digits, or the run as NPZ."""
-    with writing(shown(path)):
-        run.save(path)

@@ -1,8 +1,10 @@
-"""eomc show: the equations as text."""
+"""eomc dof and eomc show: print the degrees of freedom and the equations of a scene."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,6 +12,52 @@ from eomc import pipeline
 from eomc.cli import options
 from eomc.cli.terminal import say, status_line, warn
 from eomc.toolchain import cache
+
+
+@click.command("dof")
+@options.SCENE
+@options.JSON
+def dof_command(scene: Path, as_json: bool) -> None:
+    """Count a scene's freedoms, from its bodies and joints, and say which are redundant.
+
+    Of a scene with constraints or loops also the rank of their rows and the freedoms that they
+    leave, which rows are redundant, how near the start is to a singular position, and with one
+    freedom its whole way, and where it is assembled.
+
+    \b
+    eomc dof scenes/arm.toml
+    eomc dof scenes/slider_crank.toml
+    """
+    from eomc.model import mobility
+    from eomc.scene import read as scenes
+
+    checked_scene = scenes.read(scene)
+    counted: dict[str, Any] = {"scene": checked_scene.name}
+    lines = []
+    if not checked_scene.constrained or (checked_scene.assembly and checked_scene.assembly.bodies):
+        mobility_count = mobility.count(checked_scene)
+        counted, lines = mobility_count.as_dict(), [mobility_count.table()]
+    if checked_scene.constrained:
+        from eomc import pipeline
+        from eomc.program import singular
+
+        system = pipeline.read(scene)
+        assert system.closure is not None
+        counted["constraints"] = {
+            **system.closure.as_dict(),
+            "q": {c.name: c.start for c in system.coordinates},
+            "qd": {f"{c.name}_dot": c.rate for c in system.coordinates},
+        }
+        lines.append(system.closure.table())
+        if closest_singularity := singular.closest_singularity(system):
+            counted["constraints"]["nearest_singular"] = vars(closest_singularity)
+            lines.append(str(closest_singularity))
+        start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)
+        lines.append(f"  assembled start: {', '.join(start)}")
+    say(json.dumps(counted, indent=1) if as_json else "\n".join(lines))
+
+
+# --- show -----------------------------------------------------------------------------------------
 
 
 @click.command("show")
@@ -24,7 +72,7 @@ from eomc.toolchain import cache
     "--sizes", "form", flag_value="sizes",
     help="Bytes of code and stack of each function of the plain C, as $CC makes them by -Os.",
 )  # fmt: skip
-def command(scene: Path, root: Path, form: str | None) -> None:
+def show_command(scene: Path, root: Path, form: str | None) -> None:
     """Print the equations of motion, L, D, C, g and the rest, as text for a terminal.
 
     \b
@@ -47,10 +95,10 @@ def command(scene: Path, root: Path, form: str | None) -> None:
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):
-        texts = cache.cached_texts(root, name, form or "text", digest, make)
-    if texts["warnings"]:
-        say(texts["warnings"], err=True)
-    say(texts["text"])
+        stored = cache.cached_texts(root, name, form or "text", digest, make)
+    if stored["warnings"]:
+        say(stored["warnings"], err=True)
+    say(stored["text"])
 
 
 def _sizes(scene: Path) -> str:
