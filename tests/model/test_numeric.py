@@ -9,8 +9,8 @@ import mpmath
 import pytest
 import sympy
 
+from eomc.model.algebra import compiled
 from eomc.model.from_scene import from_scene
-from eomc.model.numeric import compiled
 from eomc.model.symbols import symbol
 from eomc.report import equations
 from eomc.scene.read import parse

@@ -15,7 +15,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
-from eomc.model.picture_from_sympy import in_python, text
+from eomc.model.from_sympy import formula_text, in_python
 from eomc.report.drawing import drawing
 from eomc.scene import formulas
 from eomc.scene.read import parse
@@ -181,7 +181,7 @@ def test_every_function_is_written_as_formulas_have_it(name: str) -> None:
     written = f"{name}(x, y)" if fewest == 2 else f"{name}(x)"
     expr = sympy.sympify(written, {"min": sympy.Min, "max": sympy.Max, "abs": sympy.Abs,
                                    "heaviside": sympy.Heaviside})  # fmt: skip
-    again = formulas.parse(text(expr + sympy.E - sympy.Rational(1, 7) + sympy.Float("0.1")))
+    again = formulas.parse(formula_text(expr + sympy.E - sympy.Rational(1, 7) + sympy.Float("0.1")))
     value = formulas.evaluate(again, formulas.NUMERIC, known.__getitem__)
     direct = formulas.evaluate(formulas.parse(written), formulas.NUMERIC, known.__getitem__)
     assert np.isclose(value, direct + np.e - 1 / 7 + 0.1, rtol=1e-14)

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 
 import eomc
 from eomc.base.errors import SceneError
-from eomc.model.discrete import with_constant_parameters
 from eomc.model.from_scene import from_scene
+from eomc.model.hybrid import with_constant_parameters
 from eomc.model.system import System
 from eomc.program.assembly import assembled
 from eomc.report import equations

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from stand_in import StandIn
 from trees import SHAPES, trees
 
+from eomc.model import hybrid
 from eomc.model import multibody as building
-from eomc.model import saturation
 from eomc.model.from_scene import from_scene
 from eomc.scene.joints import JOINTS
 from eomc.scene.read import parse, read
@@ -227,7 +227,7 @@ def test_of_inputs_beyond_their_limits_the_limits_act() -> None:
 
 
 def test_limits_left_out_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(saturation, "saturate_inputs", lambda system: system)
+    monkeypatch.setattr(hybrid, "saturate_inputs", lambda system: system)
     assert compared(LIMITED, 12)["power"] > 1e3 * rows_bodies.LIMIT
 
 

@@ -13,7 +13,7 @@ from sympy.core.function import AppliedUndef
 from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
-from eomc.model import algebra, digit_bound
+from eomc.model import algebra
 from eomc.model.mechanics import in_words_of_python
 from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
@@ -141,7 +141,7 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
             raise undeclared(role, strange, known, rule)
-        digit_bound.bound(formula, {})
+        algebra.bound(formula, {})
         return algebra.expression(formula, known)
     except FormulaError as wrong:
         shown = text if len(text) <= 80 else text[:79] + "…"

@@ -12,8 +12,8 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.model import loops
+from eomc.model.algebra import compiled
 from eomc.model.loops import Closed
-from eomc.model.numeric import compiled
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
 NEAR = 1e-9  # m or rad; smaller residuals count as zero

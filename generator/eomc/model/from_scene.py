@@ -8,11 +8,9 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import algebra, constraints, digit_bound, saturation
-from eomc.model.coulomb_friction import Friction, add_stick_slip
-from eomc.model.discrete import add_discrete_coordinates
-from eomc.model.event_function import check_event_functions
+from eomc.model import algebra, constraints
 from eomc.model.generalized_potential import NotLinearError, split
+from eomc.model.hybrid import Friction, add_hybrid_dynamics
 from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
 from eomc.model.symbols import (
@@ -45,7 +43,7 @@ class _Formulas:
         self.known |= {name: symbol(name) for name in names}
         self.problems: list[Problem] = []
         self.doubts: list[Problem] = []
-        self.sizes: dict[str, digit_bound.DigitBound] = {}  # of constants and definitions
+        self.sizes: dict[str, algebra.DigitBound] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
         """Convert a formula to a SymPy expression and return it.
@@ -55,8 +53,8 @@ class _Formulas:
         """
         name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
-            self.sizes[name] = digit_bound.VARIES
-            self.sizes[name] = digit_bound.bound(formula, self.sizes)
+            self.sizes[name] = algebra.VARIES
+            self.sizes[name] = algebra.bound(formula, self.sizes)
             return algebra.expression(formula, self.known)
         except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
             message = f"'{formula.shown}' {fault}"
@@ -290,9 +288,7 @@ def from_scene(scene: Scene) -> System:
     )
     if faults := scene_formulas.problems or system.beyond_float():
         raise SceneError(faults)
-    return add_stick_slip(
-        add_discrete_coordinates(saturation.saturate_inputs(check_event_functions(system))), sticks
-    )
+    return add_hybrid_dynamics(system, sticks)
 
 
 def _follows(scene: Scene, c: SceneCoordinate) -> Iterator[str]:

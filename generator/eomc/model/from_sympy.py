@@ -1,27 +1,33 @@
-"""Conversion of a user's symbols and expressions, whatever their assumptions, for System.make."""
+"""Conversion of a user's symbols and expressions, whatever their assumptions, for System.make.
+
+SymPy functions that formulas of scenes do not have are rewritten exactly. A picture becomes the
+table [picture] of a scene with the names of the system and the picture only, and its expressions
+become formulas.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import json
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
+from sympy.core.relational import GreaterThan, LessThan, StrictGreaterThan, StrictLessThan
+from sympy.printing.str import StrPrinter
 
 from eomc.base import names
-from eomc.base.errors import EomcError, Problem
+from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.model import api_arguments, constraints
 from eomc.model.algebra import UNDEFINED
 from eomc.model.api_arguments import name_of
-from eomc.model.coulomb_friction import Friction
 from eomc.model.generalized_potential import NotLinearError, split
+from eomc.model.hybrid import Friction
 from eomc.model.mechanics import AnySystem
-from eomc.model.picture_from_sympy import picture_scene
-from eomc.model.picture_from_sympy import text as formula_text
-from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -35,8 +41,9 @@ from eomc.model.symbols import (
     symbol,
     t,
 )
+from eomc.scene import read
 from eomc.scene.messages import is_in_degrees
-from eomc.scene.scene import RunSettings
+from eomc.scene.scene import RunSettings, Scene
 from eomc.scene.schema import ACTIONS, DIRECTIONS
 
 _OF_NUMBERS = (
@@ -517,3 +524,232 @@ def _own_symbols(
                 rate = Symbol(f"{one}{order}", real=one.is_real)
                 found[name + order] = used.get(rate.name, rate)
     return found
+
+
+# --- functions that formulas of scenes have -------------------------------------------------------
+
+_AS: Mapping[Any, Callable[[Expr], Expr]] = {
+    sympy.UnevaluatedExpr: lambda x: x,
+    sympy.sec: lambda x: 1 / sympy.cos(x),
+    sympy.csc: lambda x: 1 / sympy.sin(x),
+    sympy.cot: lambda x: sympy.cos(x) / sympy.sin(x),
+    sympy.sech: lambda x: 1 / sympy.cosh(x),
+    sympy.csch: lambda x: 1 / sympy.sinh(x),
+    sympy.coth: lambda x: 1 / sympy.tanh(x),
+    sympy.asec: lambda x: sympy.acos(1 / x),
+    sympy.acsc: lambda x: sympy.asin(1 / x),
+}
+_ORDERS = (GreaterThan, LessThan, StrictGreaterThan, StrictLessThan)
+
+
+class JumpError(ValueError):
+    """Error for a SymPy Piecewise that is discontinuous or whose continuity is undecided."""
+
+
+def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
+    """Return an equal expression without Piecewise and without functions such as sec and coth.
+
+    The result uses only functions that formulas of scenes can use. fixed: dict from each constant
+    symbol to True if it is known to be nonnegative, else False. Raises JumpError for a Piecewise
+    that is discontinuous, or whose continuity cannot be decided.
+    """
+    expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
+    return expr.replace(lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, fixed))
+
+
+def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
+    """Return a continuous Piecewise as a sum of products with Max.
+
+    Starts from the last piece. Where d > 0 a piece replaces another; if their difference is q d
+    with finite q, the term q Max(d, 0) is added.
+    """
+    *pieces, (result, last) = piecewise.args
+    if last != sympy.true:
+        raise JumpError(f"{piecewise} has no last piece: give one for all else, (0, True)")
+    last_piece = result
+    for k in reversed(range(len(pieces))):
+        piece, condition = pieces[k]
+        if not isinstance(condition, _ORDERS):
+            raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
+        d = condition.gts - condition.lts
+        other = _applicable_piece(condition, piecewise.args[k + 1 :], fixed)
+        q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
+        if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed.keys():
+            unknown = [str(s) for s in fixed if s in condition.free_symbols and not fixed[s]]
+            order = f"; Symbol('{unknown[0]}', positive=True) tells an order" if unknown else ""
+            jump = sympy.Heaviside(d)
+            if len(pieces) == 1:
+                jump = last_piece + (piece - last_piece) * jump
+            raise JumpError(
+                f"{piecewise} jumps where {d} = 0, or can't be seen not to: write {jump}, whose "
+                f"Heaviside is 1/2 there, or Max, Min or a smooth tanh{order}"
+            )
+        result += q * sympy.Max(d, 0)
+    return result
+
+
+def _applicable_piece(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
+    """Return the later piece that applies where a condition holds; None if undecided."""
+    for piece, other in later:
+        if _never_both(condition, sympy.Not(other), fixed):
+            return piece
+        if not _never_both(condition, other, fixed):
+            return None
+    return None
+
+
+def _never_both(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
+    """Return True if two conditions exclude each other: d > 0 and e > 0 if d + s e <= 0, s > 0."""
+    if isinstance(one, _ORDERS) and isinstance(other, _ORDERS):
+        (d, varying), (e, against) = (
+            (x.gts - x.lts).expand().as_independent(*x.free_symbols - fixed.keys(), as_Add=True)
+            for x in (one, other)
+        )
+        s = -sympy.cancel(varying / against) if against != 0 else sympy.S.Zero
+        known = {x: sympy.Dummy(x.name, nonnegative=True) for x in fixed if fixed[x]}
+        if s.is_positive and sympy.expand(d + s * e).xreplace(known).is_nonpositive:
+            return True
+    return bool(sympy.And(one, other).simplify() == sympy.false)
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+_PICTURE_EXAMPLE = (
+    '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
+)
+_WORDS = (  # phrases of messages, for TOML and for Python
+    ('lines = [["cart", "tip"]]', '"lines": [["cart", "tip"]]'),
+    ("[picture.points], such as tip = [", '"points", such as "tip": ['),
+    (
+        'a table, such as { tip = ["x", "l*cos(theta)"] }',
+        'a dict, such as {"tip": ["x", "l*cos(theta)"]}',
+    ),
+    ("a list of tables with", "a list of dicts with"),
+    ('[{ at = "cart", size = [0.4, 0.2] }]', '[{"at": "cart", "size": [0.4, 0.2]}]'),
+    ('[{ at = "wheel", radius = 0.1 }]', '[{"at": "wheel", "radius": 0.1}]'),
+    (", here a table", ", here a dict"),
+    (", here true", ", here True"),
+    (", here false", ", here False"),
+)
+_SCENE_NAMES = {"Abs": "abs", "Max": "max", "Min": "min"}
+
+
+def picture_scene(
+    picture: Any, expression: Callable[[Any, str], Expr], coordinates: Iterable[Coordinate],
+    parameters: Iterable[Parameter], inputs: Iterable[str],
+    definitions: Sequence[tuple[Symbol, Expr]],
+) -> tuple[Scene, str]:  # fmt: skip
+    """Return a scene with the picture of a system made in Python, and the picture as JSON text.
+
+    Parameters
+    ----------
+    picture
+        The argument `picture` of System.make.
+    expression
+        Function that converts a user's expression; called with (expression, description of it for
+        messages).
+    coordinates, parameters, inputs
+        Quantities that the picture may use; the scene declares all of them.
+    definitions
+        Pairs (symbol, expression) that the picture may use; the scene contains those that it needs.
+
+    Raises
+    ------
+    EomcError
+        If the picture is invalid.
+    """
+    if not isinstance(picture, Mapping):
+        raise api_arguments.fault(
+            "picture", f"give a dict, such as {_PICTURE_EXAMPLE}, here {picture!r}"
+        )
+    table = _as_toml(picture, expression)
+    coordinates = [*coordinates]
+    tree: dict[str, Any] = {
+        "eomc": 1,
+        "name": "pictured",
+        "coordinates": {c.name: _metres(c) for c in coordinates},
+        "parameters": {p.name: {"value": p.value, **_metres(p)} for p in parameters},
+        "inputs": {name: {} for name in inputs},
+        "definitions": _used_definitions(table, definitions),
+        "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # required in a scene; not drawn
+        "picture": table,
+    }
+    try:
+        scene = read.check_tree(tree, "System.make")
+    except SceneError as wrong:
+        problems = [replace(p, message=in_python(p.message)) for p in wrong.problems]
+        raise SceneError(problems) from None
+    return scene, json.dumps(table, sort_keys=True, default=str)
+
+
+def in_python(message: str) -> str:
+    """Return a message about the table [picture] with Python syntax in place of TOML syntax."""
+    for toml, python in _WORDS:
+        message = message.replace(toml, python)
+    return message
+
+
+def _metres(one: Coordinate | Parameter) -> dict[str, str]:
+    """Return the unit if it is a length, the only one that pictures use."""
+    return {"unit": "m"} if one.unit == "m" else {}
+
+
+def _as_toml(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
+    """Convert a value to that of a scene: expressions to formulas, sequences to lists."""
+    if isinstance(value, Mapping):
+        return {str(key): _as_toml(entry, expression) for key, entry in value.items()}
+    if isinstance(value, sympy.MatrixBase):
+        value = value.flat()
+    if hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_as_toml(entry, expression) for entry in value]
+    if isinstance(value, Expr):
+        return formula_text(expression(value, "picture"))
+    return value
+
+
+def _used_definitions(table: Any, definitions: Sequence[tuple[Symbol, Expr]]) -> dict[str, str]:
+    """Return the definitions on which a picture depends, in their order."""
+    names = {*re.findall(r"[A-Za-z_]\w*", json.dumps(table, default=str))}
+    used: dict[str, str] = {}
+    for name, expr in reversed(definitions):
+        if name.name in names:
+            names |= {s.name for s in expr.free_symbols if isinstance(s, Symbol)}
+            used[name.name] = formula_text(expr)
+    return dict(reversed(used.items()))
+
+
+class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    """Printer of SymPy expressions as formulas of scenes."""
+
+    def _print_Function(self, expr: Any) -> str:
+        name = type(expr).__name__
+        return f"{_SCENE_NAMES.get(name, name)}({self.stringify(expr.args, ', ')})"
+
+    _print_Max = _print_Min = _print_Abs = _print_Function
+
+    def _print_Heaviside(self, expr: Any) -> str:
+        return f"heaviside({self._print(expr.args[0])})"
+
+    def _print_Float(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Exp1(self, expr: Any) -> str:
+        return "exp(1)"
+
+    def _print_NumberSymbol(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Pi(self, expr: Any) -> str:
+        return "pi"
+
+
+def formula_text(expr: Expr) -> str:
+    """Return a SymPy expression as a formula in the syntax of scenes.
+
+    >>> x = Symbol("x")
+    >>> formula_text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))
+    'exp(1)*max(0, x) + abs(x)**2/2'
+    """
+    return str(_Formula().doprint(expr))

@@ -16,12 +16,11 @@ from sympy import Add, Expr, S, Symbol
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import loops, rational
-from eomc.model.chains import Chains, Named, Step, rotation_about
-from eomc.model.coulomb_friction import Friction
+from eomc.model.hybrid import Friction
 from eomc.model.loops import Closed
 from eomc.model.rational import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
-from eomc.model.tree import BodyFrame, Link, Tree
+from eomc.model.tree import BodyFrame, Chains, Link, Named, Step, Tree, rotation_about
 from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS

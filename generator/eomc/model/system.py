@@ -14,11 +14,8 @@ from typing import Any, Never
 from eomc.base.errors import SceneError
 from eomc.model import api_arguments, from_sympy
 from eomc.model.api_arguments import or_empty
-from eomc.model.coulomb_friction import add_stick_slip
-from eomc.model.discrete import add_discrete_coordinates
-from eomc.model.event_function import check_event_functions
+from eomc.model.hybrid import add_hybrid_dynamics
 from eomc.model.mechanics import Mechanics
-from eomc.model.saturation import saturate_inputs
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -197,8 +194,5 @@ class System(Mechanics):
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        system = add_stick_slip(
-            add_discrete_coordinates(saturate_inputs(check_event_functions(system))),
-            maker.frictions,
-        )
+        system = add_hybrid_dynamics(system, maker.frictions)
         return replace(system, again=partial(cls.make, **arguments))

@@ -16,8 +16,8 @@ import numpy as np
 
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
-from eomc.model import coulomb_friction, discrete, loops
-from eomc.model.constraint_report import ConstraintSummary, Move
+from eomc.model import hybrid, loops
+from eomc.model.mechanics import ConstraintSummary, Move
 from eomc.model.system import System
 from eomc.program import contradictions
 from eomc.program.manifold import (
@@ -80,12 +80,10 @@ def assembled(system: System) -> System:
         return system
     if system.modes or system.discrete:
         if system.modes:
-            combined = coulomb_friction.with_modes(
-                system, assembled(coulomb_friction.without_modes(system))
-            )
+            combined = hybrid.with_modes(system, assembled(hybrid.without_modes(system)))
         else:
-            combined = discrete.with_parameters_as_states(
-                system, assembled(discrete.with_constant_parameters(system))
+            combined = hybrid.with_parameters_as_states(
+                system, assembled(hybrid.with_constant_parameters(system))
             )
         assert combined.closure is not None
         closure = replace(combined.closure, computed_from=_dependencies(combined))

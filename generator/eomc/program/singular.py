@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from eomc.model import coulomb_friction, discrete
+from eomc.model import hybrid
 from eomc.model.system import System
 from eomc.program.manifold import Configuration, Flags, Manifold, TangentSpace, Vector
 from eomc.program.manifold_sampling import step_on_manifold, trace_branch
@@ -55,8 +55,8 @@ def closest_singularity(system: System) -> ClosestSingularity | None:
     None for more than one degree of freedom, and for constraints that depend on velocities or time.
     Among equally close configurations, the one that is reached first is returned.
     """
-    system = discrete.with_constant_parameters(
-        coulomb_friction.without_modes(system) if system.modes else system
+    system = hybrid.with_constant_parameters(
+        hybrid.without_modes(system) if system.modes else system
     )
     manifold, rows = Manifold(system), system.constraints
     rank = system.closure.rank if system.closure else 0

@@ -16,7 +16,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from eomc.model.numeric import compiled
+from eomc.model.algebra import compiled
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.report import sketch

@@ -12,7 +12,7 @@ from sympy import Expr, ImmutableMatrix
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
-from eomc.model.discrete import with_constant_parameters
+from eomc.model.hybrid import with_constant_parameters
 from eomc.model.symbols import symbol
 from eomc.model.system import System
 from eomc.pipeline import ScenePath

@@ -35,9 +35,9 @@ from eomc.emit.c_expression import QUAD
 from eomc.emit.c_names import Target, rename_for_c
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.render import show
-from eomc.model.discrete import with_constant_parameters
+from eomc.model.algebra import compiled
+from eomc.model.hybrid import with_constant_parameters
 from eomc.model.nonsmooth import nonsmooth_functions
-from eomc.model.numeric import compiled
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import sympy
 
-from eomc.model.numeric import compiled
+from eomc.model.algebra import compiled
 from eomc.model.symbols import needed
 from eomc.model.system import System, dot, t
 from eomc.verify.sampling import State

@@ -17,7 +17,7 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
-from eomc.model.numeric import compiled
+from eomc.model.algebra import compiled
 from eomc.model.system import System, dot, symbol, t
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison

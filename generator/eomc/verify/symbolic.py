@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 from sympy import Expr, ImmutableMatrix
 
 from eomc.base.errors import EomcError
-from eomc.model.discrete import with_constant_parameters
-from eomc.model.numeric import compiled
+from eomc.model.algebra import compiled
+from eomc.model.hybrid import with_constant_parameters
 from eomc.model.system import System, dot, t
 from eomc.verify.reference import (
     MATRICES,
