@@ -33,9 +33,9 @@ from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify import check as checking
 from eomc.verify import comparison
+from eomc.verify.checks_runs import RunDivision, run_in_c
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
-from eomc.verify.rows_runs import run_in_c
 from eomc.verify.sampling import State
 
 FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
@@ -84,7 +84,8 @@ def outcomes(module: Any, check: Any) -> Vector:
         for method in module.methods:
             h = check.system.run.h * float(np.exp(draw.uniform(-3, 2)))
             for cuts in ((3, 17), ()):
-                run = run_in_c(model, method, at, h, 30, cuts=cuts, every=1 + n % 3)
+                division = RunDivision(cuts)
+                run = run_in_c(model, method, at, h, 30, every=1 + n % 3, division=division)
                 found += [run.rows, np.array([run.status, run.steps])]
     if hasattr(module, "simulate_batch"):
         q, qd = (np.array([getattr(e.state, x) for e in states] * 9) for x in ("q", "qd"))

@@ -26,7 +26,7 @@ from eomc.program import outline
 from eomc.program.assembly import assembled
 from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
-from eomc.verify import rows_plain
+from eomc.verify import checks_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row
 
@@ -221,7 +221,7 @@ def test_flags_that_ignore_nan_are_refused(name: str, form: str, tmp_path: Path)
 def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[Row]:
     """The rows of the plain form that a check has."""
     comparison = Comparison(made(name), fast, np.random.default_rng(0), states, plain)
-    rows_plain.rows(comparison)
+    checks_plain.report(comparison)
     return comparison.rows
 
 

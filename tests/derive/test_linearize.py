@@ -13,7 +13,7 @@ from conftest import MODULES, Modules, tiers
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_signals
+from eomc.verify import checks_inputs_outputs
 from eomc.verify.comparison import Comparison
 
 
@@ -263,5 +263,5 @@ def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
-        rows_signals.report(of)
+        checks_inputs_outputs.report_closed_loop(of)
         assert [(row.name, row.passed) for row in of.rows] == [("closed loop", passed)], of.rows

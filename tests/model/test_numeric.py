@@ -15,7 +15,7 @@ from eomc.model.symbols import symbol
 from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
-from eomc.verify.rows_outputs import Formulas
+from eomc.verify.checks_inputs_outputs import Formulas
 from eomc.verify.sampling import State
 
 # of Python, NumPy, mpmath, SymPy, and of what expressions are compiled to

@@ -12,7 +12,7 @@ from conftest import Modules, tiers
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_discretize
+from eomc.verify import checks_derivatives
 from eomc.verify.comparison import Comparison
 
 WINCH = """eomc = 1
@@ -210,7 +210,7 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
-        rows_discretize.report(of)
+        checks_derivatives.report_step_derivatives(of)
         assert [row.passed for row in of.rows] == [passed], of.rows
 
 
@@ -219,5 +219,5 @@ def test_what_is_steep_in_a_velocity_passes_the_check(modules: Modules) -> None:
     """Friction smoothed over a small part of the speeds there are: of narrow differences."""
     m, made = modules.unoptimised(RUBBED), from_scene(parse(RUBBED, "test.toml"))
     of = Comparison(made, m, np.random.default_rng(0), 4)
-    rows_discretize.report(of)
+    checks_derivatives.report_step_derivatives(of)
     assert [row.passed for row in of.rows] == [True], of.rows

@@ -18,7 +18,7 @@ from eomc.integrators.tableaux import METHODS
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
-from eomc.verify import rows_discretize, symbolic
+from eomc.verify import checks_derivatives, symbolic
 from eomc.verify.comparison import Comparison
 
 HEAD = """eomc = 1
@@ -311,6 +311,6 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
-        rows_discretize.report(of)
+        checks_derivatives.report_step_derivatives(of)
         assert [row.passed for row in of.rows] == [passed] * 3, of.rows
     assert [row.name for row in of.rows] == [f"discretize by {x}" for x in m.methods]

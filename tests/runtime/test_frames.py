@@ -13,9 +13,9 @@ from conftest import Modules
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_sines
+from eomc.verify import checks_runs
+from eomc.verify.checks_inputs_outputs import Formulas
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_outputs import Formulas
 from eomc.verify.sampling import State
 
 SPACE = """eomc = 1
@@ -268,10 +268,10 @@ def test_a_rounding_of_a_sum_is_no_wrong_sine(modules: Modules, monkeypatch) -> 
     """
     made = from_scene(parse(SPACE, "crane3.toml"))
     of = Comparison(made, modules.of_text(SPACE), np.random.default_rng(0), None)
-    assert rows_sines.vanishing(of) <= rows_sines.LIMIT
-    monkeypatch.setattr(rows_sines, "MOVES", ())
-    monkeypatch.setattr(rows_sines, "NEIGHBOURS", range(-2, 3))
-    assert rows_sines.vanishing(of) > rows_sines.LIMIT
+    assert checks_runs.largest_error_near_zeros(of) <= checks_runs.VANISHING_LIMIT
+    monkeypatch.setattr(checks_runs, "MOVES", ())
+    monkeypatch.setattr(checks_runs, "NEIGHBOURS", range(-2, 3))
+    assert checks_runs.largest_error_near_zeros(of) > checks_runs.VANISHING_LIMIT
 
 
 def test_wrenches_without_frames_are_refused(modules: Modules) -> None:

@@ -18,7 +18,7 @@ from eomc.cli.main import main
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
-from eomc.verify import rows_limits
+from eomc.verify import checks_inputs_outputs
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -213,7 +213,7 @@ class Wrong:
 def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: bool) -> None:
     module: Any = Wrong(limited) if wrong else limited
     of = Comparison(from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4)
-    rows_limits.report(of)
+    checks_inputs_outputs.report_limits(of)
     (row,) = of.rows
     assert row.name == "limits of inputs" and row.passed is not wrong, row
 

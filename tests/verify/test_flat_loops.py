@@ -15,9 +15,9 @@ from eomc.model.system import System
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify.check import check
+from eomc.verify.checks_constraints import MAX_RESIDUAL, ConstraintChecks
+from eomc.verify.checks_runs import SHORT_LIMIT, RunChecks
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_constraints import MAX_RESIDUAL, FormRows
-from eomc.verify.rows_runs import SHORT_LIMIT, Runs
 
 CRANK = """
 [[body]]
@@ -102,7 +102,7 @@ def test_roundings_that_grow_where_rows_fade_are_no_errors(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:
     made = comparison(modules, *of, seed=seed)
-    runs, rows = Runs(made), FormRows(made, made.module)
+    runs, rows = RunChecks(made), ConstraintChecks(made, made.module)
     for found, limit in (
         (runs.short(), SHORT_LIMIT), (runs.long(), runs.limit),
         (rows.residual_along_run("rk4"), MAX_RESIDUAL),

@@ -20,12 +20,12 @@ from scene_author_wide import wide_text
 from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
-from eomc.verify import rows_derivatives
+from eomc.verify import checks_derivatives
 from eomc.verify.check import check
+from eomc.verify.checks_derivatives import largest_error, module_derivatives
+from eomc.verify.checks_runs import FINE, RunChecks
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Measurement, Report
-from eomc.verify.rows_derivatives import module_derivatives, slopes
-from eomc.verify.rows_runs import FINE, Runs
 from eomc.verify.sampling import State
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.
@@ -270,7 +270,7 @@ def test_short_steps_end_where_rounding_of_constraints_lets_them(modules: Module
         assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
         np.random.default_rng(1034), None,
     )  # fmt: skip
-    found = Runs(comparison).short()
+    found = RunChecks(comparison).short()
     assert isinstance(found, float) and found < 5
 
 
@@ -283,7 +283,7 @@ def test_stages_by_sweeps_end_at_rounding_of_far_angles(modules: Modules) -> Non
         assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
         np.random.default_rng(25099), None,
     )  # fmt: skip
-    runs = Runs(comparison)
+    runs = RunChecks(comparison)
     runs.sines()  # which draws before it
     assert 0 < runs.far() < 100
 
@@ -340,15 +340,15 @@ def test_derivatives_are_compared_where_small_terms_count(
     near = max(abs(float(e.state.q[0])) for e in comparison.expected)
     (far,) = comparison.sampler.far_states()
     assert abs(float(far.state.q[0])) > 2 * near
-    assert slopes(comparison, "linearize") < 1e-8
+    assert largest_error(comparison, "linearize") < 1e-8
 
     def wrong(check: Comparison, name: str, s: State) -> Any:
         found = module_derivatives(check, name, s)
         assert found is not None
         return found + 1e-3 * (s.q[0] / 0.3) ** 6
 
-    monkeypatch.setattr(rows_derivatives, "module_derivatives", wrong)
-    assert slopes(comparison, "linearize") > 1e-7
+    monkeypatch.setattr(checks_derivatives, "module_derivatives", wrong)
+    assert largest_error(comparison, "linearize") > 1e-7
 
 
 WOUND_ARM = """eomc = 1
@@ -390,7 +390,7 @@ def test_an_angle_that_is_wound_up_may_throw_another_coordinate(
 def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, potential: str
 ) -> None:
-    monkeypatch.setattr(Runs, "rounded", lambda *_: 99.0)
+    monkeypatch.setattr(RunChecks, "rounded", lambda *_: 99.0)
     text = WELL.replace("-depth*exp(-x**2)", potential).replace(', "gauss8", "gauss16"', "")
     (row,) = (r for r in checked(text, modules).rows if r.name == "rk4 rounding")
     bends = "max" in potential
@@ -404,11 +404,11 @@ def test_what_shorter_steps_make_less_is_no_rounding(
 ) -> None:
     """As of friction that turns within a thousandth of a step."""
     found = dict(zip(FINE, (99.0, finer), strict=True))
-    monkeypatch.setattr(Runs, "rounded", lambda *given: found[given[-1]])
+    monkeypatch.setattr(RunChecks, "rounded", lambda *given: found[given[-1]])
     text = WELL.replace(', "gauss8", "gauss16"', "")
     made = from_scene(parse(text, "test.toml"))
     module = modules.unoptimised(text)
-    runs = Runs(Comparison(made, module, np.random.default_rng(0), 4))
+    runs = RunChecks(Comparison(made, module, np.random.default_rng(0), 4))
     steep = Measurement(finer, "forces are so steep that shorter steps differ less")
     assert runs.fine("rk4") == (finer if finer > 50 else steep)
 

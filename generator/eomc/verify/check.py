@@ -15,29 +15,22 @@ import numpy as np
 
 from eomc.model.system import System
 from eomc.verify import (
-    rows_adaptive,
-    rows_adaptive_batch,
-    rows_adaptive_refusals,
-    rows_constraints,
-    rows_derivatives,
-    rows_discretize,
-    rows_events,
-    rows_frames,
-    rows_limits,
-    rows_newton,
-    rows_outputs,
-    rows_plain,
-    rows_projection,
-    rows_signals,
-    rows_sines,
-    rows_stepped,
+    checks_adaptive,
+    checks_bodies,
+    checks_constraints,
+    checks_derivatives,
+    checks_events,
+    checks_inputs_outputs,
+    checks_newton,
+    checks_plain,
+    checks_runs,
 )
+from eomc.verify.checks_batch import BatchChecks
+from eomc.verify.checks_bodies import BodyChecks
+from eomc.verify.checks_refusals import RefusalChecks
+from eomc.verify.checks_runs import RunChecks
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
-from eomc.verify.rows_batch import Batches
-from eomc.verify.rows_bodies import Bodies
-from eomc.verify.rows_refusals import Refusals
-from eomc.verify.rows_runs import Runs
 from eomc.verify.sampling import VALUES
 
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
@@ -91,27 +84,27 @@ def _report(comparison: Comparison, module: Any) -> Report:
         value_rows(comparison)
         property_rows(comparison)
         if system.constraints:
-            rows_constraints.report(comparison)
+            checks_constraints.report(comparison)
         if compiled:  # what is compiled has several ways to one answer
             compiled_rows(comparison)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
-            Bodies(comparison, scene).report()
+            BodyChecks(comparison, scene).report()
             if compiled:
-                rows_frames.report(comparison, scene)
+                checks_bodies.report_frames(comparison, scene)
         if compiled and system.run.inverse_dynamics:
-            rows_frames.inverse_dynamics(comparison)
+            checks_bodies.report_inverse_dynamics(comparison)
         if system.outputs and hasattr(module, "output"):
-            rows_outputs.report(comparison)
+            checks_inputs_outputs.report_outputs(comparison)
         if compiled and system.events:
-            rows_events.report(comparison)
-            rows_stepped.report(comparison)
+            checks_events.report_functions(comparison)
+            checks_events.report_fixed_steps(comparison)
         if hasattr(module, "applied"):
-            rows_limits.report(comparison)
-            rows_signals.report(comparison)
-            rows_discretize.report(comparison)
-            rows_adaptive.report(comparison)
-        rows_plain.rows(comparison)
+            checks_inputs_outputs.report_limits(comparison)
+            checks_inputs_outputs.report_closed_loop(comparison)
+            checks_derivatives.report_step_derivatives(comparison)
+            checks_adaptive.report_runs(comparison)
+        checks_plain.report(comparison)
     else:
         comparison.row("states", 1, "states with a regular D", lambda: 0.0, minimum=True)
     kind = "Taylor arithmetic" if comparison.large else "equations written out"
@@ -147,7 +140,7 @@ def property_rows(comparison: Comparison) -> None:
     row("bias = C qd + g", LIMIT, rounding, comparison.bias)
     force = "tau + A^T lambda" if comparison.system.constraints else "tau"
     row(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion)
-    rows_derivatives.report(comparison)
+    checks_derivatives.report_acceleration_derivatives(comparison)
     if comparison.dtype == np.float64:  # single precision leaves its differences too few digits
         row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", comparison.skewness)
         comparison.convergence_rows()
@@ -158,14 +151,14 @@ def compiled_rows(comparison: Comparison) -> None:
 
     They need a module compiled from C. Batches are checked if the module has functions for them.
     """
-    runs, refusals = Runs(comparison), Refusals(comparison)
+    runs, refusals = RunChecks(comparison), RefusalChecks(comparison)
     runs.report()
-    rows_sines.report(comparison)
-    rows_newton.report(comparison)
+    checks_runs.report_vanishing_sines(comparison)
+    checks_newton.report(comparison)
     refusals.report()
-    rows_adaptive_refusals.report(comparison, refusals)
+    checks_adaptive.report_refusals(comparison, refusals)
     if comparison.system.constraints:
-        rows_projection.of_inertia(comparison, refusals)
+        checks_constraints.report_massless(comparison, refusals)
     if hasattr(comparison.module, "simulate_batch"):
-        Batches(runs, refusals.singular).report()
-        rows_adaptive_batch.report(comparison, refusals.singular)
+        BatchChecks(runs, refusals.singular).report()
+        checks_adaptive.report_batches(comparison, refusals.singular)

@@ -10,7 +10,7 @@ import pytest
 from cases import scene_system
 from stand_in import StandIn
 
-from eomc.verify import rows_derivatives, symbolic
+from eomc.verify import checks_derivatives, symbolic
 from eomc.verify.comparison import Comparison
 from eomc.verify.sampling import State
 
@@ -25,11 +25,11 @@ def test_what_accelerations_lose_is_allowed_to_derivatives(
     module.dtype = "float32"
     made = Comparison(system, module, np.random.default_rng(0), 4)
     e = next(e for e in made.expected if np.all(e.value["acceleration"]))
-    monkeypatch.setattr(rows_derivatives, "module_derivatives", lambda *_: np.ones((1, 2)))
+    monkeypatch.setattr(checks_derivatives, "module_derivatives", lambda *_: np.ones((1, 2)))
     monkeypatch.setattr(
         module, "acceleration", lambda *_, **__: e.value["acceleration"] * (1 + lost * made.eps)
     )
-    found = rows_derivatives._growth(made, "linearize", e, np.ones((1, 2)))
+    found = checks_derivatives._rounding_growth(made, "linearize", e, np.ones((1, 2)))
     assert found == pytest.approx(lost, rel=1e-6, abs=1e-6)
 
 
@@ -43,6 +43,6 @@ def test_what_a_rounding_of_the_state_moves_is_allowed(monkeypatch: pytest.Monke
     def powers(_: Comparison, __: str, s: State) -> Any:
         return np.array([[s.q[0] ** 3 * s.qd[0] ** 2]])
 
-    monkeypatch.setattr(rows_derivatives, "module_derivatives", powers)
-    found = rows_derivatives._growth(made, "linearize", e, powers(made, "", e.state))
+    monkeypatch.setattr(checks_derivatives, "module_derivatives", powers)
+    found = checks_derivatives._rounding_growth(made, "linearize", e, powers(made, "", e.state))
     assert found == pytest.approx(5, rel=1e-3)

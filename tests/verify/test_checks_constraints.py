@@ -15,12 +15,12 @@ from conftest import Modules
 from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
-from eomc.verify import rows_constraints
+from eomc.verify import checks_constraints
 from eomc.verify.check import check
+from eomc.verify.checks_constraints import MAX_RESIDUAL, WORK_TOLERANCE, ConstraintChecks
+from eomc.verify.checks_refusals import OK, RefusalChecks
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT
-from eomc.verify.rows_constraints import MAX_RESIDUAL, WORK, FormRows
-from eomc.verify.rows_refusals import OK, Refusals
 from eomc.verify.sampling import SMALL, Sampler
 from eomc.verify.symbolic import reference_for
 
@@ -81,7 +81,7 @@ def test_what_is_right_passes(bob: ModuleType) -> None:
 
 
 def test_a_tangent_that_leaves_the_rows_fails(bob: ModuleType) -> None:
-    assert failed(Bent(bob), rows_constraints.report) == {"tangent"}
+    assert failed(Bent(bob), checks_constraints.report) == {"tangent"}
 
 
 class Answering:
@@ -110,13 +110,15 @@ def hinged() -> Comparison:
 
 
 @pytest.mark.parametrize(
-    ("sign", "least", "most"), [(1, 0, WORK), (-1, 0.1, 2), (np.nan, 1, np.inf)]
+    ("sign", "least", "most"), [(1, 0, WORK_TOLERANCE), (-1, 0.1, 2), (np.nan, 1, np.inf)]
 )
 def test_reactions_are_compared_where_a_coordinate_hardly_moves(
     hinged: Comparison, sign: float, least: float, most: float
 ) -> None:
     """What is no number passed."""
-    made = FormRows(hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]}))
+    made = ConstraintChecks(
+        hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]})
+    )
     assert least <= made.reactions() <= most
 
 
@@ -143,29 +145,29 @@ def test_rows_do_the_work_of_their_parts_without_rates(bent: dict[str, Any]) -> 
     """A belt's with no t in it, of which it was expected that it does none."""
     system = assembled(from_scene(parse(BELT)))
     of = Comparison(system, None, np.random.default_rng(0), 4)
-    power = FormRows(of, Answering(of, **bent)).power()
+    power = ConstraintChecks(of, Answering(of, **bent)).power()
     assert (power > LIMIT) == bool(bent)
 
 
 def test_accelerations_of_negative_masses_fail(
     bob: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Refusals, "accelerate", lambda *_: (OK, True))
-    assert failed(bob, lambda made: Refusals(made).report()) == {"negative D along the rows"}
+    monkeypatch.setattr(RefusalChecks, "accelerate", lambda *_: (OK, True))
+    assert failed(bob, lambda made: RefusalChecks(made).report()) == {"negative D along the rows"}
 
 
 @pytest.mark.slow
 def test_multipliers_of_negative_masses_fail(
     bob: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    call = Refusals.call
+    call = RefusalChecks.call
 
-    def found(self: Refusals, name: str, s: Any) -> Any:
+    def found(self: RefusalChecks, name: str, s: Any) -> Any:
         return None if name == "multipliers" else call(self, name, s)
 
-    monkeypatch.setattr(Refusals, "call", found)
+    monkeypatch.setattr(RefusalChecks, "call", found)
     told = {"negative D along the rows: refusals"}
-    assert failed(bob, lambda made: Refusals(made).report()) == told
+    assert failed(bob, lambda made: RefusalChecks(made).report()) == told
 
 
 def test_states_with_a_negative_d_are_left_out() -> None:
@@ -183,6 +185,6 @@ def test_runs_whose_step_is_too_long_are_no_fault_of_the_rows(modules: Modules) 
     """Angles of 1e37, whose sines are anything, were taken for rows that are not held."""
     system = assembled(from_scene(parse((SCENES / "four_bar.toml").read_text("utf-8") + STIFF)))
     module, random = modules.unoptimised(system), np.random.default_rng(0)
-    made = FormRows(Comparison(system, module, random, 4), module)
+    made = ConstraintChecks(Comparison(system, module, random, 4), module)
     found = made.residual_along_run("rk4")
     assert isinstance(found, float) and 0 < found < MAX_RESIDUAL

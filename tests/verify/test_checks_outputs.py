@@ -12,7 +12,7 @@ from conftest import Modules
 from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
-from eomc.verify import rows_outputs
+from eomc.verify import checks_inputs_outputs
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -67,7 +67,7 @@ class Wrong:
 def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
     made, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
-    rows_outputs.report(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
     assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
@@ -111,7 +111,7 @@ def test_wrong_ones_of_multipliers_fail(
         modules.unoptimised(ON_A_ROD),
     )
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
-    rows_outputs.report(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
 
@@ -124,7 +124,7 @@ def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
     text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
     made, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
-    rows_outputs.report(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
     assert [row.passed for row in comparison.rows] == [True, True], comparison.rows
 
 
@@ -149,7 +149,7 @@ load = "k*x + x_ddot"
 def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules) -> None:
     made, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
-    rows_outputs.report(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
     assert {row.name: row.passed for row in comparison.rows} == {"outputs": True}
 
 
@@ -159,6 +159,6 @@ def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str,
     text += '[run]\nlinearize = "parameters"\n'
     made, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
-    rows_outputs.report(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
     found = {row.name: row.passed for row in comparison.rows}
     assert found == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}

@@ -13,7 +13,7 @@ from runtime.test_frames import SPACE
 from eomc.model.from_scene import from_scene
 from eomc.runtime.frames import Momentum, Pose
 from eomc.scene.read import parse
-from eomc.verify import rows_frames
+from eomc.verify import checks_bodies
 from eomc.verify.comparison import Comparison
 
 ROWS = {
@@ -59,8 +59,8 @@ def failed(of: Comparison, module: Any) -> set[str]:
     """The rows that do not pass of a module in the comparison's place."""
     right, of.rows, of.module = of.module, [], module
     try:
-        rows_frames.report(of, of.system.scene)
-        rows_frames.inverse_dynamics(of)
+        checks_bodies.report_frames(of, of.system.scene)
+        checks_bodies.report_inverse_dynamics(of)
     finally:
         of.module = right
     return {row.name for row in of.rows if not row.passed}
@@ -102,7 +102,7 @@ def test_joints_that_move_together(modules: Modules) -> None:
     module = modules.unoptimised(text.replace("crane3", "crane4"))
     made = from_scene(parse(text.replace("crane3", "crane4"), "test.toml"))
     comparison = Comparison(made, module, np.random.default_rng(0), 6)
-    rows_frames.report(comparison, made.scene)
-    rows_frames.inverse_dynamics(comparison)
+    checks_bodies.report_frames(comparison, made.scene)
+    checks_bodies.report_inverse_dynamics(comparison)
     assert len(comparison.rows) == len(ROWS)
     assert all(row.passed for row in comparison.rows), comparison.rows

@@ -14,9 +14,9 @@ from cases import scene_system
 from conftest import Modules
 
 import eomc
+from eomc.verify.checks_runs import VANISHING_LIMIT, largest_error_near_zeros
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Measurement
-from eomc.verify.rows_sines import LIMIT, vanishing
 
 
 class Bent:
@@ -53,9 +53,15 @@ def test_an_entry_that_is_one_cosine_is_judged_by_itself(
 ) -> None:
     """Noise of a sum that cancels is none of the sine's."""
     module = Bent(modules("cartpole"), bend)
-    found = vanishing(Comparison(scene_system("cartpole"), module, np.random.default_rng(0), 4))
+    found = largest_error_near_zeros(
+        Comparison(scene_system("cartpole"), module, np.random.default_rng(0), 4)
+    )
     assert isinstance(found, float)
-    assert found > 1e6 * LIMIT if wrong and bend is shifted else (found > LIMIT) == wrong
+    assert (
+        found > 1e6 * VANISHING_LIMIT
+        if wrong and bend is shifted
+        else (found > VANISHING_LIMIT) == wrong
+    )
 
 
 @pytest.mark.parametrize(
@@ -75,8 +81,8 @@ def test_what_is_left_of_a_sum_that_cancels_is_no_cosine(
         return found
 
     check.reference = SimpleNamespace(evaluate=evaluate)  # type: ignore[assignment]
-    found = vanishing(check)
-    assert isinstance(found, float) and (found > LIMIT) == judged
+    found = largest_error_near_zeros(check)
+    assert isinstance(found, float) and (found > VANISHING_LIMIT) == judged
 
 
 FIVE_BAR = (
@@ -129,12 +135,15 @@ def test_differences_of_angles_are_no_sines(tmp_path: Path) -> None:
     (tmp_path / "five_bar.toml").write_text(FIVE_BAR, encoding="utf-8")
     made = eomc.read(tmp_path / "five_bar.toml")
     module = eomc.load(made, tmp_path / "build")
-    found = [vanishing(Comparison(made, module, np.random.default_rng(k), 4)) for k in range(12)]
-    assert all(isinstance(x, float) and x <= LIMIT for x in found), found
+    found = [
+        largest_error_near_zeros(Comparison(made, module, np.random.default_rng(k), 4))
+        for k in range(12)
+    ]
+    assert all(isinstance(x, float) and x <= VANISHING_LIMIT for x in found), found
 
 
 @pytest.mark.slow
 def test_where_no_entry_is_a_sine_alone_nothing_is_judged(modules: Modules) -> None:
     made = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
-    found = vanishing(made)
+    found = largest_error_near_zeros(made)
     assert isinstance(found, Measurement) and found.why

@@ -22,9 +22,9 @@ from eomc.model import multibody as building
 from eomc.model.from_scene import from_scene
 from eomc.scene.joints import JOINTS
 from eomc.scene.read import parse, read
-from eomc.verify import rows_bodies
+from eomc.verify import checks_bodies
+from eomc.verify.checks_bodies import BodyChecks
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_bodies import Bodies
 from eomc.verify.sampling import State
 from eomc.verify.taylor import TaylorReference
 
@@ -38,7 +38,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
     module = StandIn(TaylorReference(made))  # type: ignore[arg-type]  # which answers alike
     check = Comparison(made, module, np.random.default_rng(0), states)
     assert check.expected
-    return {name: Bodies(check, made.scene).compare(name) for name in NAMES}
+    return {name: BodyChecks(check, made.scene).compare(name) for name in NAMES}
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
 def test_every_tree_has_the_energies_of_its_point_masses(plane: bool, data: Any) -> None:
     shape = data.draw(st.sampled_from([s for s in SHAPES if len(s) < 3]))
     off = compared(data.draw(trees(shape, plane)))
-    assert max(off.values()) < rows_bodies.LIMIT, off
+    assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
 KINDS = """
@@ -104,7 +104,7 @@ damping = 2
 
 
 def test_every_kind_of_joint_is_known_here_too() -> None:
-    assert rows_bodies._MOTIONS.keys() == JOINTS.keys()
+    assert checks_bodies._MOTIONS.keys() == JOINTS.keys()
 
 
 def kinds(kind: str, coordinates: str) -> str:
@@ -126,7 +126,7 @@ def single() -> str:
 )
 def test_joints_of_three_angles_and_bodies_placed_by_formulas(kind: str, coordinates: str) -> None:
     off = compared(kinds(kind, coordinates), 3)
-    assert max(off.values()) < rows_bodies.LIMIT, off
+    assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
 def wrong_rotation(axis: int, angle: Any) -> Any:
@@ -177,12 +177,12 @@ def test_a_fault_in_what_is_made_of_bodies_is_noticed(
 ) -> None:
     patch, name = WRONG[what]
     patch(monkeypatch)
-    assert compared(single())[name] > 1e3 * rows_bodies.LIMIT
+    assert compared(single())[name] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
 def test_a_damper_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building.Builder, "_damper", lambda *line: None)
-    assert compared(single())["power"] > 1e3 * rows_bodies.LIMIT
+    assert compared(single())["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
 LIMITED = """
@@ -223,19 +223,19 @@ b = "push"
 
 def test_of_inputs_beyond_their_limits_the_limits_act() -> None:
     off = compared(LIMITED, 12)
-    assert max(off.values()) < rows_bodies.LIMIT, off
+    assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
 def test_limits_left_out_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hybrid, "saturate_inputs", lambda system: system)
-    assert compared(LIMITED, 12)["power"] > 1e3 * rows_bodies.LIMIT
+    assert compared(LIMITED, 12)["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
 def test_terms_linear_in_the_velocities_are_no_energy() -> None:
     potential = '[energy]\npotential = "a*b + 0.3*arm_x*dot(arm_y) + way"\n'
     text = LIMITED.replace("[forces]", f'way = "0.2*a_dot*sin(b)"\n{potential}[forces]')
     off = compared(text, 4)
-    assert max(off.values()) < rows_bodies.LIMIT, off
+    assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
 def test_quaternions_are_scipys() -> None:
@@ -243,16 +243,16 @@ def test_quaternions_are_scipys() -> None:
     a, b, x = random.normal(size=(5, 4)), random.normal(size=(5, 4)), random.normal(size=(5, 3))
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
     one, other = (Rotation.from_quat(np.roll(q, -1, axis=1)) for q in (a, b))
-    np.testing.assert_allclose(rows_bodies.rotate(a, x), one.apply(x), atol=1e-14)
-    product = rows_bodies.quaternion_product(a, b)
-    np.testing.assert_allclose(rows_bodies.rotate(product, x), (one * other).apply(x), atol=1e-14)
+    np.testing.assert_allclose(checks_bodies.rotate(a, x), one.apply(x), atol=1e-14)
+    product = checks_bodies.quaternion_product(a, b)
+    np.testing.assert_allclose(checks_bodies.rotate(product, x), (one * other).apply(x), atol=1e-14)
 
 
 def test_point_masses_have_the_inertia_of_the_body() -> None:
     made = from_scene(read(SCENES / "tumbling_box.toml"))
     assert made.scene is not None and made.scene.assembly is not None
     start = State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
-    line = rows_bodies.Line(made.scene, start, 0.1)
+    line = checks_bodies.MotionLine(made.scene, start, 0.1)
     (body,) = [b for b in made.scene.assembly.bodies if b.joint]
     masses, points = zip(*line.points(body), strict=True)
     m, x = np.array(masses), np.array(points)

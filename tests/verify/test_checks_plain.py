@@ -16,7 +16,7 @@ import eomc
 from eomc import pipeline
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_plain
+from eomc.verify import checks_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import State
@@ -62,7 +62,9 @@ def compared(modules: Modules, h: str, rows: int, off: float = 0.0, text: str = 
     text = text.replace("H", h)
     module = modules.unoptimised(text)
     made = Comparison(from_scene(parse(text, "q.toml")), module, np.random.default_rng(0), 4)
-    return rows_plain._run_off(made, Plain(module, rows, off), "gauss8", made.expected[0], float(h))
+    return checks_plain._run_off(
+        made, Plain(module, rows, off), "gauss8", made.expected[0], float(h)
+    )
 
 
 def test_a_form_that_ends_where_the_step_can_be_made_fails(modules: Modules) -> None:
@@ -96,7 +98,7 @@ def test_steps_under_inputs_can_go_on_too() -> None:
     of.accelerations = partial(Comparison.accelerations, of)
     x, s = np.array([[0.3, -0.2], [0.1, 0.4]]), State(*np.zeros((2, 2)), u=np.array([0.5]))
     for method in ("rk4", "gauss8", "gauss16"):
-        assert rows_plain._next_step_converges(of, method, s, x, 0.01, 3)
+        assert checks_plain._next_step_converges(of, method, s, x, 0.01, 3)
 
 
 FRICTION = """eomc = 1
@@ -121,12 +123,12 @@ def test_few_sweeps_are_compared_in_steps_so_short_that_they_do(modules: Modules
     system = from_scene(parse(FRICTION, "f.toml"))
     plain = eomc.load(system, Path("build/tests/plain_sweeps"), form="plain")
     made = Comparison(system, module, np.random.default_rng(0), 4)
-    long = rows_plain._run_off(made, plain, "gauss16", made.expected[0], 0.02 / 16)
+    long = checks_plain._run_off(made, plain, "gauss16", made.expected[0], 0.02 / 16)
     assert long is not None and long > LIMIT
-    least = rows_plain._least_off(made, plain, "gauss16", made.expected[0])
+    least = checks_plain._least_off(made, plain, "gauss16", made.expected[0])
     assert least is not None and least < LIMIT
     wrong = Plain(plain, 25, 1e-9)
-    off = rows_plain._least_off(made, wrong, "gauss16", made.expected[0])
+    off = checks_plain._least_off(made, wrong, "gauss16", made.expected[0])
     assert off is not None and off > LIMIT
 
 
@@ -155,6 +157,6 @@ def test_derivatives_that_cancel_to_nothing_are_compared_in_units_of_their_terms
     plain = eomc.load(system, Path("build/tests/plain_disk"), form="plain")
     fast = eomc.load(system, Path("build/tests/fast_disk"), form="fast")
     made = Comparison(pipeline._assembled(system), fast, np.random.default_rng(0), 8)
-    assert rows_plain._linearization(made, plain) < LIMIT
+    assert checks_plain._linearization(made, plain) < LIMIT
     for off in (1e-8, 1e-11):
-        assert rows_plain._linearization(made, Linear(plain, off)) > LIMIT
+        assert checks_plain._linearization(made, Linear(plain, off)) > LIMIT

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.checks_refusals import SINGULAR
+from eomc.verify.checks_runs import EVERY, LONG, TURNS, RunChecks, RunResult, run_in_c
 from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
-from eomc.verify.rows_refusals import SINGULAR
-from eomc.verify.rows_runs import EVERY, LONG, TURNS, RunResult, Runs, run_in_c
 from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
@@ -30,13 +30,13 @@ ROUNDED = 10.0  # times what roundings of the start make of a row that has no di
 DRAWS = 2  # of starts that are a rounding off
 
 
-class Batches:
+class BatchChecks:
     """Checks of batches: COUNT instances of a system, run side by side by fixed steps.
 
     runs: the checks of single runs. singular: states at which the mass matrix D is singular.
     """
 
-    def __init__(self, runs: Runs, singular: list[State]) -> None:
+    def __init__(self, runs: RunChecks, singular: list[State]) -> None:
         self.check, self.model, self.h = runs.check, runs.model, runs.h
         self.module, self.runs = self.check.module, runs
         self.random = np.random.default_rng(9)

@@ -16,10 +16,10 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import kkt
+from eomc.verify.checks_runs import parameters, run_in_c
 from eomc.verify.comparison import Comparison
 from eomc.verify.kkt import EIGENVALUE_TOLERANCE
 from eomc.verify.reference import Vector
-from eomc.verify.rows_runs import parameters, run_in_c
 from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
@@ -56,7 +56,7 @@ def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
                 yield field, i, what, replace(s, **{field: x})
 
 
-class Refusals:
+class RefusalChecks:
     """Checks that the module refuses states and steps, by returning an error, when it must.
 
     singular, regular: states with a singular and with a regular mass matrix D. The checks of D

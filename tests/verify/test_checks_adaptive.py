@@ -15,12 +15,11 @@ from conftest import Modules
 
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_adaptive
+from eomc.verify import checks_adaptive
+from eomc.verify.checks_adaptive import BATCH_LIMIT, AdaptiveBatchChecks, AdaptiveRefusalChecks
+from eomc.verify.checks_refusals import RefusalChecks
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Measurement
-from eomc.verify.rows_adaptive_batch import LIMIT, BatchRows
-from eomc.verify.rows_adaptive_refusals import _Adaptive
-from eomc.verify.rows_refusals import Refusals
 
 # the more it has jumped the sooner it jumps again: without end before 0.17 s
 ENDLESS = """eomc = 1
@@ -85,7 +84,7 @@ def bounded() -> Iterator[None]:
 @pytest.mark.usefixtures("bounded")
 def test_events_without_end_are_left_after_what_is_compared(of: Comparison) -> None:
     """Of a run of 5 s, which would take memory as long as it went on."""
-    rows_adaptive.report(of)
+    checks_adaptive.report_runs(of)
     assert [row.passed for row in of.rows] == [True] * 3, of.rows
 
 
@@ -101,7 +100,7 @@ def test_a_row_of_stiff_steps_takes_them(of: Comparison) -> None:
             stiff.append(run.stiff_steps == run.steps)
             return run
 
-    rows_adaptive._error(of, Told(), 1e-6, True, of.expected[0].state)
+    checks_adaptive._run_error(of, Told(), 1e-6, True, of.expected[0].state)
     assert stiff.count(True) >= 3 and stiff.count(False) == 1
 
 
@@ -111,7 +110,7 @@ def test_inputs_that_are_held_are_those_of_all_stages(modules: Modules) -> None:
     driven = Comparison(made, modules("cartpole_driven"), np.random.default_rng(1), 4)
     s = replace(driven.expected[0].state, u=np.array([0.5]))
     x, times = np.array([*s.q, *s.qd]), np.array([2.5])
-    rows, _ = rows_adaptive._reference(driven, s, x, times, times)
+    rows, _ = checks_adaptive._reference_states(driven, s, x, times, times)
     assert np.isfinite(rows).all()
 
 
@@ -127,25 +126,25 @@ def stiff(modules: Modules) -> Comparison:
 def test_steps_are_judged_where_time_tells_them(
     stiff: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, drive = _Adaptive(stiff, Refusals(stiff)), _Adaptive.drive
+    made, drive = AdaptiveRefusalChecks(stiff, RefusalChecks(stiff)), AdaptiveRefusalChecks.drive
     assert made.longest() == 0
     start, late = (e.state for e in stiff.expected)
     assert made.step_limit_errors(start) == 0 and made.step_limit_errors(late) is None
 
-    def unheard(self: _Adaptive, *of: Any, h_most: float = 0.0, **how: Any) -> Any:
+    def unheard(self: AdaptiveRefusalChecks, *of: Any, h_most: float = 0.0, **how: Any) -> Any:
         return drive(self, *of, **how)
 
-    monkeypatch.setattr(_Adaptive, "drive", unheard)
+    monkeypatch.setattr(AdaptiveRefusalChecks, "drive", unheard)
     assert made.longest() == 1
     monkeypatch.setattr(stiff, "expected", stiff.expected[1:])
     assert isinstance(made.longest(), Measurement)  # nothing is judged, and it says so
 
 
 def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> None:
-    many = BatchRows(stiff, [])
+    many = AdaptiveBatchChecks(stiff, [])
     assert many.state is stiff.expected[0].state
     right = many.compare_with_single_runs()
-    assert isinstance(right, float) and right < LIMIT
+    assert isinstance(right, float) and right < BATCH_LIMIT
 
     class Off:
         simulate = staticmethod(stiff.module.simulate)
@@ -156,4 +155,4 @@ def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> No
 
     many.module = Off()
     wrong = many.compare_with_single_runs()
-    assert isinstance(wrong, float) and wrong > LIMIT
+    assert isinstance(wrong, float) and wrong > BATCH_LIMIT

@@ -12,7 +12,7 @@ from instrument import Shipped, in_a_fork
 from mutants import variant
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify import one_step, rows_newton, symbolic
+from eomc.verify import checks_newton, one_step, symbolic
 from eomc.verify.comparison import Comparison
 
 MADE = variant("pendulum_dp8_gauss8")
@@ -45,7 +45,7 @@ def sweeps(shipped: Shipped, source: str) -> float:
 
     def measure() -> float:
         made = Comparison(MADE, shipped.load(), np.random.default_rng(0), 4)
-        found = rows_newton.Newton(made).extra_sweeps("gauss8")
+        found = checks_newton.NewtonChecks(made).extra_sweeps("gauss8")
         assert isinstance(found, float)
         return found if math.isfinite(found) else 1e9
 
@@ -63,7 +63,7 @@ def test_right_ones_need_few_sweeps(shipped: Shipped) -> None:
 def test_wrong_ones_do_not(shipped: Shipped, what: str) -> None:
     right, wrong = WRONG[what]
     assert shipped.source.count(right) == 1
-    assert sweeps(shipped, shipped.source.replace(right, wrong)) > rows_newton.MAX_EXTRA_SWEEPS
+    assert sweeps(shipped, shipped.source.replace(right, wrong)) > checks_newton.MAX_EXTRA_SWEEPS
 
 
 def test_newtons_method_takes_the_step_that_sweeps_take() -> None:

@@ -38,7 +38,7 @@ MAX_NEWTON_SWEEPS = (
 COMPARED_VALUES = (*VALUES, "acceleration")
 
 
-def rows(check: Comparison) -> None:
+def report(check: Comparison) -> None:
     """Append checks of the portable C code (as opposed to the optimised one) to the report.
 
     There are none if there is no module of that form.

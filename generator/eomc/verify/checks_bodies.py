@@ -1,16 +1,16 @@
-"""Checks of bodies: energies and forces recomputed from the scene's own tables.
+"""Checks of bodies and frames, recomputed from the scene's own tables of bodies.
 
-The reference starts from K and P, which multibody.py makes of a scene. Here every body becomes
-point masses that have its mass, its centre and its inertia, frames are composed joint by joint with
-quaternions, and numbers are taken along a straight line through the state, q + s qd at the time
-t + s, so that rates are derivatives of interpolating polynomials. No SymPy, nothing of
-multibody.py.
+The reference starts from K and P, which multibody.py makes of a scene. Here each body becomes point
+masses that have its mass, its centre of mass and its inertia, and frames are composed joint by
+joint with quaternions. Energies, forces, poses and momenta are evaluated along a short motion
+through the state, with constant accelerations. Time derivatives are those of interpolating
+polynomials. This uses neither SymPy nor multibody.py.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -24,14 +24,15 @@ from eomc.scene.formulas import Formula
 from eomc.scene.scene import Scene
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import STENCIL, Vector
+from eomc.verify.report import LIMIT
 from eomc.verify.sampling import Expected, State
 
-LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
+RELATIVE_LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
 UNITS = 1e3  # of rounding, which are more in single precision
-STATES = 8  # at most
-NODES = 16  # of the interpolating polynomials
+BODY_STATES = 8  # at most
+INTERPOLATION_NODES = 16  # of the interpolating polynomials
 WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
-WIDER = 3.0  # times as wide, where things hardly move
+WIDENING_FACTOR = 3.0  # times as wide, where things hardly move
 
 _X, _Y, _Z = np.eye(3)
 
@@ -66,24 +67,24 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
     typical, least = rate(spread), rate(np.maximum(spread, 1))
     yield from (width / typical for width in WIDTHS)
     width = WIDTHS[0] / typical
-    while 0 < WIDER * width < 1 / least:
-        width *= WIDER
+    while 0 < WIDENING_FACTOR * width < 1 / least:
+        width *= WIDENING_FACTOR
         yield width
 
 
-class Bodies:
+class BodyChecks:
     """Checks of energies and power, which are recomputed from the bodies in the scene file.
 
-    lines: the lines of motion computed so far (see `Line`), by state and width.
+    lines: the lines of motion computed so far (see `MotionLine`), by state and width.
     """
 
     def __init__(self, check: Comparison, scene: Scene) -> None:
         self.check, self.scene = check, scene
-        self.lines: dict[tuple[int, float], Line] = {}
+        self.lines: dict[tuple[int, float], MotionLine] = {}
 
     def report(self) -> None:
         """Append checks of energies and of the power of forces to the report of `eomc check`."""
-        limit = max(LIMIT, UNITS * self.check.eps)
+        limit = max(RELATIVE_LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
             self.check.row(f"{label} of bodies", limit, "of its size, from point masses",
@@ -95,7 +96,7 @@ class Bodies:
         name: "kinetic_energy", "potential_energy" or "power" (the power of the forces). The
         expected value is recomputed from the scene's bodies.
         """
-        return self.check.largest(partial(self.off, name), STATES)
+        return self.check.largest(partial(self.off, name), BODY_STATES)
 
     def off(self, name: str, e: Expected) -> float:
         """Return the relative error of the module's quantity `name` at the state of `e`.
@@ -115,19 +116,19 @@ class Bodies:
             with np.errstate(all="ignore"):
                 key = id(e), width
                 state_with_parameters = self.check.sampler.with_discrete_parameters(s)
-                line = self.lines.get(key) or Line(
+                line = self.lines.get(key) or MotionLine(
                     self.scene, state_with_parameters, width, slides=slides
                 )
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
                 differences.append(abs(value - ours) / (size or 1.0))
-            if differences and differences[-1] < LIMIT / 10:
+            if differences and differences[-1] < RELATIVE_LIMIT / 10:
                 break
         return min(differences, default=math.nan)
 
 
 @dataclass(frozen=True)
-class Frame:
+class MovingFrame:
     """Position and rotation of a body's frame at n times along a motion.
 
     Attributes
@@ -151,19 +152,19 @@ class Frame:
         """
         return self.at + rotate(self.turn, x)
 
-    def slid(self, by: Vector, axis: Vector) -> Frame:
+    def slid(self, by: Vector, axis: Vector) -> MovingFrame:
         """Return the frame translated along its own `axis` (3,) by distances `by` (n,), in m."""
         return replace(self, at=self.point(by[:, None] * axis))
 
-    def turned(self, by: Vector, axis: Vector) -> Frame:
+    def turned(self, by: Vector, axis: Vector) -> MovingFrame:
         """Return the frame rotated about its own `axis` (3,) by the angles `by` (n,), in rad."""
         half = by[:, None] / 2
         turn = np.hstack([np.cos(half), np.sin(half) * axis])
-        return Frame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
+        return MovingFrame(self.at, quaternion_product(self.turn, turn), self.angle + by * axis[2])
 
 
 @dataclass
-class Line:
+class MotionLine:
     """The bodies of a scene along a line of motion: a short motion through one state.
 
     The coordinates at the time t + s are q + stretch qd s + bend s²/2, |s| <= width. Quantities are
@@ -195,11 +196,11 @@ class Line:
     stretch: float = 1.0  # of the velocities
     bend: Vector | float = 0.0  # accelerations
     slides: Mapping[str, float] = field(default_factory=dict)  # of what may stick: its mode
-    frames: dict[str, Frame] = field(default_factory=dict)
+    frames: dict[str, MovingFrame] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        s, n = self.state, NODES
+        s, n = self.state, INTERPOLATION_NODES
         nodes, rate = _interpolation(n)
         self.nodes, self.rate = nodes * self.width, rate / self.width
         zero = np.zeros(n + 1)
@@ -213,7 +214,9 @@ class Line:
         for constant in self.scene.constants:
             known[constant.name] = self.evaluate(constant.formula)
         known |= {p.name: (s.params or {}).get(p.name, p.value) for p in self.scene.parameters}
-        self.frames[WORLD] = Frame(np.zeros((n + 1, 3)), np.tile([1.0, 0, 0, 0], (n + 1, 1)), zero)
+        self.frames[WORLD] = MovingFrame(
+            np.zeros((n + 1, 3)), np.tile([1.0, 0, 0, 0], (n + 1, 1)), zero
+        )
         for body in self.assembly.bodies:
             if body.joint:
                 self.attach(body)
@@ -278,7 +281,7 @@ class Line:
         """Return the values of three constant formulas, (3,)."""
         return np.array([float(self.evaluate(x)) for x in entries])
 
-    def oriented(self, frame: Frame, body: RigidBody) -> Frame:
+    def oriented(self, frame: MovingFrame, body: RigidBody) -> MovingFrame:
         """Return the frame after the rotations in the table of the body."""
         for turn in body.rotation:
             axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
@@ -438,7 +441,7 @@ class Line:
                 if body.actuator:
                     power = power + self.evaluate(body.actuator[k]) * rate
         if self.assembly.forces:  # what moves with time alone is none of the coordinates' work
-            at_rest = Line(self.scene, self.state, self.width, 0.0)
+            at_rest = MotionLine(self.scene, self.state, self.width, 0.0)
             power = power + sum(self.work(f, at_rest) for f in self.assembly.forces)
         return power
 
@@ -453,7 +456,7 @@ class Line:
             return self.slides[name] * rate
         return np.tanh(rate / (self.evaluate(width) if width else 1.0)) * rate
 
-    def work(self, force: Force, at_rest: Line) -> Vector:
+    def work(self, force: Force, at_rest: MotionLine) -> Vector:
         """Return the power of a force and torque on a body, in W, at the line's nodes, (n,).
 
         The power along `at_rest`, the same line with zero velocities, is subtracted. It comes from
@@ -470,7 +473,7 @@ class Line:
         (v, w), (v0, w0) = (line.motion(line.frames[force.body], point) for line in (self, at_rest))
         return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
 
-    def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
+    def motion(self, frame: MovingFrame, point: Vector) -> tuple[Vector, Vector]:
         """Return the velocity of a point of a frame and the frame's angular velocity, both (n, 3).
 
         They are in world coordinates, in m/s and rad/s, at the n nodes of the line. point:
@@ -491,7 +494,7 @@ class Line:
         for n, weight in STENCIL:
             for sign in (1, -1):
                 by = 0.01 * n * sign
-                line = Line(self.scene, self.state, self.width, 1 + by)
+                line = MotionLine(self.scene, self.state, self.width, 1 + by)
                 total += sign * weight / 0.01 * line.at_middle(line.dissipation())
         return total
 
@@ -556,3 +559,231 @@ _ALGEBRA: Mapping[str, Any] = {
     "min": lambda *x: np.minimum.reduce(np.broadcast_arrays(*x)),
     "max": lambda *x: np.maximum.reduce(np.broadcast_arrays(*x)),
 }
+
+
+FRAME_STATES = 4
+ACCELERATION_LIMIT = 1e-8  # of accelerations: two derivatives are good to 1e-10
+
+
+def report_frames(check: Comparison, scene: Scene) -> None:
+    """Append checks of frames and momentum to the report of `eomc check`.
+
+    Frames are coordinate systems on bodies for which the module has functions, such as poses and
+    velocities. A function that the module does not have is not checked.
+    """
+    run, eps = check.system.run, check.eps
+    for module, form in check.forms:
+        frames = FrameChecks(check, module, scene)
+
+        def row(name: str, limit: float, measure: Callable[[Expected], float]) -> None:
+            largest = partial(check.largest, measure, FRAME_STATES)
+            check.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
+
+        if check.system.output_frames:
+            row("poses of frames", RELATIVE_LIMIT, frames.poses)
+            row("velocities of frames", RELATIVE_LIMIT, frames.velocities)
+            row("accelerations of frames", ACCELERATION_LIMIT, frames.accelerations)
+            row("Jacobians of frames", RELATIVE_LIMIT, frames.jacobians)
+            row("forces at frames", RELATIVE_LIMIT, frames.forces)
+        if run.momentum:
+            row("momentum", RELATIVE_LIMIT, frames.momentum)
+
+
+def report_inverse_dynamics(check: Comparison) -> None:
+    """Append checks of the module's `report_inverse_dynamics` to the report of `eomc check`.
+
+    This function is compared with D q̈ + bias of the reference.
+    """
+    for module, form in check.forms:
+        measure = partial(
+            check.largest, partial(_inverse_dynamics_error, check, module), FRAME_STATES
+        )
+        check.row(f"{form}inverse dynamics", LIMIT, "units of rounding", measure)
+
+
+def _inverse_dynamics_error(check: Comparison, module: Any, e: Expected) -> float:
+    """Return the error of `report_inverse_dynamics` at a state, in units of rounding.
+
+    The accelerations are twice those of the motion, plus large ones of alternating signs.
+    """
+    s, D = e.state, e.value["D"]
+    qdd = 2 * e.value["acceleration"]
+    qdd = qdd + check.sampler.speed**2 / check.sampler.spread * (-1.0) ** np.arange(len(qdd))
+    forces = module.inverse_dynamics(s.q, s.qd, qdd, t=s.t, params=s.params)
+    size = e.size["D"] @ np.abs(qdd) + e.size["bias"]
+    return check.units(forces, D @ qdd + e.value["bias"], size)
+
+
+class FrameChecks:
+    """Comparison of a module's frame functions with frames computed from the scene's own tables.
+
+    module: that of one form of C, optimised or portable.
+    """
+
+    def __init__(self, check: Comparison, module: Any, scene: Scene) -> None:
+        self.check, self.module, self.scene = check, module, scene
+        self.names = [f.name for f in check.system.output_frames]
+        self.plane = check.system.plane
+
+    def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[MotionLine]:
+        """Yield short motions through the state `s`, one for each of several durations.
+
+        bend: accelerations during the motion, (nq,). See `checks_bodies.MotionLine`.
+        """
+        for width in widths(self.check.sampler.spread, s.qd, bend):
+            with np.errstate(all="ignore"):
+                yield MotionLine(
+                    self.scene, self.check.sampler.with_discrete_parameters(s), width, 1.0, bend
+                )
+
+    def off(
+        self, values: Vector, exact: Callable[[MotionLine], Vector], *state: Any, least: float = 0.0
+    ) -> float:
+        """Return the largest error of the module's `values`, relative to the largest exact value.
+
+        exact: a function that computes the exact values from a line of motion (a short motion
+        through a state). state: arguments of `lines`, which yields such lines of several widths;
+        the smallest error counts. least: lower bound of the divisor.
+        """
+        best = np.inf
+        for line in self.lines(*state):
+            with np.errstate(all="ignore"):
+                expected = exact(line)
+                size = max(float(np.max(np.abs(expected))), least) or 1.0
+                off = float(np.max(np.abs(values - expected))) / size
+            best = min(best, off) if off == off else best
+            if best < RELATIVE_LIMIT / 10:
+                break
+        return best
+
+    def arguments(self, s: State) -> dict[str, Any]:
+        """Return time and parameters of a state as keyword arguments for the module."""
+        return {"t": s.t, "params": s.params}
+
+    def relevant_components(self, linear: Vector, angular: Vector) -> Vector:
+        """Return the components (x, y, angle) of a motion in the plane, or all six in space.
+
+        linear, angular: vectors of three components.
+        """
+        return np.array([*linear[:2], angular[2]] if self.plane else [*linear, *angular])
+
+    def poses(self, e: Expected) -> float:
+        """Return the relative error of the module's positions and rotations of frames."""
+        poses = self.module.pose(e.state.q, **self.arguments(e.state))
+
+        def exact(line: MotionLine) -> Vector:
+            rows = []
+            for name in self.names:
+                frame, m = line.frames[name], line.middle
+                axes = [rotate(frame.turn, x)[m] for x in np.eye(3)]
+                turn = [frame.angle[m]] if self.plane else np.array(axes).T.ravel()
+                rows.append([*frame.at[m][: 2 if self.plane else 3], *turn])
+            return np.array(rows)
+
+        n = len(self.names)
+        both = np.hstack([poses.position, np.reshape(poses.rotation, (n, -1))])
+        return self.off(both, exact, e.state)
+
+    def twists(self, line: MotionLine) -> Vector:
+        """Return linear and angular velocities of all nf frames along a motion, (nf, 6, n).
+
+        line: the motion, evaluated at n times.
+        """
+        motions = (line.motion(line.frames[name], np.zeros(3)) for name in self.names)
+        return np.array([np.hstack(motion).T for motion in motions])
+
+    def relevant_twists(self, twists: Vector) -> Vector:
+        """Return the components of twists (nf, 6) that exist in the plane, or all in space."""
+        return np.array([self.relevant_components(x[:3], x[3:]) for x in twists])
+
+    def velocities(self, e: Expected) -> float:
+        """Return the relative error of the module's linear and angular velocities of frames."""
+        s = e.state
+        twists = self.module.frame_velocity(s.q, s.qd, **self.arguments(s))
+        least = self.twist_scale(s, self.check.sampler.speed)
+
+        def exact(line: MotionLine) -> Vector:
+            return self.relevant_twists(self.twists(line)[..., line.middle])
+
+        return self.off(twists, exact, s, least=least)
+
+    def twist_scale(self, s: State, rates: Vector) -> float:
+        """Return the largest entry of |J| rates, a bound of the frames' velocities at a state.
+
+        J are the module's Jacobians of the frames. rates: coordinate velocities, (nq,), used in
+        place of those of `s`.
+        """
+        J = np.abs(self.module.jacobian(s.q, **self.arguments(s)))
+        return float(np.max(J @ rates, initial=0))
+
+    def accelerations(self, e: Expected) -> float:
+        """Return the relative error of the module's accelerations of frames.
+
+        The accelerations of the coordinates are those of the motion.
+        """
+        s, qdd = e.state, e.value["acceleration"]
+        rates = self.module.frame_acceleration(s.q, s.qd, qdd, **self.arguments(s))
+
+        def exact(line: MotionLine) -> Vector:
+            return self.relevant_twists(self.twists(line) @ line.rate[line.middle])
+
+        sampler = self.check.sampler
+        least = self.twist_scale(s, sampler.speed**2 / sampler.spread)
+        return self.off(rates, exact, s, qdd, least=least)
+
+    def jacobians(self, e: Expected) -> float:
+        """Return the relative error of the module's Jacobians of frames.
+
+        Column i is compared with the frames' velocities when coordinate i alone moves, minus their
+        velocities when no coordinate moves, which are due to time alone.
+        """
+        s = e.state
+        J = np.asarray(self.module.jacobian(s.q, **self.arguments(s)), float)
+        at_rest = self.check.sampler.with_discrete_parameters(replace(s, qd=0 * s.qd))
+        rates, worst = np.maximum(self.check.sampler.spread, 1), 0.0
+        for k, direction in enumerate(np.eye(len(s.q))):
+
+            def exact(line: MotionLine) -> Vector:
+                rest = MotionLine(self.scene, at_rest, line.width)
+                both = [self.relevant_twists(self.twists(x)[..., x.middle]) for x in (line, rest)]
+                return both[0] - both[1]
+
+            moving = replace(s, qd=direction * rates)
+            worst = max(worst, self.off(J[..., k] * rates[k], exact, moving))
+        return worst
+
+    def forces(self, e: Expected) -> float:
+        """Return the relative error of the module's `frame_forces`, Jᵀw for forces w at frames.
+
+        The forces are random, and the expected value follows from the module's own Jacobians J.
+        """
+        s, arguments = e.state, self.arguments(e.state)
+        J = np.asarray(self.module.jacobian(s.q, **arguments), float)
+        w = np.random.default_rng(0).normal(size=J.shape[:2])
+        forces = self.module.frame_forces(s.q, w, **arguments)
+        size = np.einsum("fik,fi->k", np.abs(J), np.abs(w))
+        off = np.abs(forces - np.einsum("fik,fi->k", J, w))
+        return float(np.max(off) / (np.max(size) or 1.0))
+
+    def momentum(self, e: Expected) -> float:
+        """Return the relative error of the module's mass, centre of mass and momenta.
+
+        The expected values follow from the point masses of all bodies.
+        """
+        s = e.state
+        m = self.module.momentum(s.q, s.qd, **self.arguments(s))
+        momentum = np.hstack([m.mass, m.center, m.linear, m.angular])
+
+        def exact(line: MotionLine) -> Vector:
+            bodies = line.bodies
+            masses = [(p, x, line.frames[b.name]) for b in bodies for p, x in line.points(b)]
+            places = [frame.point(x) for _, x, frame in masses]
+            weights = np.array([p for p, *_ in masses])
+            at = np.array([x[line.middle] for x in places])
+            v = np.array([(line.rate @ x)[line.middle] for x in places])
+            center, linear = weights @ at / sum(weights), weights @ v
+            angular = np.sum(np.cross(at - center, weights[:, None] * v), axis=0)
+            d = 2 if self.plane else 3
+            return np.hstack([sum(weights), center[:d], self.relevant_components(linear, angular)])
+
+        return self.off(momentum, exact, s)

@@ -1,25 +1,32 @@
-"""Checks of runs: long steps, runs in several calls, stored states, inputs by step, large angles.
+"""Checks of runs: long steps, runs in several calls, stored states, inputs by step, sines.
 
 A run may take another way through the C code than one step from the start does: sines and cosines
-are predicted while steps are short, Kahan remainders are kept, and a run in several calls goes on
+are predicted while steps are short, Kahan remainders are kept, and a run in several calls continues
 from its workspace. All ways give the same motion, most of them the same bits.
+
+Near a multiple of a quarter turn, an error of 1e-17 in the reduction of an angle is lost in most
+sums, but not in an entry of D or g that is one sine times something else. The reference shows which
+entries these are: at neighbouring doubles they are proportional to the sine, and larger than the
+rest of constants that cancel.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
 from typing import Any
 
 import numpy as np
+import sympy
 
 from eomc.integrators.tableaux import METHODS
-from eomc.model.system import System, t
-from eomc.verify import derivatives
-from eomc.verify.angles import largest_angle
+from eomc.model.algebra import compiled
+from eomc.model.symbols import needed
+from eomc.model.system import System, dot, t
+from eomc.verify.checks_derivatives import differentiate
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
@@ -40,10 +47,8 @@ LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by al
 ANGLES = 48  # around the circle, at which sines are looked at
 SHORT_LIMIT = 20.0  # units; wrong terms of predicted sines make hundreds
 SINES = 20.0  # units; their last terms make hundreds
-LONG_STEP_COUNT, LONG_STEP_COUNT_IF_LARGE = (
-    6,
-    3,
-)  # long steps, or steps with a row of u each; where the reference takes long
+# number of long steps, or of steps with inputs of their own; fewer if the reference is expensive
+LONG_STEP_COUNT, LONG_STEP_COUNT_IF_LARGE = 6, 3
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FARTHEST_ANGLE = 2.0**26  # radians: beyond it roundings of an angle hide all else
@@ -81,9 +86,31 @@ def parameters(model: Any, s: State) -> Vector:
     return np.array(values, model.dtype)
 
 
+@dataclass(frozen=True)
+class RunDivision:
+    """Division of a run into several calls of the C function.
+
+    Attributes
+    ----------
+    cuts : sequence of int
+        Numbers of steps after which one call ends and the next one continues the run.
+    moved : float
+        Change of the first coordinate between two calls, relative to 1 + its size.
+    fresh_memory : bool
+        Whether each call gets a new workspace instead of that of the call before.
+    """
+
+    cuts: Sequence[int] = ()
+    moved: float = 0.0
+    fresh_memory: bool = False
+
+
+UNDIVIDED = RunDivision()
+
+
 def run_in_c(
-    model: Any, method: str, s: State, h: float, steps: int, *, cuts: Sequence[int] = (),
-    every: int = 1, moved: float = 0.0, fresh_memory: bool = False,
+    model: Any, method: str, s: State, h: float, steps: int, *, every: int = 1,
+    division: RunDivision = UNDIVIDED,
 ) -> RunResult:  # fmt: skip
     """Return the result of a run from `s` by the compiled C function for `method`.
 
@@ -97,27 +124,23 @@ def run_in_c(
         Step size, s.
     steps : int
         Number of steps of the whole run.
-    cuts : sequence of int
-        Numbers of steps after which a call of the C function ends and the next one continues.
     every : int
         Only each `every`-th state is stored.
-    moved : float
-        Change of the first coordinate between two calls, relative to 1 + its size.
-    fresh_memory : bool
-        Whether each call gets a new workspace instead of that of the call before.
+    division : RunDivision
+        Division of the run into calls of the C function; by default, one call.
     """
     _, run, _, _, work_type, _ = model._loops[method]
     q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
     rows = np.full((2, 1 - -steps // every, model.nq), np.nan, model.dtype)
     u = None if s.u is None else np.array(s.u, model.dtype)
     stride = 0 if u is None or u.ndim == 1 else model.nu
-    work = model._ffi.new(work_type) if cuts else model._c[2]
+    work = model._ffi.new(work_type) if division.cuts else model._c[2]
     steps_done, status, p = 0, 0, parameters(model, s)
-    for end in (*(c for c in cuts if c < steps), steps):
-        if moved and steps_done:
+    for end in (*(c for c in division.cuts if c < steps), steps):
+        if division.moved and steps_done:
             row = rows[0, -(-steps_done // every)]
-            row[0] += moved * (1 + abs(row[0]))  # also where it has been thrown far out
-        if fresh_memory and steps_done:
+            row[0] += division.moved * (1 + abs(row[0]))  # also where it has been thrown far out
+        if division.fresh_memory and steps_done:
             work = model._ffi.new(work_type)
             work.completed = steps_done
         code = run(
@@ -142,7 +165,7 @@ def _reads_time(system: System) -> bool:
     return any(t in x.free_symbols for x in parts)
 
 
-class Runs:
+class RunChecks:
     """Checks of runs by fixed steps, made with the compiled C functions.
 
     starts: the scene's initial state and a random state, each with the values of the reference (the
@@ -363,7 +386,7 @@ class Runs:
         s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
         scale = self.sampler.scale
         with np.errstate(all="ignore"):
-            by = derivatives.differentiate(self.sampler.reference, s, scale, self.sampler.defaults)
+            by = differentiate(self.sampler.reference, s, scale, self.sampler.defaults)
             slopes = np.fmax.reduce([np.abs(J[:, n : 2 * n]) for J, _ in by])
         gain = e.size["acceleration"] + rounded / self.h + slopes @ rounded
         return replace(e, size={**e.size, "acceleration": gain})
@@ -470,8 +493,9 @@ class Runs:
         must then ignore what its workspace contains from the call before.
         """
         whole = run_in_c(self.model, method, s, h, STEPS)
-        pieces = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS)
-        sparse = run_in_c(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)
+        pieces = run_in_c(self.model, method, s, h, STEPS, division=RunDivision(CUTS))
+        few_calls = RunDivision(CUTS[::2])
+        sparse = run_in_c(self.model, method, s, h, STEPS, every=EVERY, division=few_calls)
         last = -(-whole.steps // EVERY)
         stored = whole.rows[:, np.minimum(EVERY * np.arange(last + 1), whole.steps)]
         rows = np.full_like(sparse.rows, np.nan)
@@ -482,7 +506,7 @@ class Runs:
         # a state that is another than was left has no memory
         by = max(1e-3 * float(self.sampler.spread[0]), 64 * self.check.eps)
         moved, fresh = (
-            run_in_c(self.model, method, s, h, CUTS[3], cuts=CUTS, moved=by, fresh_memory=fresh)
+            run_in_c(self.model, method, s, h, CUTS[3], division=RunDivision(CUTS, by, fresh))
             for fresh in (False, True)
         )
         return wrong + (not moved.is_identical(fresh))
@@ -525,3 +549,150 @@ class Runs:
                 size = size + e.size.get("place", 0.0)  # onto which each step is put
                 errors.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
         return float(median(errors)) if errors else 0.0
+
+
+VANISHING_LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
+QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
+# doubles beside each; some far, as from one to the next what a sum rounds may hardly change
+NEIGHBOURS = (-613, -2, -1, 0, 1, 2, 389)
+PROPORTION_TOLERANCE = 1e-6  # an entry over its sine, at neighbours
+CONSTANT_TOLERANCE = (
+    0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
+)
+Errors = dict[tuple[str, int], float]  # of entries of D and g
+# of other coordinates, which change what sums round, no sine: also the power of two whose roundings
+# a sum has that all but cancels; in no proportion to each other, as roundings recur
+MOVES = (1e-6, -0.43, 0.31, 0.77, -0.68)
+
+
+def report_vanishing_sines(check: Comparison) -> None:
+    """Append a check of sines near their zeros to the report of `eomc check`, if there are angles.
+
+    There is none in single precision, which takes its sines from double precision.
+    """
+    if np.any(check.sampler.angles) and check.dtype == np.float64:
+        check.row(
+            "sines that vanish",
+            VANISHING_LIMIT,
+            "units of rounding",
+            lambda: largest_error_near_zeros(check),
+        )
+
+
+def largest_error_near_zeros(check: Comparison) -> float | Measurement:
+    """Return the largest relative error of entries of D and g near zeros of a sine, in roundings.
+
+    The entries are those that are proportional to one sine, so that they vanish with it. An entry
+    counts if it vanishes at all multiples of a quarter turn at which the sine does. One that
+    vanishes at some of them only may be a sum that cancels there, such as 1 - tanh(x)**2 for large
+    x.
+    """
+    e, errors = check.few(2)[-1], list[float]()
+    for i in map(int, np.flatnonzero(check.sampler.angles)):
+        for odd in (0, 1):
+            places = [n for n in QUARTERS if n % 2 == odd]
+            error_tables = [dict(_entry_errors(check, i, n, e)) for n in places]
+            common = set.intersection(*map(set, error_tables))
+            for quarters, here in zip(places, error_tables, strict=True):
+                errors += _persistent_errors(check, i, quarters, e, {k: here[k] for k in common})
+    if not errors:
+        return Measurement(math.inf, "no entry of D or g is one sine times something")
+    return max(errors)
+
+
+def _persistent_errors(
+    check: Comparison, i: int, quarters: int, e: Expected, errors: Errors
+) -> Iterable[float]:
+    """Return the errors that stay the same, relative to the entry, if other coordinates move."""
+    if max(errors.values(), default=0.0) <= VANISHING_LIMIT:
+        return errors.values()
+    again = [dict(_entry_errors(check, i, quarters, other)) for other in _moved_states(e)]
+    each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in errors.items()}
+    return [min(x) for x in each.values() if np.ptp(x) <= CONSTANT_TOLERANCE * max(x)]
+
+
+def _moved_states(e: Expected) -> Iterator[Expected]:
+    s = e.state
+    for by in MOVES:
+        yield replace(e, state=replace(s, q=s.q * (1 + by), t=s.t * (1 + by)))
+
+
+def _entry_errors(
+    check: Comparison, i: int, quarters: int, e: Expected
+) -> Iterator[tuple[tuple[str, int], float]]:
+    """Return the errors of entries with coordinate i near this number of quarter turns."""
+    s, angle = e.state, quarters * (math.pi / 2)
+    angles = angle + np.array(NEIGHBOURS) * math.ulp(angle)
+    sines = np.array([math.cos(x) if quarters % 2 else math.sin(x) for x in angles.tolist()])
+    states = [replace(s, q=np.where(np.arange(len(s.q)) == i, x, s.q)) for x in angles]
+    for name in ("D", "g"):
+        with np.errstate(all="ignore"):
+            known = [check.reference.evaluate(name, x.q, x.qd, x.t, None, x.params) for x in states]
+            expected = np.reshape(known, (len(states), -1))
+            parts = expected / sines[:, None]
+            values = np.reshape([check.ask(name, x) for x in states], expected.shape)
+            least = VANISHING_LIMIT * check.eps * np.ravel(e.size[name])
+            for k, (part, entry, value) in enumerate(
+                zip(parts.T, expected.T, values.T, strict=True)
+            ):
+                if np.all(np.abs(part) > least[k]) and np.ptp(
+                    part
+                ) <= PROPORTION_TOLERANCE * np.max(np.abs(part)):
+                    yield (name, k), _relative_error(value - entry, entry, check.eps)
+
+
+def _relative_error(off: Vector, entry: Vector, eps: float) -> float:
+    """Return the relative error of an entry, in units of rounding.
+
+    It is 0 if it is neither constant at all neighbours nor proportional to the entry: then the
+    module computes the same entry by a sum that cancels.
+    """
+    errors = [
+        float(np.max(np.abs(x))) if np.ptp(x) <= CONSTANT_TOLERANCE * np.max(np.abs(x)) else 0.0
+        for x in (off / np.median(np.abs(entry)), off / entry)
+    ]
+    small = float(np.max(np.abs(off / entry)))
+    return small / eps if small <= VANISHING_LIMIT * eps else max(errors) / eps
+
+
+PERIODIC = (sympy.sin, sympy.cos, sympy.tan)
+
+
+def largest_angle(system: System) -> Callable[[State], float]:
+    """Return a function that computes the largest angle in the system's formulas at a state, rad.
+
+    An angle is an argument of a sine, cosine or tangent. Its rounding error, relative to its size,
+    limits the precision of all results. The function ignores angles that contain a rate dot(...),
+    and returns 0 if there are no angles.
+    """
+    formulas = [
+        system.kinetic, system.potential, system.linear_potential, system.dissipation,
+        *system.forces, *(e for pair in system.applied for e in pair),
+        *(i.signal for i in system.inputs), *(c.formula for c in system.constraints),
+    ]  # fmt: skip
+    known, free = [], set[sympy.Symbol]()  # definitions without rates
+    for name, e in needed(system.definitions, formulas):
+        if not e.has(dot) and not e.free_symbols & free:
+            known.append((name, e))
+        else:
+            free.add(name)
+        formulas.append(e)
+    angles = {f.args[0] for e in formulas for f in e.atoms(*PERIODIC)}
+    angles = {e for e in angles if not e.has(dot) and not e.free_symbols & free}
+    if not angles:
+        return lambda s: 0.0
+    parameters = [p.symbol for p in system.parameters]
+    names = [*system.q, *system.qd, t, *system.u, *parameters]
+    evaluate = compiled(names, sorted(angles, key=str), "numpy", needed(known, [*angles]))
+    defaults = {p.name: p.value for p in system.parameters}
+
+    def evaluate_largest(s: State) -> float:
+        values = s.params or defaults
+        u = np.zeros(len(system.u)) if s.u is None else s.u
+        with np.errstate(all="ignore"):
+            arguments = evaluate(
+                *s.q, *s.qd, s.t, *u, *(np.float64(values[p.name]) for p in parameters)
+            )
+        return float(np.nanmax(np.abs(np.array(arguments, float)), initial=0.0))
+
+    return evaluate_largest

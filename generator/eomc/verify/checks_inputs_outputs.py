@@ -1,8 +1,12 @@
-"""Rows of `check` about outputs: values in eighty digits, rates by differences along the motion.
+"""Checks of outputs, of the closed loop with feedback signals, and of limits of inputs.
 
-Nothing is differentiated as a formula: q(s) = q + qd s + qdd s^2/2, formulas and definitions are
-evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h. Accelerations and multipliers, which have
-rows of their own, are the module's; derivatives of multipliers are differences of the reference's.
+Values of outputs are evaluated with eighty digits, and nothing is differentiated as a formula:
+along the motion q(s) = q + qd s + qdd s^2/2, formulas and definitions are evaluated as they are,
+and dot(e) is (e(h) - e(-h))/2h. Accelerations and multipliers, which have checks of their own, are
+the module's; derivatives of multipliers are differences of the reference's.
+
+A of the closed loop must be A + B du/dx of the open one, with derivatives of the signals in eighty
+digits. Inputs beyond their limits must act as the limits do, bit by bit.
 """
 
 from __future__ import annotations
@@ -18,8 +22,9 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.model.algebra import compiled
-from eomc.model.system import System, dot, symbol, t
-from eomc.verify import derivatives
+from eomc.model.symbols import Output, resolved, symbol
+from eomc.model.system import System, dot, t
+from eomc.verify.checks_derivatives import differentiate
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
@@ -35,7 +40,7 @@ _NONE: Vector = np.zeros(0)
 _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
 
 
-def report(check: Comparison) -> None:
+def report_outputs(check: Comparison) -> None:
     """Append checks of outputs and of their derivatives to the report of `eomc check`.
 
     Outputs are quantities that the scene defines by formulas.
@@ -47,10 +52,13 @@ def report(check: Comparison) -> None:
             f"{form}outputs", LIMIT, "units of rounding", partial(_values, check, module, formulas)
         )
         if check.system.run.needs_derivatives:
-            unit, slopes = "of the largest derivative", partial(_slopes, check, module, formulas)
+            unit, slopes = (
+                "of the largest derivative",
+                partial(_slope_error, check, module, formulas),
+            )
             check.row(f"{form}outputs: C, D", limit, unit, slopes)
             if check.system.run.linearize == "parameters" and check.system.parameters:
-                by_parameters = partial(_slopes, check, module, formulas, by_parameters=True)
+                by_parameters = partial(_slope_error, check, module, formulas, by_parameters=True)
                 check.row(f"{form}outputs: by parameters", limit, unit, by_parameters)
 
 
@@ -89,7 +97,7 @@ def compare_outputs(
     return check.largest(error, STATES)
 
 
-def _slopes(
+def _slope_error(
     check: Comparison, module: Any, formulas: Formulas, by_parameters: bool = False
 ) -> float:
     """Compare C and D, or dy/dp, with differences of the outputs, through A, B or E."""
@@ -134,7 +142,7 @@ def _multiplier_slopes(check: Comparison, s: State, by_parameters: bool) -> Iter
     """
     first = 2 * len(s.q) + len(check.system.inputs)
     arguments = (check.reference, s, check.sampler.scale, check.sampler.defaults, "multipliers")
-    for slopes, _ in derivatives.differentiate(*arguments):
+    for slopes, _ in differentiate(*arguments):
         yield slopes[:, first:] if by_parameters else slopes[:, :first]
 
 
@@ -284,3 +292,119 @@ class _Motion:
                 value = self.symbol_values[x] + (time if x == t else 0)
             self.known[x, time] = value
         return self.known[x, time]
+
+
+def report_closed_loop(check: Comparison) -> None:
+    """Append checks of the linearised closed loop to the report of `eomc check`.
+
+    The loop is closed by the signals, the scene's formulas for inputs. There are no checks if no
+    signal depends on the state or if a signal has discontinuities.
+    """
+    if not check.system.run.needs_derivatives or not _is_feedback(check.system):
+        return
+    signals = tuple(Output(i.name, i.signal) for i in check.system.inputs)
+    formulas = Formulas(replace(check.system, outputs=signals, inputs=()))
+    limit, unit = max(SLOPE_LIMIT, LIMIT * check.eps), "of the largest derivative"
+    for module, form in check.forms:
+        check.row(
+            f"{form}closed loop", limit, unit, partial(_closed_loop_error, check, module, formulas)
+        )
+
+
+def _is_feedback(system: System) -> bool:
+    """Return whether a signal depends on the state, and none has discontinuities."""
+    known = resolved(system.definitions)
+    signals = sympy.Tuple(*(i.signal.xreplace(known) for i in system.inputs))
+    moves = signals.free_symbols & {*system.q, *system.qd}
+    return bool(moves) and not signals.has(sympy.sign, sympy.Heaviside)
+
+
+def _closed_loop_error(check: Comparison, module: Any, formulas: Formulas) -> float:
+    """Compare A of the closed loop with A + B du/dx, from the module's own A and B."""
+
+    def error(e: Expected) -> float:
+        s = replace(e.state, u=None)
+        arguments = {"t": s.t, "params": s.params}
+        n = 2 * len(s.q)
+        A, B, closed = (
+            np.asarray(x, float)
+            for x in (
+                *module.linearize(s.q, s.qd, **arguments),
+                module.linearize(s.q, s.qd, closed=True, **arguments)[0],
+            )
+        )
+        K = formulas.slopes(s, np.zeros(len(s.q)))[:, :n]
+        size = np.max(abs(A) + abs(B) @ abs(K), axis=1, keepdims=True)
+        return float(np.max(abs(closed - A - B @ K) / (size + 1e-300)))
+
+    return check.largest(error, 2)
+
+
+BEYOND_FACTOR = 3.0  # times what lies between limits
+
+
+def report_limits(check: Comparison) -> None:
+    """Append checks of limits of inputs to the report of `eomc check`, if the scene has limits."""
+    if all(x is None for i in check.system.inputs for x in i.limits):
+        return
+    for module, form in check.forms:
+        check.row(
+            f"{form}limits of inputs", 0, "that differ", partial(_differing_results, check, module)
+        )
+
+
+def _differing_results(check: Comparison, module: Any) -> float:
+    """Return how many inputs, accelerations and steps differ from those at the limits."""
+    differing = 0
+    for e in check.few(STATES):
+        s = e.state
+        least, most = limits(check.system, s.params or check.sampler.defaults)
+        for beyond in _beyond(least, most):
+            both = [
+                list(_results_with_inputs(module, s, u))
+                for u in (beyond, np.clip(beyond, least, most))
+            ]
+            differing += sum(not np.array_equal(a, b) for a, b in zip(*both, strict=True))
+    return float(differing)
+
+
+def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]:
+    """Return the smallest and the largest permitted values of the inputs, both (nu,).
+
+    An input without a limit has the value -inf or inf there. params: values of the parameters,
+    which the formulas of the limits may contain.
+    """
+    values = {symbol(name): value for name, value in params.items()}
+    ends = [
+        [
+            far if x is None else float(x.xreplace(values))
+            for x, far in zip(i.limits, (-np.inf, np.inf), strict=True)
+        ]
+        for i in system.inputs
+    ]
+    least, most = np.array(ends).T
+    return least, most
+
+
+def _beyond(least: Vector, most: Vector) -> Iterator[Vector]:
+    """Yield inputs of which some are below, some above and some between their limits."""
+    width = np.where(np.isfinite(most - least), most - least, 1.0)
+    low = np.where(np.isfinite(least), least, np.where(np.isfinite(most), most, 0) - 2 * width)
+    high = np.where(np.isfinite(most), most, low + 2 * width)
+    for turn in range(3):
+        where = (np.arange(len(low)) + turn) % 3
+        yield np.choose(
+            where, [low - BEYOND_FACTOR * width, high + BEYOND_FACTOR * width, (low + high) / 2]
+        )
+
+
+def _results_with_inputs(module: Any, s: State, u: Vector) -> Iterator[Vector]:
+    arguments = {"t": s.t, "u": u, "params": s.params}
+    yield module.applied(s.q, s.qd, **arguments)
+    yield module.acceleration(s.q, s.qd, **arguments)
+    for method in module.methods:
+        yield np.array(module.step(s.q, s.qd, method=method, **arguments))
+    if hasattr(module, "step_batch"):
+        q, qd = np.array([s.q], module.dtype), np.array([s.qd], module.dtype)
+        yield module.step_batch(q, qd, **arguments)
+        yield np.array([q, qd])

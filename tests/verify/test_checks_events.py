@@ -12,7 +12,7 @@ from conftest import Modules
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System, symbol
 from eomc.scene.read import parse
-from eomc.verify import rows_events, rows_outputs
+from eomc.verify import checks_events, checks_inputs_outputs
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -54,7 +54,7 @@ def ball(modules: Modules) -> ModuleType:
 
 def failed(system: System, ball: ModuleType) -> set[str]:
     made = Comparison(system, ball, np.random.default_rng(0), 4)
-    rows_events.report(made)
+    checks_events.report_functions(made)
     return {row.name for row in made.rows if not row.passed}
 
 
@@ -103,7 +103,7 @@ tolerance = 1e-9
 def test_where_formulas_are_not_real_there_is_nothing_to_compare(modules: Modules) -> None:
     made = from_scene(parse(ODD))
     of = Comparison(made, modules.unoptimised(made), np.random.default_rng(0), 8)
-    rows_events.report(of)
-    rows_outputs.report(of)
+    checks_events.report_functions(of)
+    checks_inputs_outputs.report_outputs(of)
     assert {"events", "jumps", "outputs"} <= {row.name for row in of.rows}
     assert all(row.passed for row in of.rows)

@@ -17,9 +17,8 @@ from stand_in import StandIn
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import symbolic
-from eomc.verify.angles import largest_angle
+from eomc.verify.checks_runs import TURNS, RunChecks, largest_angle
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_runs import TURNS, Runs
 from eomc.verify.sampling import State
 
 MADE = variant("pendulum_gauss16")
@@ -76,7 +75,7 @@ def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
     system = from_scene(parse(GEARS, "gears.toml"))
     module: Any = StandIn(symbolic.derive(system))
     module._model = None
-    runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+    runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
     turns = 2 * np.pi * np.round(TURNS / 2 / np.pi)
     for by, holds in (((3, 1), True), ((-3, -1), True), ((1, 1), False), ((1, -1), False)):
         assert runs.holds(State(np.array([0.3, 0.1]) + turns * np.array(by), np.zeros(2))) == holds
@@ -109,12 +108,12 @@ def test_angles_are_compared_as_far_as_doubles_hold_them(
     monkeypatch: pytest.MonkeyPatch, angle: str
 ) -> None:
     """A time that is off by its last digit is none of the module's faults; by 1e-9 it is one."""
-    monkeypatch.setattr(Runs, "far_steps", lambda *_: 0.0)  # which are the C's own
+    monkeypatch.setattr(RunChecks, "far_steps", lambda *_: 0.0)  # which are the C's own
     for rate, fails in (("(1 + 2**-52)", False), ("(1 + 1e-9)", True)):
         module: Any = StandIn(symbolic.derive(phase(angle, rate)))
         module._model = None
         system = phase(angle)
-        runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+        runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
         assert (runs.far() > runs.limit) == fails
 
 
@@ -144,7 +143,7 @@ def test_inputs_are_compared_as_long_as_steps_do_not_throw_the_state_out() -> No
     system = from_scene(parse(THROWN, "thrown.toml"))
     module: Any = StandIn(symbolic.derive(system))
     module._model = None
-    runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+    runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
     spread, at = np.array([[1.0], [1.0]]), State(np.zeros(1), np.array([1e-5]))
     steps, x, growth = runs.driven(at, np.zeros((6, 1)), spread)
     assert steps == 1
@@ -158,8 +157,8 @@ def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) 
     """There stages of gauss16 are computed one by one, which stands last in its sweep."""
     assert shipped.source.count(STAGE) == 1
     wrong = shipped.source.replace(STAGE, STAGE.replace("= at", "= -at"))
-    assert found(shipped, shipped.source, lambda check: Runs(check).far()) < 10
-    assert found(shipped, wrong, lambda check: Runs(check).far()) > Runs.limit
+    assert found(shipped, shipped.source, lambda check: RunChecks(check).far()) < 10
+    assert found(shipped, wrong, lambda check: RunChecks(check).far()) > RunChecks.limit
 
 
 @pytest.mark.slow

@@ -16,10 +16,10 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
+from eomc.verify.checks_runs import run_in_c
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement
-from eomc.verify.rows_runs import run_in_c
 from eomc.verify.sampling import State
 
 LENGTHS = (1.5, 3.0, 6.0, 15.0)  # steps, in times the fastest mode's own
@@ -69,7 +69,7 @@ def report(check: Comparison) -> None:
     """
     if check.system.constraints:
         return
-    newton = Newton(check)
+    newton = NewtonChecks(check)
     for method in check.methods:
         if METHODS[method].newton and check.dtype == np.float64:
             unit = "sweeps a step more than Newton's method"
@@ -81,7 +81,7 @@ def report(check: Comparison) -> None:
             )
 
 
-class Newton:
+class NewtonChecks:
     """Comparison of iteration counts: the module's implicit steps against those of the reference.
 
     scale: typical sizes of q and q̇, (2, nq).

@@ -11,7 +11,7 @@ from conftest import Modules
 
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
-from eomc.verify import rows_stepped
+from eomc.verify import checks_events
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -76,7 +76,7 @@ def aside(run: Any) -> None:
 
 def row(module: Any) -> Any:
     made = Comparison(SWING, module, np.random.default_rng(0), 4, None)
-    rows_stepped.report(made)
+    checks_events.report_fixed_steps(made)
     (found,) = made.rows
     assert found.name == "events in steps of rk4" and not module._model._passes_over
     return found

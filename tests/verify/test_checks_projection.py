@@ -12,9 +12,9 @@ from cases import scene_system
 from stand_in import StandIn
 
 from eomc.verify import symbolic
+from eomc.verify.checks_constraints import ProjectionChecks, report_projection
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row
-from eomc.verify.rows_projection import ProjectionChecks, report
 
 SYSTEM = scene_system("pendulum_xy")
 
@@ -40,7 +40,7 @@ def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, Row]:
     monkeypatch.setattr(ProjectionChecks, "refusals", lambda _: 0.0)  # which ask a C function
     random = np.random.default_rng(0)
     made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
-    report(made, module, "")
+    report_projection(made, module, "")
     return {row.name: row for row in made.rows}
 
 

@@ -10,9 +10,9 @@ from conftest import Modules, tiers
 
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
+from eomc.verify.checks_batch import STEPS, BatchChecks
+from eomc.verify.checks_runs import RunChecks, run_in_c
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_batch import STEPS, Batches
-from eomc.verify.rows_runs import Runs, run_in_c
 
 # forces that answer where a slide is; with a cosine of it they have no digit at 1e304
 SLIDE = """eomc = 1
@@ -37,11 +37,11 @@ SOON_LOST = 8e306  # after a few steps
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def batches(modules: Modules, force: str, text: str = SLIDE) -> Batches:
+def batches(modules: Modules, force: str, text: str = SLIDE) -> BatchChecks:
     text = text.replace("FORCE", force)
     made = from_scene(parse(text, "slide.toml"))
     comparison = Comparison(made, modules.unoptimised(text), np.random.default_rng(0), 4)
-    return Batches(Runs(comparison), [])
+    return BatchChecks(RunChecks(comparison), [])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,557 @@
+"""Checks of adaptive steps: of single runs and batches, and of refusals.
+
+Single runs are compared with steps of the tableau on the reference's accelerations, two for each
+step of a run with a tighter tolerance. Each adaptive step may have an error of the tolerance, times
+the growth of a difference of the initial state. A run that can't continue returns a status, and the
+state is the last good one.
+
+A batch is computed by other C functions than a single run; the two agree within the tolerance. In
+another place of the batch, in other calls, or next to instances that fail, an instance has the same
+bits.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+import zlib
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import GAUSS16
+from eomc.verify import one_step
+from eomc.verify.checks_refusals import (
+    NOT_FINITE,
+    OK,
+    REFUSED,
+    SINGULAR,
+    RefusalChecks,
+    with_nonfinite_entries,
+)
+from eomc.verify.checks_runs import parameters
+from eomc.verify.comparison import GROWTH_LIMIT, Comparison
+from eomc.verify.reference import Vector
+from eomc.verify.report import Measurement, largest
+from eomc.verify.sampling import NUDGE, State, simulate
+
+ERROR_LIMIT, ERROR_UNIT = 0.1, "tolerances a step, times growth"
+STEP_COUNTS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
+MIN_TOLERANCE = {"float64": 1e-15, "float32": 5e-7}  # tolerance
+TIME_ROUNDINGS = 4  # roundings of a time
+# roundings of time in a step: C refuses steps of TICKS, and begins with a part of the step it takes
+MIN_STEP_ROUNDINGS = 16 * TIME_ROUNDINGS
+ROUNDING = 1e3  # in a tolerance's place, where that is smaller
+
+
+def report_runs(check: Comparison) -> None:
+    """Append checks of adaptive steps to the report, if the scene has a tolerance."""
+    if check.system.run.tolerance is None:
+        return
+    tight = 1e-13 if check.dtype == np.float64 else 1e-6
+    for module, form in check.forms:
+        for tol, stiff in ((10 * tight**0.5, False), (tight, False), (tight**0.5, True)):
+            measure = partial(_largest_error, check, module, tol, stiff)
+            how = "stiff" if stiff else f"{tol:g}"
+            check.row(f"{form}adaptive steps, {how}", ERROR_LIMIT, ERROR_UNIT, measure)
+
+
+def resolves_steps(check: Comparison, s: State, h: float) -> bool:
+    """Return whether times near s.t are precise enough for steps of h seconds.
+
+    In single precision, for instance, times have only 7 digits.
+    """
+    return h > MIN_STEP_ROUNDINGS * check.eps * (abs(s.t) + h)
+
+
+def _largest_error(check: Comparison, module: Any, tol: float, stiff: bool) -> float | Measurement:
+    errors = (
+        _run_error(check, module, max(tol, 8 * check.eps), stiff, e.state) for e in check.few(3)
+    )
+    return largest(errors, "a difference grows too much in a few steps")
+
+
+def _simulate(module: Any, s: State, x: Vector, T: float, tol: float, **how: Any) -> Any:
+    n = len(s.q)
+    span = how if "times" in how else {"duration": T, **how}
+    return simulate(module, replace(s, q=x[:n], qd=x[n:]), tol=tol, t0=s.t, **span)
+
+
+def _start_run(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bool) -> Any:
+    """Return the run, or its part in the first call of C, which has more steps than are compared.
+
+    Jumps that add energy may follow one another without end, in less and less time.
+    """
+
+    def stop_early(completed: int, total: int) -> None:
+        if completed < total:
+            raise KeyboardInterrupt
+
+    try:
+        return _simulate(module, s, x, T, tol, stiff=stiff, progress=stop_early)
+    except module.Interrupted as stop:
+        return stop.run
+
+
+def _run_error(check: Comparison, module: Any, tol: float, stiff: bool, s: State) -> float | None:
+    """Return the error at the end and at times within steps of a run from one state.
+
+    The unit is the tolerance times steps and growth. None if nothing can be compared.
+    """
+    x = np.concatenate([s.q, s.qd])
+    spread = check.sampler.scale.ravel()
+    first = _start_run(module, s, x, check.system.run.duration, tol, stiff)
+    if len(first) < 2:  # not a single step
+        begins = np.isfinite(check.reference.acceleration(s.q, s.qd, s.t, s.u, s.params)).all()
+        return math.inf if first.status == "not finite" and begins else None
+    ends = [first.events[e.name].t for e in check.system.events if e.action != "record"]
+    first_end = min((float(t[0]) for t in ends if len(t)), default=math.inf)
+    if first_end <= s.t:  # the state jumps at once
+        return None
+    moved = x + NUDGE * spread
+    neighbour = check.sampler.project(replace(s, q=moved[: len(s.q)], qd=moved[len(s.q) :]))
+    nudged = np.concatenate([neighbour.q, neighbour.qd])
+    for steps in STEP_COUNTS:
+        T = min(float(first.t[min(steps, len(first) - 1)]), first_end) - s.t
+        T *= 1 if s.t + T < first_end else 0.9  # the reference knows of no events
+        run = _simulate(module, s, x, T, tol, stiff=stiff)
+        near = _simulate(module, s, nudged, T, tol, stiff=stiff)
+        if run.status != "ok" or near.status != "ok":
+            continue
+        growth = float(np.max(np.abs(near.x[-1] - run.x[-1]) / spread)) / NUDGE
+        if not growth < GROWTH_LIMIT:
+            continue
+        times = s.t + T * np.array([0.31, 0.77, 1.0])
+        rows = _simulate(module, s, x, T, tol, times=times, stiff=stiff)
+        finer = _simulate(module, s, x, T, max(tol / 1000, MIN_TOLERANCE[check.dtype.name]))
+        expected, rates = _reference_states(check, s, x, times, finer.t)
+        if not np.isfinite(expected).all():
+            continue
+        late = (
+            TIME_ROUNDINGS * check.eps * (abs(s.t) + T) * np.abs(rates)
+        )  # by what rounding of t makes of it
+        off = np.abs(np.vstack([rows.x - expected, run.x[-1:] - expected[-1:]]).astype(float))
+        off = np.maximum(0.0, off - np.vstack([late, late[-1:]]))
+        off /= np.abs(expected).max(axis=0) + max(growth, 1.0) * spread
+        allowed = (tol + ROUNDING * check.eps) * (run.steps + 1)
+        return float(np.nan_to_num(off.max(), nan=math.inf) / allowed)
+    return None
+
+
+def _reference_states(
+    check: Comparison, s: State, x: Vector, times: Vector, grid: Vector
+) -> tuple[Vector, Vector]:
+    """Return the reference's states and their rates at some times, both (n, 2 nq).
+
+    It makes two fixed steps between successive times of `grid` and `times`.
+    """
+    n, rows, rates = len(s.q), [], []
+    acceleration = check.accelerations(s)
+    q, qd, t = x[:n], x[n:], s.t
+    with np.errstate(all="ignore"):
+        for end in np.union1d(grid[grid > s.t], times):
+            h = (end - t) / 2
+            for k in range(2):
+                state = q, qd, t + k * h, h
+                end_state = one_step.step(GAUSS16, acceleration, *state)
+                if not np.isfinite(end_state).all():  # too long for sweeps
+                    end_state, _ = one_step.step_by_newton(GAUSS16, acceleration, *state)
+                q, qd = end_state
+            t = float(end)
+            if end in times:
+                rows.append(np.concatenate([q, qd]))
+                rates.append(np.concatenate([qd, acceleration(q, qd, t)]))
+    return np.array(rows), np.array(rates)
+
+
+SINGULAR_STATE_COUNT, MAX_STEPS = 8, 40  # states; steps of a run
+STEP_LIMIT_PARTS = 7  # steps of a span in which one would do
+COARSE_TOLERANCE = 1e-3  # tolerance
+LARGE_ANGLE = 1e7  # rad: sines of several angles at once come to their limit before
+
+
+@dataclass(frozen=True)
+class AdaptiveRunResult:
+    """Results of an adaptive run by the C function.
+
+    status: 0, or the code of the error. rows: states at the ends of steps, (n, 2 nq). times: their
+    times, (n,), s. x: the last state, (2 nq,).
+    """
+
+    status: int
+    rows: Vector
+    times: Vector
+    x: Vector
+
+    @property
+    def refuses_cleanly(self) -> bool:
+        """Whether the run has returned an error and made no step."""
+        return self.status != OK and not len(self.rows)
+
+
+def report_refusals(check: Comparison, refusals: RefusalChecks) -> None:
+    """Append checks of adaptive runs to the report: refusals, and the limit of the step size.
+
+    There are none if the scene has no tolerance. refusals: the checks of refusals by fixed steps,
+    which have found states with a singular mass matrix D.
+    """
+    if check.system.run.tolerance is None:
+        return
+    checks = AdaptiveRefusalChecks(check, refusals)
+    check.row("adaptive steps: refusals", 0, "runs that end otherwise", checks.wrong_refusals)
+    check.row("adaptive steps: longest", 0, "runs that end otherwise", checks.longest)
+
+
+class AdaptiveRefusalChecks:
+    """Checks of what single adaptive runs by the C function refuse, and of their step sizes.
+
+    refusals: the checks of refusals by fixed steps, which have found states with a singular D.
+    """
+
+    def __init__(self, check: Comparison, refusals: RefusalChecks) -> None:
+        self.check, self.model, self.refusals = check, check.module._model, refusals
+        self.state = check.few(2)[-1].state
+
+    def drive(
+        self, s: State, span: float, tol: float, h_most: float = 0.0, stiff: bool = False,
+        each: int = MAX_STEPS,
+    ) -> AdaptiveRunResult:  # fmt: skip
+        """Return an adaptive run of `span` seconds by the C function, of at most MAX_STEPS steps.
+
+        s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff:
+        whether to begin with Newton's method. each: number of steps per call of the C function.
+        """
+        model, many = self.model, 2 * MAX_STEPS
+        x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)
+        rows, times = np.full((2, many, model.nq), np.nan, model.dtype), np.zeros(many, model.dtype)
+        u = None if s.u is None else np.array(s.u, model.dtype)
+        work, null, p = model._ffi.new("adaptive_work *"), model._c[2], parameters(model, s)
+        work.stiff = stiff
+        events = (0, model._ffi.NULL, null) if model.events else ()
+        n, status, end = 0, OK, s.t + span
+        for _ in range(0, MAX_STEPS, each):
+            if status != OK or t[0] >= end or (model.events and work.stopped):
+                break
+            status = model._lib.adaptive(
+                model._pointer(x), model._pointer(t), end, tol, h_most, model._pointer(u), each,
+                null, many - n, model._pointer(times[n:]), model._pointer(rows[0, n:]),
+                model._pointer(rows[1, n:]), *events, model._pointer(p), work,
+            )  # fmt: skip
+            n += work.rows
+        return AdaptiveRunResult(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
+
+    def wrong_refusals(self) -> float:
+        """Return the number of adaptive runs that are not refused correctly, or store nan or inf.
+
+        Some runs start where the mass matrix D is singular or at nan or inf; they must return an
+        error and make no step. Others start with numbers so large that a step overflows; they must
+        store finite states only.
+        """
+        h, tol = self.check.system.run.h, COARSE_TOLERANCE
+        wrong = 0
+        for s in self.refusals.singular[
+            :: max(1, len(self.refusals.singular) // SINGULAR_STATE_COUNT)
+        ]:
+            for stiff in (False, True):
+                run = self.drive(s, 10 * h, tol, stiff=stiff)
+                wrong += not (run.refuses_cleanly and run.status == SINGULAR)
+                wrong += not np.array_equal(run.x, np.asarray([s.q, s.qd], run.x.dtype).ravel())
+        for *_, odd in with_nonfinite_entries(self.state):
+            run = self.drive(odd, 10 * h, tol)
+            wrong += not run.refuses_cleanly or run.status not in REFUSED
+        return float(wrong + self.overflow_errors())
+
+    def overflow_errors(self) -> int:
+        """Return the number of runs that store states that are not finite.
+
+        Their initial states are so large that a step may overflow.
+        """
+        wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
+        for unit in np.eye(len(self.state.q)):
+            for size in (LARGE_ANGLE, huge):
+                for stiff in (False, True):
+                    far = replace(self.state, q=size * unit, qd=1.01 * size * unit)
+                    run = self.drive(far, 1.0, COARSE_TOLERANCE, stiff=stiff)
+                    wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
+        return wrong
+
+    def longest(self) -> float | Measurement:
+        """Return the number of errors in adaptive runs with a limit of the step size.
+
+        No step may exceed the limit, the last step must end at the given time, and a run in several
+        calls must equal the run in one call.
+        """
+        errors = (self.step_limit_errors(e.state) for e in self.check.few(2))
+        return largest(errors, "time tells no parts of a first step")
+
+    def step_limit_errors(self, s: State) -> float | None:
+        """Return the number of errors in one adaptive run from `s` with a limit of the step size.
+
+        The result is None if times are not precise enough for such steps.
+        """
+        first = self.drive(s, self.check.system.run.duration, COARSE_TOLERANCE)
+        later = first.times[first.times > s.t]  # the state may jump at once
+        span = float(later[0]) - s.t if len(later) else 0.0
+        if not resolves_steps(self.check, s, span / STEP_LIMIT_PARTS):
+            return None
+        run, cut = (
+            self.drive(s, span, COARSE_TOLERANCE, h_most=span / STEP_LIMIT_PARTS, each=n)
+            for n in (MAX_STEPS, 1)
+        )
+        sizes = np.diff(np.concatenate([[s.t], run.times]))
+        rounding = TIME_ROUNDINGS * self.check.eps * (abs(s.t) + span)
+        late = (
+            bool(np.any(sizes > span / STEP_LIMIT_PARTS + rounding))
+            or len(run.times) < STEP_LIMIT_PARTS
+        )
+        end = np.asarray(s.t + span, run.times.dtype)
+        there = run.status == OK and run.times[-1] == end
+        return float(late) + float(not there) + float(not np.array_equal(run.rows, cut.rows))
+
+
+# --- batches --------------------------------------------------------------------------------------
+
+INSTANCES = 19  # more than twice the lanes of any register
+BATCH_SINGULAR_STATES = 4  # singular states
+BATCH_STEPS = 4  # of a run that is compared with the run of a single instance
+BATCH_TOLERANCE = {8: 1e-12, 4: 1e-6}  # by the bytes of a number
+MAX_STEP_FRACTION = 0.3  # limit of the step size, relative to the duration of the run
+BATCH_LIMIT, BATCH_UNIT = 1.0, "tolerances a step"
+EVENTS_PER_CALL = 64  # room for the events of an instance, besides those of a step
+
+
+@dataclass
+class AdaptiveBatchResult:
+    """Results of the C function `adaptive_batch` for n instances of the system.
+
+    Attributes
+    ----------
+    x : (n, 2 nq) array
+        Final states.
+    t : (n,) array
+        Their times, s.
+    rows : (n, 4, nq) array
+        q at two times, then q̇ at these times.
+    counts : (n, 6) array
+        Numbers of steps, rejected steps, evaluations, stiff steps and events; a checksum of the
+        events.
+    status : (n,) array
+        Error codes; 0 if there is no error.
+    """
+
+    x: Vector
+    t: Vector
+    rows: Vector
+    counts: Vector
+    status: Vector
+
+    def __getitem__(self, which: Any) -> list[Vector]:
+        return [x[which] for x in (self.x, self.t, self.rows, self.counts, self.status)]
+
+
+def report_batches(check: Comparison, singular: list[State]) -> None:
+    """Append checks of batches with adaptive steps to the report of `eomc check`.
+
+    There are none if the scene has no tolerance or no batches. singular: states at which the mass
+    matrix D is singular; a batch must refuse them.
+    """
+    if check.system.run.tolerance is None or not check.system.run.batch:
+        return
+    checks = AdaptiveBatchChecks(check, singular)
+    check.row("adaptive steps of many", BATCH_LIMIT, BATCH_UNIT, checks.compare_with_single_runs)
+    for module, form in check.forms:
+        many = AdaptiveBatchChecks(check, singular, module)
+        check.row(f"{form}adaptive steps of many: bits", 0, "instances", many.differing_instances)
+        check.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.wrong_refusals)
+
+
+class EventRecorder:
+    """Buffers for the events of `count` instances in a batch, and a digest of the events so far.
+
+    digests: for each instance, the number of its events and a checksum of them. room: the buffers
+    as arguments of the C function.
+    """
+
+    def __init__(self, model: Any, count: int) -> None:
+        self.digests: list[list[int]] = [[0, 0] for _ in range(count)]
+        self.room: tuple[Any, ...] = ()
+        if not model.events:
+            return
+        each = EVENTS_PER_CALL + len(model.events)
+        self.counts, self.which = np.zeros(count, "l"), np.zeros((count, each), "i")
+        self.rows = np.zeros((count, each, 1 + 2 * model.nq), model.dtype)
+        address, (long, integer) = model._c[0], model._whole
+        places = address(long, self.counts), address(integer, self.which)
+        self.room = (each, *places, model._pointer(self.rows))
+
+    def record(self) -> None:
+        """Add the events that the last call of the C function stored to the digests."""
+        for k, n in enumerate(self.counts if self.room else ()):
+            number, digest = self.digests[k]
+            for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
+                number, digest = number + 1, zlib.crc32(which.tobytes() + row.tobytes(), digest)
+            self.digests[k] = [number, digest]
+
+
+class AdaptiveBatchChecks:
+    """Checks of adaptive runs of a batch of COUNT instances, all of which start near one state.
+
+    singular: states at which D is singular. module: the module of the optimised (default) or the
+    portable C code.
+    """
+
+    def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
+        self.check, self.module, self.singular = check, module or check.module, singular
+        self.model = self.module._model
+        self.tol = BATCH_TOLERANCE[self.model.dtype.itemsize]
+        states = [e.state for e in reversed(check.few(2))]
+        self.state = s = next(filter(self.resolves_steps, states), states[0])
+        random, sampler = np.random.default_rng(3), check.sampler
+        self.starts = [
+            sampler.project(replace(s, q=s.q + dq, qd=s.qd + dv))
+            for dq, dv in zip(
+                1e-2 * sampler.spread * random.standard_normal((INSTANCES, len(s.q))),
+                1e-2 * sampler.speed * random.standard_normal((INSTANCES, len(s.q))), strict=True,
+            )
+        ]  # fmt: skip
+
+    def single_run(self, s: State, **span: Any) -> Any:
+        """Return the adaptive run of a single instance from the state `s`.
+
+        span: the `duration` or the `times` of the run, as arguments of the module's `simulate`.
+        """
+        return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
+
+    def span(self, s: State) -> float:
+        """Return the duration of the first STEPS adaptive steps from the state `s`, in s.
+
+        The result is 0 if the run makes no step.
+        """
+        run = self.single_run(s, duration=self.check.system.run.duration)
+        return float(run.t[min(BATCH_STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
+
+    def resolves_steps(self, s: State) -> bool:
+        """Return whether times near s.t are precise enough for the adaptive steps from `s`."""
+        return resolves_steps(self.check, s, self.span(s) / BATCH_STEPS)
+
+    def compare_with_single_runs(self) -> float | Measurement:
+        """Return the largest difference between states of the batch and those of single runs.
+
+        States at two times are compared. The unit is the tolerance, times the number of steps.
+        """
+        s, T = self.state, self.span(self.state)
+        if not self.resolves_steps(s):
+            return Measurement(math.nan, "times tell no steps")
+        times = s.t + T * np.array([0.4, 1.0])
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+            q, qd = (np.array([getattr(x, name) for x in self.starts]) for name in ("q", "qd"))
+            many = self.module.simulate_batch(
+                q, qd, times=times, tol=self.tol, t0=s.t, params=s.params,
+                u=None if s.u is None else np.tile(s.u, (INSTANCES, 1)), threads=1,
+            )  # fmt: skip
+        return largest(
+            (self.end_error(many, k, times) for k in range(INSTANCES)), "no instance has a step"
+        )
+
+    def end_error(self, many: Any, k: int, times: Vector) -> float | None:
+        """Return the largest difference between instance k of a batch run and its single run.
+
+        many: the batch run, which has stored the states at `times`; the single run stores them too.
+        The unit is the tolerance, times the number of steps. The result is None if the single run
+        stops early.
+        """
+        one = self.single_run(self.starts[k], times=times)
+        if one.status != "ok" or len(one) < len(times):
+            return None
+        x = np.hstack([many.q[k], many.qd[k]]).astype(float)
+        scale = np.abs(one.x).max(axis=0) + self.check.sampler.scale.ravel()
+        allowed = (self.tol + ROUNDING * self.check.eps) * (one.steps + 1)
+        return float(np.nan_to_num(np.max(np.abs(x - one.x) / scale) / allowed, nan=math.inf))
+
+    def drive(
+        self, starts: list[State], span: float, steps: int, *, stiff: bool = False,
+        longest: float = 0.0,
+    ) -> AdaptiveBatchResult:  # fmt: skip
+        """Return the results of an adaptive batch run by the C function `adaptive_batch`.
+
+        starts: initial states of the instances. The run begins at the time of the checked state and
+        lasts `span` seconds. steps: largest number of steps of each instance per call; calls are
+        repeated until all instances are finished. stiff: whether to begin with Newton's method.
+        longest: limit of the step size, s; 0 for none.
+        """
+        model, n, s = self.model, len(starts), starts[0]
+        new = model._ffi.new
+        q, qd = (np.array([getattr(x, k) for x in starts], model.dtype) for k in ("q", "qd"))
+        t = np.array([x.t for x in starts], model.dtype)
+        end = self.state.t + span
+        times = np.array([self.state.t + 0.6 * span, end], model.dtype)
+        rows = np.full((2, n, 2, model.nq), np.nan, model.dtype)
+        row_counts, status, memory = np.zeros(n, "l"), np.zeros(n, "i"), new("adaptive_memory[]", n)
+        for one in memory if stiff else ():
+            one.stiff = 1
+        u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
+        p = np.array([parameters(model, x) for x in starts], model.dtype)
+        address, (long, integer) = model._c[0], model._whole
+        recorder = EventRecorder(model, n)
+        for _ in range(100_000):
+            remaining = model._lib.adaptive_batch(
+                n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
+                model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
+                model._pointer(rows[1]), *recorder.room, model._pointer(p), 1, memory,
+                address(long, row_counts), address(integer, status),
+            )  # fmt: skip
+            recorder.record()
+            if not remaining:
+                break
+        counts = [
+            [m.steps, m.rejected, m.evaluations, m.stiff_steps, *digest_entry]
+            for m, digest_entry in zip(memory, recorder.digests, strict=True)
+        ]
+        return AdaptiveBatchResult(
+            np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status
+        )
+
+    def differing_instances(self) -> float:
+        """Return the number of instances whose bits depend on the other instances or on the calls.
+
+        Each instance is run several times: at another place in the batch, in calls of fewer steps
+        and, for some instances, without others. All of these runs must give the same bits.
+        """
+        wrong, T = 0, self.span(self.state)
+        for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
+            how: Any = {"stiff": stiff, "longest": longest}
+            whole, few = (self.drive(self.starts, T, n, **how) for n in (1000, 1))
+            back = self.drive(self.starts[::-1], T, 3, **how)
+            single = [self.drive([x], T, 1000, **how) for x in self.starts[:3]]
+            for k in range(INSTANCES):
+                others = [
+                    few[k],
+                    back[INSTANCES - 1 - k],
+                    *([single[k][0]] if k < len(single) else []),
+                ]
+                wrong += any(_have_different_bits(whole[k], other) for other in others)
+        return float(wrong)
+
+    def wrong_refusals(self) -> float:
+        """Return the number of errors in a batch of which some instances must be refused.
+
+        These instances start at nan or where D is singular. It is an error if such an instance is
+        not refused, and if the result of another instance changes because of it.
+        """
+        T, rest = self.span(self.state), self.starts[3:]
+        odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
+        known = self.singular[:: max(1, len(self.singular) // BATCH_SINGULAR_STATES)]
+        odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]
+        result, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
+        wrong = sum(
+            _have_different_bits(result[k + len(odd)], expected[k]) for k in range(len(rest))
+        )
+        wrong += int(result.status[0] != NOT_FINITE) + int(result.status[1] == 0)
+        wrong += sum(code not in (SINGULAR, NOT_FINITE) for code in result.status[2 : len(odd)])
+        return float(wrong)
+
+
+def _have_different_bits(one: list[Vector], other: list[Vector]) -> bool:
+    return not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
