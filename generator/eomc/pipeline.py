@@ -93,7 +93,7 @@ def sources(
 
 def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
     from eomc.derive import lagrange
-    from eomc.program import program, unused_parameters
+    from eomc.program import program
 
     if isinstance(system, (str, os.PathLike)):
         raise EomcError(f"give a System, such as eomc.read({str(system)!r})")
@@ -102,7 +102,7 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
     for problem in (
         *system.warnings,
         *program.inertia(derived),
-        *unused_parameters.parameters(derived),
+        *program.unused_parameters(derived),
     ):
         if warn is not None:
             warn(problem)

@@ -18,7 +18,7 @@ from eomc.derive import lagrange
 from eomc.integrators.tableaux import METHODS
 from eomc.model import from_scene as system
 from eomc.program import program
-from eomc.program.trig import separate_angles
+from eomc.program.two_point import separate_angles
 from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 

@@ -18,7 +18,7 @@ from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.optimised.lanes import Accelerations
 from eomc.program import program
-from eomc.program.trig import Angle
+from eomc.program.two_point import Angle
 from eomc.toolchain.files import write_files
 
 

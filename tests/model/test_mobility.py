@@ -15,9 +15,9 @@ from eomc.cli.main import main
 from eomc.model import kinematics, mobility
 from eomc.model.from_scene import from_scene
 from eomc.model.mobility import Mobility
-from eomc.program import singular
+from eomc.program import ranks
 from eomc.program.assembly import assembled
-from eomc.program.singular import ClosestSingularity
+from eomc.program.ranks import ClosestSingularity
 from eomc.scene.read import parse
 
 
@@ -399,7 +399,7 @@ def test_loops_and_rows_count():
 def test_dof_tells_rank_and_the_assembled_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(singular, "MAX_CONFIGURATIONS", 50)  # as many steps lead all round
+    monkeypatch.setattr(ranks, "MAX_CONFIGURATIONS", 50)  # as many steps lead all round
     file = tmp_path / "four_bar.toml"
     file.write_text(FOUR_BAR.replace("1.4 }", "1.4, guess = true }") + "\n".join(BARS))
     done = CliRunner().invoke(main, ["dof", str(file), "--json"])
@@ -416,7 +416,7 @@ def test_dof_tells_rank_and_the_assembled_start(
     ]
     assert abs(ends[0] - ends[1]) < 1e-14
     near = ClosestSingularity(**found["constraints"]["nearest_singular"])
-    monkeypatch.setattr(singular, "closest_singularity", lambda _: near)  # not sought again
+    monkeypatch.setattr(ranks, "closest_singularity", lambda _: near)  # not sought again
     shown = CliRunner().invoke(main, ["dof", str(file)]).output
     assert str(near) in shown
     assert "2 rows of constraints on 3 coordinates, rank 2 of 2" in shown

@@ -20,8 +20,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
-from eomc.program.manifold import Configuration, Manifold
-from eomc.program.manifold_sampling import random_walk
+from eomc.program.manifold import Configuration, Manifold, random_walk
 from eomc.scene.read import parse
 
 NAMES = list(constrained.cases())

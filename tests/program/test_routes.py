@@ -14,7 +14,7 @@ from cases import scene_system
 
 from eomc.derive.lagrange import derive
 from eomc.derive.ldl import Solution
-from eomc.program import admissible
+from eomc.program import routes
 from eomc.program.interpret import evaluate, nearby
 from eomc.program.ir import Cost, Function
 from eomc.program.lower import lower
@@ -93,8 +93,8 @@ def test_no_other_file_compares_their_names() -> None:
 
 def test_states_where_no_route_has_a_result_say_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     errors = {"one": [math.inf, *[1e-16] * 3, 3e-16], "other": [math.inf, *[1e-16] * 3, math.inf]}
-    monkeypatch.setattr(admissible, "_errors", lambda made, *_: errors[made.name])
+    monkeypatch.setattr(routes, "_errors", lambda made, *_: errors[made.name])
     empty = Function("", (), (), (), (), Cost(), "", ())
     made = {name: replace(empty, name=name) for name in errors}
-    found = admissible._roundings(made, scene_system("cartpole"))
+    found = routes._roundings(made, scene_system("cartpole"))
     assert found == {"one": 3e-16, "other": math.inf}

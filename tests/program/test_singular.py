@@ -11,9 +11,9 @@ from eomc import pipeline
 from eomc.base import resources
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.program import singular
+from eomc.program import ranks
 from eomc.program.assembly import assembled
-from eomc.program.singular import ClosestSingularity, closest_singularity
+from eomc.program.ranks import ClosestSingularity, closest_singularity
 from eomc.scene.read import parse
 
 PARALLELOGRAM = """
@@ -55,7 +55,7 @@ def test_a_four_bar_is_as_near_as_a_grid_of_crank_angles_finds(
 ) -> None:
     """Bars of 1, 3, 2.5 and 3.2 m, of unit inertia each: closed by the angles of triangles."""
     monkeypatch.setattr(
-        singular, "MAX_CONFIGURATIONS", 50
+        ranks, "MAX_CONFIGURATIONS", 50
     )  # either way: of a tenth of a radian, all round
     text = PARALLELOGRAM.replace("2*cos(B) - cos(C) - 2", "3*cos(B) - 2.5*cos(C) - 3.2")
     text = text.replace("2*sin(B) - sin(C)", "3*sin(B) - 2.5*sin(C)")

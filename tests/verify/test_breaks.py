@@ -23,7 +23,7 @@ from eomc.derive import lagrange
 from eomc.derive.lagrange import EquationsOfMotion
 from eomc.emit import c_expression, render
 from eomc.model.system import System
-from eomc.program import admissible, program
+from eomc.program import program, routes
 from eomc.program.ir import Sum
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
@@ -91,7 +91,7 @@ def text(right: str, wrong: str) -> Breakage:
 
 def lowered(patch: pytest.MonkeyPatch) -> None:
     """On its way to assignments the last sum of the acceleration loses a sign."""
-    right = admissible.lower
+    right = routes.lower
 
     def wrong(name: str, *how: Any, **more: Any) -> Any:
         made = right(name, *how, **more)
@@ -103,7 +103,7 @@ def lowered(patch: pytest.MonkeyPatch) -> None:
         body[k] = replace(body[k], value=Sum(((-weight, first), *rest), body[k].value.constant))
         return replace(made, body=tuple(body))
 
-    patch.setattr(admissible, "lower", wrong)
+    patch.setattr(routes, "lower", wrong)
 
 
 def printed(patch: pytest.MonkeyPatch) -> None:

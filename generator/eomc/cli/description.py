@@ -39,7 +39,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
         counted, lines = mobility_count.as_dict(), [mobility_count.table()]
     if checked_scene.constrained:
         from eomc import pipeline
-        from eomc.program import singular
+        from eomc.program import ranks
 
         system = pipeline.read(scene)
         assert system.closure is not None
@@ -49,7 +49,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
             "qd": {f"{c.name}_dot": c.rate for c in system.coordinates},
         }
         lines.append(system.closure.table())
-        if closest_singularity := singular.closest_singularity(system):
+        if closest_singularity := ranks.closest_singularity(system):
             counted["constraints"]["nearest_singular"] = vars(closest_singularity)
             lines.append(str(closest_singularity))
         start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)

@@ -13,8 +13,7 @@ from sympy import Expr, S
 
 from eomc.base.errors import EomcError
 from eomc.derive.tape import Stage, is_negative
-from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
-from eomc.program.trig import names_of_pair
+from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, names_of_pair, rename
 
 MAX_INLINE_OPERATIONS = 5  # longer expressions get a name of their own
 MIN_SIMD_ANGLES = 3  # angles from which on sines are computed in vector registers

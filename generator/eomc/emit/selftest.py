@@ -27,7 +27,7 @@ from eomc.model.symbols import ALONG
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.outline import weight
 from eomc.program.program import TIME
-from eomc.program.trig import separate_angles
+from eomc.program.two_point import separate_angles
 
 # by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
 LIMIT = {True: 2.0**20, False: 2.0**13}

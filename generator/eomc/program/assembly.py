@@ -40,7 +40,7 @@ MAX_ROTATION_ERROR = 0.5  # rad: axis equations satisfied at more have a wrong r
 
 
 @dataclass(frozen=True)
-class Start:
+class ConsistentStart:
     """Consistent initial values of a system with constraints.
 
     Attributes
@@ -152,7 +152,7 @@ def _refuse_idle(manifold: Manifold) -> None:
         raise SceneError(idle)
 
 
-def _start(manifold: Manifold) -> Start:
+def _start(manifold: Manifold) -> ConsistentStart:
     """Compute consistent initial values. Raises SceneError where there are none."""
     system = manifold.system
     free = np.array([not c.start_fixed for c in system.coordinates])
@@ -173,7 +173,7 @@ def _start(manifold: Manifold) -> Start:
         q, _ = manifold.refine(closest, free)
         rounded = np.where(free, _rounded(closest, q), guess)
         configuration = manifold.configuration(rounded) or closest
-    return Start(configuration, q, _rates(manifold, configuration, q, rates), strayed)
+    return ConsistentStart(configuration, q, _rates(manifold, configuration, q, rates), strayed)
 
 
 def _search(
@@ -268,7 +268,9 @@ def _moves(
             yield Move(name, one, other, unit)
 
 
-def _closure(manifold: Manifold, start: Start, constraint_ranks: Ranks) -> ConstraintSummary:
+def _closure(
+    manifold: Manifold, start: ConsistentStart, constraint_ranks: Ranks
+) -> ConstraintSummary:
     system = manifold.system
     names = [c.name for c in system.constraints]
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
@@ -292,7 +294,7 @@ def _closure(manifold: Manifold, start: Start, constraint_ranks: Ranks) -> Const
     )
 
 
-def _remarks(manifold: Manifold, start: Start, constraint_ranks: Ranks) -> Iterator[str]:
+def _remarks(manifold: Manifold, start: ConsistentStart, constraint_ranks: Ranks) -> Iterator[str]:
     """Yield messages on unusual properties of the constraints."""
     rows, rank = len(manifold.rows), constraint_ranks.rank
     if start.may_have_changed_branch:

@@ -14,10 +14,10 @@ from eomc.derive.ldl import Pairs, Vector
 from eomc.derive.linearize import directional_derivatives
 from eomc.model.symbols import Output
 from eomc.model.system import System
-from eomc.program.admissible import Candidate, weight
 from eomc.program.interpret import evaluator
 from eomc.program.ir import Function
 from eomc.program.lower import lower
+from eomc.program.routes import Candidate, weight
 
 
 def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:

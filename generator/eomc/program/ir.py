@@ -209,3 +209,13 @@ def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
     return Call(
         value.function, tuple(replace(a, name=real(a.name)) if a.name else a for a in value.args)
     )
+
+
+def names_of_pair(names: Mapping[str, str]) -> tuple[str, str]:
+    """Return the names of the sine and of the cosine of an angle.
+
+    `names` maps "sin", "cos" or both to existing names. If one of the two is missing, its name is
+    derived from the other one, as cos_theta_ from sin_theta.
+    """
+    sine = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
+    return sine, names.get("cos") or names["sin"].replace("sin", "cos") + "_"

@@ -9,9 +9,8 @@ import sympy
 from sympy import Expr, S, Symbol
 
 from eomc.derive.tape import Stage, Tape, split
-from eomc.program.common_subexpressions import reduce_operations
+from eomc.program.common_subexpressions import ScheduleBuilder, reduce_operations
 from eomc.program.ir import Assignment, Call, Cost, Function, Operand, Product, Sum, Value, rename
-from eomc.program.schedule_builder import ScheduleBuilder
 
 
 def lower(
@@ -44,7 +43,7 @@ def lower(
         values that have no name in the scene.
     """
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
-    work = _Reader(tape)
+    work = _TapeReader(tape)
     for symbol in tape.live(ends):
         work.take(symbol)
     operands = [work.operand(atom) for atom in ends]
@@ -69,7 +68,7 @@ def lower(
     return _renamed(function, work.hints, reserved)
 
 
-class _Reader(ScheduleBuilder):
+class _TapeReader(ScheduleBuilder):
     """Values that are read from a tape."""
 
     def __init__(self, tape: Tape) -> None:

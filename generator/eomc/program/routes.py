@@ -2,13 +2,15 @@
 derived.
 
 To add a route, write a function of `RouteInputs` here or in derive/ and an entry of `ROUTES`.
-admissible.py selects the route of each function.
+`cheapest` selects the route of each function: the one with the fewest operations among those
+without loss of accuracy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from sympy import Expr
@@ -18,7 +20,11 @@ from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Rows, SolveResult, solve
 from eomc.derive.link_multipliers import prefer_short_chains
 from eomc.derive.tape import Tape
+from eomc.model.symbols import ALONG
 from eomc.model.system import System
+from eomc.program.interpret import evaluator, nearby
+from eomc.program.ir import Cost, Function
+from eomc.program.lower import lower
 from eomc.program.polynomial import Expander
 
 MAX_EXPANDED_DEFINITIONS = 120  # definitions that C depends on, up to which it is expanded
@@ -44,20 +50,20 @@ class RouteInputs:
         if self.lagrange is None or self.expander is None:
             return None
         D, n = self.lagrange.D, len(self.lagrange.bias)
-        lower = [(i, j) for i in range(n) for j in range(i + 1)]
+        triangle = [(i, j) for i in range(n) for j in range(i + 1)]
         entries_and_forces = self.expander.expand(
-            [*(D[i][j] for i, j in lower), *self.lagrange.balance]
+            [*(D[i][j] for i, j in triangle), *self.lagrange.balance]
         )
         if entries_and_forces is None:
             return None
-        entries = dict(zip(lower, entries_and_forces, strict=False))
+        entries = dict(zip(triangle, entries_and_forces, strict=False))
         rows = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
-        return self.lagrange.tape, rows, entries_and_forces[len(lower) :]
+        return self.lagrange.tape, rows, entries_and_forces[len(triangle) :]
 
 
 @dataclass(frozen=True)
-class Functions:
-    """Functions of the equations of motion by one route, as atoms of `tape`.
+class RouteFunctions:
+    """RouteFunctions of the equations of motion by one route, as atoms of `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
@@ -109,7 +115,7 @@ class Route:
     name: str
     sentence: str
     accelerations: Callable[[RouteInputs], SolveResult] = lambda _: None
-    functions: Callable[[RouteInputs], Functions | None] = lambda _: None
+    functions: Callable[[RouteInputs], RouteFunctions | None] = lambda _: None
     solved: Callable[[System, str], str] = _by_ldl
     penalty: float = 1.0
 
@@ -125,7 +131,7 @@ def _power(e: EquationsOfMotion) -> Expr:
     return e.tape.total([e.power, *powers])
 
 
-def _functions(e: EquationsOfMotion | None) -> Functions | None:
+def _functions(e: EquationsOfMotion | None) -> RouteFunctions | None:
     """Return all functions of the equations of motion other than the accelerations."""
     if e is None:
         return None
@@ -142,10 +148,10 @@ def _functions(e: EquationsOfMotion | None) -> Functions | None:
         outputs["power"] = [power]
     if e.signals:
         outputs["signal"] = e.signals
-    return Functions(e.tape, outputs, e.notes)
+    return RouteFunctions(e.tape, outputs, e.notes)
 
 
-def _expanded_functions(material: RouteInputs) -> Functions | None:
+def _expanded_functions(material: RouteInputs) -> RouteFunctions | None:
     """Return the functions by Lagrange, expanded."""
     plain = _functions(material.lagrange)
     if plain is None or material.expander is None:
@@ -158,7 +164,7 @@ def _expanded_functions(material: RouteInputs) -> Functions | None:
     return replace(plain, outputs=outputs)
 
 
-def _rotated(material: RouteInputs) -> Functions | None:
+def _rotated(material: RouteInputs) -> RouteFunctions | None:
     """Return C of a short tree, expanded: rotations that cancel are removed by sin^2 + cos^2 =
     1.
     """
@@ -252,3 +258,107 @@ ROUTES: Mapping[str, Route] = {
         ),
     )
 }
+
+
+# --- selection ------------------------------------------------------------------------------------
+
+MAX_ERROR_RATIO = 2  # a route with more than twice the rounding error of another is not used
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to compute a function of the generated code, as derived by one route.
+
+    A route is a method of derivation, such as Lagrange's or Newton and Euler's. All expressions are
+    defined on the attribute `tape`, a list of elementary operations with named results.
+
+    Attributes
+    ----------
+    outputs
+        The results of the function.
+    checks
+        Pairs (pivot, diagonal entry) of a matrix factorization; every pivot must be positive.
+    labels
+        Names for the outputs, then for pivots and diagonal entries.
+    order
+        Indices of the coordinates in order of elimination.
+    multipliers
+        Lagrange multipliers of the constraints; for accelerations only.
+    parts
+        For each constraint that is active in some contact or friction modes only: the numerator and
+        the denominator of its multiplier.
+    """
+
+    tape: Tape
+    outputs: Sequence[Expr]
+    checks: Sequence[tuple[Expr, Expr]] = ()
+    labels: Sequence[str] = ()
+    order: tuple[int, ...] = ()
+    multipliers: Sequence[Expr] = ()
+    parts: Mapping[int, Sequence[Expr]] = field(default_factory=dict)
+
+
+def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
+    """Return the function with the given name, computed by the route with the fewest operations.
+
+    A route is a method of derivation. `routes` maps the name of each route to the function that it
+    gives. Routes with significantly larger rounding errors than another are excluded.
+    """
+    lowered = {
+        way: lower(name, r.tape, r.outputs, system.names, checks=r.checks, labels=r.labels)
+        for way, r in routes.items()
+    }
+
+    def rank(route: str) -> tuple[float, int]:
+        return weight(lowered[route].cost) * ROUTES[route].penalty, len(lowered[route].early)
+
+    by_weight = sorted(lowered, key=rank)
+    best, first = by_weight[0], next(iter(lowered))
+    if len(lowered) > 1 and lowered[best].body != lowered[first].body:
+        errors = _roundings(lowered, system)
+        least = min(errors.values())
+        # Without cancellation, n rounding errors add up to about sqrt(n) units of rounding.
+        usual = 2.0**-52 * max(4.0, math.sqrt(len(lowered[best].body)))
+        best = next(r for r in by_weight if errors[r] <= MAX_ERROR_RATIO * max(least, usual))
+    costs = tuple((route, f.cost) for route, f in lowered.items())
+    return replace(lowered[best], route=best, routes=costs)
+
+
+def _roundings(functions: Mapping[str, Function], system: System) -> dict[str, float]:
+    """Return the largest relative error of each function in doubles, at some states around the
+    start.
+
+    The error is infinite where a function fails and another does not: without masses, link
+    multipliers fail where D may still be regular.
+    """
+    states = range(5 if all(len(f.body) < 500 for f in functions.values()) else 2)
+    errors = {route: _errors(f, system, states) for route, f in functions.items()}
+    comparable = [k for k in states if any(math.isfinite(values[k]) for values in errors.values())]
+    return {
+        route: max((values[k] for k in comparable), default=0.0) for route, values in errors.items()
+    }
+
+
+def _errors(function: Function, system: System, states: Iterable[int]) -> list[float]:
+    """Return the relative error of the results at each state; inf where there is no result."""
+    in_doubles, exact, out = evaluator(function), evaluator(function, exact=True), []
+    for k in states:
+        values = nearby(system, k)
+        values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
+        values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
+        try:
+            (computed, regular), (true, _) = in_doubles(values), exact(values)
+        except (ArithmeticError, ValueError):
+            regular = False
+        if not regular:
+            out.append(math.inf)
+            continue
+        size = max(map(abs, true))
+        difference = max(abs(a - b) for a, b in zip(computed, true, strict=True))
+        out.append(difference / size if size else 0.0)
+    return out
+
+
+def weight(cost: Cost) -> int:
+    """Return the cost of one call of a function, in units of the cost of one addition."""
+    return cost.adds + cost.multiplications + 8 * cost.divisions + 25 * (cost.sincos + cost.calls)

@@ -84,7 +84,7 @@ def read(file: str | os.PathLike[str]) -> Robot:
         raise EomcError(f"{shown}: {xml.RUN_XACRO}")
     if root.kind != "robot":
         raise EomcError(f"{shown}: not a URDF: its root element is <{root.kind}>, not <robot>")
-    return _Reader(root, Path(file), shown).robot()
+    return _UrdfReader(root, Path(file), shown).robot()
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class _Joint:
     drive: Drive | None
 
 
-class _Reader:
+class _UrdfReader:
     """Reader of one file, which collects faults."""
 
     def __init__(self, root: Tag, path: Path, shown: str) -> None:

@@ -9,9 +9,9 @@ from sympy import S
 
 from eomc.emit.c_expression import DOUBLE, MIN_SIMD_ANGLES
 from eomc.emit.c_names import Target
-from eomc.program import outline, trig, two_point
+from eomc.program import outline, two_point
 from eomc.program.ir import Function, Operand, rename
-from eomc.program.trig import Angle
+from eomc.program.two_point import Angle
 
 MAX_INLINED_OPERATIONS = 300  # of accelerations, up to which every stage inlines them
 
@@ -86,7 +86,7 @@ class Accelerations:
         """
         assert self._split_projection is not None
         remaining = self._split_projection[1]
-        angles, separated = trig.separate_angles(remaining, self.target.names)
+        angles, separated = two_point.separate_angles(remaining, self.target.names)
         known = {(frozenset(a.terms), a.offset): a for a in self.angles}
         pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]
         names = {
@@ -112,7 +112,7 @@ class Accelerations:
         """
         if not self.target.real.reach:
             return (), self.staged[1]
-        return trig.separate_angles(self.staged[1], self.target.names)
+        return two_point.separate_angles(self.staged[1], self.target.names)
 
     @property
     def angles(self) -> tuple[Angle, ...]:

@@ -24,7 +24,7 @@ from eomc.emit.projection import ProjectionView
 from eomc.program import outline
 from eomc.program.ir import Call, Function, Sum
 from eomc.program.program import TIME
-from eomc.program.trig import Angle
+from eomc.program.two_point import Angle
 
 INLINE, NOINLINE = "INLINE", "NOINLINE"
 
