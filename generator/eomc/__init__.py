@@ -6,7 +6,7 @@
 """
 
 from eomc.base.errors import EomcError, SceneError
-from eomc.base.version import __version__
+from eomc.base.resources import __version__
 from eomc.pipeline import build, export_fmu, load, read, sources
 
 __all__ = [

@@ -1,9 +1,14 @@
-"""Templates, hand-written C, scenes, runtime files: inside the package, or above it in a clone."""
+"""What is installed with eomc: its version, templates, hand-written C, scenes and runtime files.
+
+The files are inside the package, or above it in a clone of the repository.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+
+__version__ = "0.1.0"  # the only place
 
 PACKAGE = Path(__file__).resolve().parent.parent
 

@@ -15,7 +15,7 @@ import click
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, FolderError, SceneError
-from eomc.base.version import __version__
+from eomc.base.resources import __version__
 from eomc.cli import terminal
 from eomc.cli.terminal import fail, say
 

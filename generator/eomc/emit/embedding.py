@@ -7,8 +7,8 @@ import textwrap
 from dataclasses import dataclass
 from typing import ClassVar
 
+from eomc.base.resources import __version__
 from eomc.base.texts import FreeText
-from eomc.base.version import __version__
 from eomc.emit import adaptive
 from eomc.emit.c_names import Target
 from eomc.emit.public import KINDS, Public, program_function, refuses, takes_qdd

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
+from eomc.base.resources import __version__
 from eomc.base.texts import FreeText, command, flat, line
-from eomc.base.version import __version__
 from eomc.emit.c_names import Target
 
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from eomc.base import resources
 from eomc.base.errors import EomcError, FolderError
-from eomc.base.version import __version__
+from eomc.base.resources import __version__
 from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain.compiler import (
     MANY_OPERATIONS,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eomc.base import texts
-from eomc.base.version import __version__
+from eomc.base.resources import __version__
 from eomc.emit.package import CompiledView, Form
 from eomc.emit.render import Sources, show
 from eomc.toolchain import extension

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
+from eomc.base.resources import __version__
 from eomc.base.texts import FreeText
-from eomc.base.version import __version__
 from eomc.emit.c_names import Target
 from eomc.emit.fmu.variables import Variable, Variables, has_signals, parse_unit, variables
 from eomc.emit.package import start_formulas
