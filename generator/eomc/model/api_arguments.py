@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import sympy
@@ -329,43 +330,46 @@ def symbol_of(value: Any, role: str) -> Any:
     return symbol(value) if isinstance(value, str) else value
 
 
-def run(
-    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
-    tolerance: Any, events: bool, inverse_dynamics: Any,
-) -> RunSettings:  # fmt: skip
-    """Return the settings of simulations and generated code from the arguments of System.make.
+def run_settings(settings: RunSettings, adaptive: bool) -> RunSettings:
+    """Check settings that a user passed to System.make, and return them in their final form.
 
-    All arguments but `events` are the arguments of System.make with these names. h, duration: step
-    size and length of a run in s. methods: names of fixed-step methods, or "auto" for adaptive
-    steps. real: C type of numbers. events: whether the system has events or friction; its steps are
-    then adaptive too. Raises EomcError for invalid settings.
+    settings: the arguments as they were given; `methods` may contain "auto", for adaptive steps.
+    adaptive: True if the system has events or friction, so that its steps are adaptive too. In the
+    result "auto" is left out, and adaptive steps have a tolerance. Raises EomcError for invalid
+    settings.
     """
-    for name, value in (("h", h), ("duration", duration)):
-        if number(value, name) <= 0:
+    for name in ("h", "duration"):
+        if number(value := getattr(settings, name), name) <= 0:
             raise fault(name, f"must be greater than zero, here {value!r}")
-    methods = (methods,) if isinstance(methods, str) else methods
-    methods = tuple(methods) if isinstance(methods, (tuple, list)) else (methods,)
-    known = (*METHODS, "auto")
+    methods, known = settings.methods, (*METHODS, "auto")
     if not methods or not all(isinstance(m, str) and m in known for m in methods):
         raise fault("methods", f"known are {', '.join(known)}, here {methods!r}")
-    events = events or "auto" in methods
-    methods = tuple(m for m in methods if m != "auto") or ("rk4",)
-    if real not in REALS:
-        raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")
-    flags = {"batch": batch, "discretize": discretize, "inverse_dynamics": inverse_dynamics}
-    for name, value in flags.items():
-        if not isinstance(value, bool):
+    if settings.real not in REALS:
+        raise fault("real", f"known are {', '.join(REALS)}, here {settings.real!r}")
+    for name in ("batch", "discretize", "inverse_dynamics"):
+        if not isinstance(value := getattr(settings, name), bool):
             raise fault(name, f"must be True or False, here {value!r}")
+    linearize, tolerance = settings.linearize, settings.tolerance
     if not isinstance(linearize, bool) and linearize != "parameters":
         raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
     if tolerance is not None:
-        least = MIN_FLOAT_TOLERANCE if real == "float" else MIN_TOLERANCE
+        least = MIN_FLOAT_TOLERANCE if settings.real == "float" else MIN_TOLERANCE
         if not least <= number(tolerance, "tolerance") <= MAX_TOLERANCE:
             raise fault(
                 "tolerance", f"lies between {least:g} and {MAX_TOLERANCE:g}, here {tolerance!r}"
             )
         tolerance = float(tolerance)
-    elif events:
-        tolerance = DEFAULT_TOLERANCE[real]
-    plain = (float(h), float(duration), methods, real, batch, linearize, discretize)
-    return RunSettings(*plain, tolerance=tolerance, inverse_dynamics=inverse_dynamics)
+    elif adaptive or "auto" in methods:
+        tolerance = DEFAULT_TOLERANCE[settings.real]
+    return replace(
+        settings,
+        h=float(settings.h),
+        duration=float(settings.duration),
+        methods=tuple(m for m in methods if m != "auto") or ("rk4",),
+        tolerance=tolerance,
+    )
+
+
+def as_tuple(value: Any) -> tuple[Any, ...]:
+    """Return the items of a list or tuple as a tuple; any other value becomes a tuple of one."""
+    return tuple(value) if isinstance(value, (tuple, list)) else (value,)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import sympy
@@ -58,19 +58,50 @@ def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: It
     return min((i for i in inputs if symbol(i) in uses), default="")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SystemArguments:
+    """The arguments of System.make as a user gave them; they are explained there.
+
+    Arguments that were not given have their defaults, {} in place of None. They are not checked,
+    except for `run`, the settings of simulations and of the generated code.
+    """
+
+    name: str
+    coordinates: Any
+    kinetic: Any
+    potential: Any
+    dissipation: Any
+    parameters: Any
+    forces: Any
+    inputs: Any
+    definitions: Any
+    outputs: Any
+    constraints: Any
+    guess: Any
+    limits: Any
+    events: Any
+    friction: Any
+    picture: Any
+    units: Any
+    title: str
+    run: RunSettings
+
+
 class Maker:
     """Converter of the arguments of System.make to a system with symbols of its own.
 
     The user's symbols may have any assumptions and names. Symbols of the system, which replace
-    them, are real and have names that are valid in C. name: name of the system.
+    them, are real and have names that are valid in C. arguments: the arguments of System.make.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, arguments: SystemArguments) -> None:
+        name = arguments.name
         if not isinstance(name, str):
             raise api_arguments.fault("name", f"must be text, here {name!r}")
         if why := names.module_fault(name):
             raise EomcError(f"System.make: name: {why}")
         self.name = name
+        self.arguments = arguments
         self.map: dict[Any, Expr] = {}
         self.used: dict[str, Expr] = {}  # symbols of the user's expressions, by their names
         self.taken: dict[str, Any] = {}
@@ -140,42 +171,29 @@ class Maker:
         self.fixed[declared.symbol] = never_negative
         return declared
 
-    def make(
-        self, of: type[AnySystem], coordinates: Any, kinetic: Any, potential: Any,
-        parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
-        definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
-        rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
-        title: str, run: RunSettings, limits: Mapping[Any, Any], events: Mapping[str, Any],
-        picture: Any, friction: Any,
-    ) -> AnySystem:  # fmt: skip
-        """Make a mechanical system from the arguments of System.make and return it.
+    def make(self, of: type[AnySystem]) -> AnySystem:
+        """Make a mechanical system from the arguments and return it.
 
-        of: class of the result, such as System. rows: the argument `constraints` of System.make.
-        run: settings of simulations and generated code. All other arguments are those of
-        System.make with the same names. Raises EomcError for invalid arguments.
+        of: class of the result, such as System. Raises EomcError for invalid arguments.
         """
-        declarations = (coordinates, parameters, inputs, definitions)
-        starts = api_arguments.symbols(coordinates, "coordinates", None)
-        parameters = api_arguments.mapping(parameters, "parameters", "{m: 2.0}")
-        forces = api_arguments.by_name(forces, "forces", "{x: F}")
-        definitions = api_arguments.mapping(definitions, "definitions", "{y: l*cos(theta)}")
-        units = api_arguments.by_name(units, "units", '{m: "kg"}')
-        for text in (title, *units.values()):
-            if not isinstance(text, str):
-                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
+        given = self.arguments
+        starts = api_arguments.symbols(given.coordinates, "coordinates", None)
+        parameters = api_arguments.mapping(given.parameters, "parameters", "{m: 2.0}")
+        forces = api_arguments.by_name(given.forces, "forces", "{x: F}")
+        definitions = api_arguments.mapping(given.definitions, "definitions", "{y: l*cos(theta)}")
+        units = self._units()
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
         coordinates = [self._coordinate(one, units) for one in starts]
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         coordinates = [*self._with_initial_values(coordinates, starts.values(), declared)]
-        coordinates = self._mark_fixed(coordinates, [*starts], guess, bool(rows))
-        pending = api_arguments.symbols(inputs, "inputs", 0)
+        coordinates = self._mark_fixed(coordinates, [*starts])
+        pending = api_arguments.symbols(given.inputs, "inputs", 0)
         named = map(name_of, (*starts, *parameters, *pending, *definitions))
-        api_arguments.check_units(
-            units, [*named, *map(str, (*rows, *outputs))], [*map(str, outputs)]
-        )
+        outputs = [*map(str, given.outputs)]
+        api_arguments.check_units(units, [*named, *map(str, given.constraints), *outputs], outputs)
         input_names = {i: self._declare(i, "input") for i in pending}
-        ends = self._limits(limits, pending, declared)
+        ends = self._limits(pending, declared)
         self.known = {c.q for c in coordinates} | {c.qd for c in coordinates} | {t}
         self.known |= {symbol(n) for n in self.taken}
         ordered = []
@@ -186,54 +204,60 @@ class Maker:
             ordered.append((defined, expr))
         if unknown := [f for f in forces if f not in map(name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
-        expression = self._expression
-        rubbed = api_arguments.by_name(friction, "friction", "{x: mu*m*g}")
+        rubbed = api_arguments.by_name(given.friction, "friction", "{x: mu*m*g}")
         sticks = [f"{self.map[x].name}_sticks" for x in starts if name_of(x) in rubbed]
+        used_inputs = input_names.values()
         drawn, drawn_text = None, ""
-        if picture is not None:
-            names = input_names.values()
+        if given.picture is not None:
             drawn, drawn_text = picture_scene(
-                picture, expression, coordinates, declared, names, ordered
+                given.picture, self._expression, coordinates, declared, used_inputs, ordered
             )
-        energies = self._energies(
-            {"kinetic": kinetic, "potential": potential, "dissipation": dissipation},
-            ordered, [c.qd for c in coordinates], input_names.values(),
-        )  # fmt: skip
+        energies = self._energies(ordered, [c.qd for c in coordinates], used_inputs)
         fields: dict[str, Any] = {
             "name": self.name,
             "coordinates": tuple(coordinates),
             **energies,
-            "forces": tuple(expression(forces.get(name_of(c), 0), f"force on {c}") for c in starts),
+            "forces": tuple(
+                self._expression(forces.get(name_of(c), 0), f"force on {c}") for c in starts
+            ),
             "parameters": tuple(declared),
             "inputs": tuple(self._inputs(pending, input_names, units, ends, ordered)),
             "definitions": tuple(ordered),
-            **self._constraints(rows, coordinates, ordered, input_names.values(), units),
-            "events": tuple(self._events(events, starts, declared)),
+            **self._constraints(coordinates, ordered, used_inputs, units),
+            "events": tuple(self._events(starts, declared)),
             "outputs": tuple(
-                self._outputs(outputs, starts, coordinates, units, [*map(str, rows), *sticks])
+                self._outputs(starts, coordinates, units, [*map(str, given.constraints), *sticks])
             ),
-            "run": run,
-            "title": title or self.name.replace("_", " ").capitalize(),
+            "run": given.run,
+            "title": given.title or self.name.replace("_", " ").capitalize(),
         }
-        self.frictions = list(self._frictions(friction, starts, declared))
-        as_text = {one for group in declarations for one in group if isinstance(one, str)}
-        own = _own_symbols(self.taken, starts, as_text, self.used)
+        self.frictions = list(self._frictions(starts, declared))
         whole = sympy.srepr(sorted(fields.items())) + drawn_text + str(self.frictions or "")
-        digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(
             **fields,
-            digest=digest,
+            digest=hashlib.sha256(whole.encode()).hexdigest(),
             renamed=tuple(self.renamed),
             picture_scene=drawn,
-            own_symbols=own,
+            own_symbols=self._own_symbols(starts),
         )
 
+    def _units(self) -> dict[str, str]:
+        """Return the units by name."""
+        units = api_arguments.by_name(self.arguments.units, "units", '{m: "kg"}')
+        for text in (self.arguments.title, *units.values()):
+            if not isinstance(text, str):
+                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
+        return units
+
     def _energies(
-        self, energies: Mapping[str, Any], definitions: Sequence[tuple[Symbol, Expr]],
-        velocities: Sequence[Symbol], inputs: Iterable[str],
+        self, definitions: Sequence[tuple[Symbol, Expr]], velocities: Sequence[Symbol],
+        inputs: Iterable[str],
     ) -> dict[str, Expr]:  # fmt: skip
         """Return the energies by field name, the potential split into its parts."""
-        expressions = {role: self._expression(energy, role) for role, energy in energies.items()}
+        expressions = {
+            role: self._expression(getattr(self.arguments, role), role)
+            for role in ("kinetic", "potential", "dissipation")
+        }
         for role, energy in expressions.items():
             if used_input := _input_in(energy, definitions, inputs):
                 why = f"{used_input} is an input, and an energy can't depend on inputs"
@@ -293,9 +317,10 @@ class Maker:
             )  # fmt: skip
 
     def _mark_fixed(
-        self, coordinates: Sequence[Coordinate], keys: Sequence[Any], guess: Any, rows: bool
+        self, coordinates: Sequence[Coordinate], keys: Sequence[Any]
     ) -> list[Coordinate]:
         """Return the coordinates with initial values marked as fixed or as guesses."""
+        guess, rows = self.arguments.guess, bool(self.arguments.constraints)
         if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
             raise api_arguments.fault(
                 "guess", f"give a list of coordinates, such as [x], here {guess!r}"
@@ -318,10 +343,11 @@ class Maker:
         ]
 
     def _constraints(
-        self, rows: Any, coordinates: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
+        self, coordinates: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
         inputs: Iterable[str], units: Mapping[Any, str],
     ) -> dict[str, Any]:  # fmt: skip
         """Return the constraints and their warnings by field name; empty without constraints."""
+        rows = self.arguments.constraints
         if not isinstance(rows, Mapping):
             example = '{"rod": x**2 + y**2 - l**2}'
             raise api_arguments.fault(
@@ -374,15 +400,14 @@ class Maker:
             ends = limits.get(name, (None, None))
             yield Input(used[one], units.get(name, ""), value, limits=ends)
 
-    def _limits(
-        self, limits: Any, inputs: Iterable[Any], parameters: Iterable[Parameter]
-    ) -> dict[str, Ends]:
+    def _limits(self, inputs: Iterable[Any], parameters: Iterable[Parameter]) -> dict[str, Ends]:
         """Return the limits of inputs by name, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
         known, checked = {name_of(i) for i in inputs}, dict[str, Ends]()
         rule = "limits are made of numbers and parameters"
-        for name, pair in api_arguments.by_name(limits, "limits", "{F: (-1, 1)}").items():
+        limits = api_arguments.by_name(self.arguments.limits, "limits", "{F: (-1, 1)}")
+        for name, pair in limits.items():
             role = f"limits of {name}"
             if name not in known:
                 raise api_arguments.fault(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
@@ -400,10 +425,9 @@ class Maker:
             checked[name] = (least, most)
         return checked
 
-    def _events(
-        self, events: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
-    ) -> Iterator[Event]:
+    def _events(self, starts: Iterable[Any], parameters: Iterable[Parameter]) -> Iterator[Event]:
         """Yield the events; each is given as a formula or a dict as in [[event]]."""
+        events = self.arguments.events
         if not isinstance(events, Mapping):
             raise api_arguments.fault(
                 "events", f'give a dict, such as {{"impact": y}}, here {events!r}'
@@ -441,12 +465,13 @@ class Maker:
             yield Event(called, when, direction, action, tuple(jump), note=note)
 
     def _frictions(
-        self, friction: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
+        self, starts: Iterable[Any], parameters: Iterable[Parameter]
     ) -> Iterator[Friction]:
         """Yield stick-slip friction along coordinates, over parameters."""
         values = {p.symbol: p.value for p in parameters}
         known = {name_of(one): self.map[one].name for one in starts}
-        for name, size in api_arguments.by_name(friction, "friction", "{x: mu*m*g}").items():
+        friction = api_arguments.by_name(self.arguments.friction, "friction", "{x: mu*m*g}")
+        for name, size in friction.items():
             role = f"friction of {name}"
             if name not in known:
                 raise api_arguments.fault(role, f"coordinates are {', '.join(known)}")
@@ -458,10 +483,11 @@ class Maker:
             yield Friction(known[name], force, "friction")
 
     def _outputs(
-        self, outputs: Any, starts: Iterable[Any], coordinates: Sequence[Coordinate],
+        self, starts: Iterable[Any], coordinates: Sequence[Coordinate],
         units: Mapping[Any, str], rows: Sequence[str],
     ) -> Iterator[Output]:  # fmt: skip
         """Yield the outputs, which may use accelerations and multipliers (lambda_rod)."""
+        outputs = self.arguments.outputs
         for one, c in zip(starts, coordinates, strict=True):
             if isinstance(one, AppliedUndef):
                 self.map[sympy.Derivative(one, (one.args[0], 2))] = c.qdd
@@ -499,31 +525,29 @@ class Maker:
             self.map[Symbol(one.name)] = symbol(used)
         return used
 
+    def _own_symbols(self, coordinates: Iterable[Any]) -> dict[str, Expr]:
+        """Return the user's symbols of coordinates, their derivatives, and all other quantities.
 
-def _own_symbols(
-    declared: Mapping[str, Any], coordinates: Iterable[Any], as_text: Collection[str],
-    used: Mapping[str, Expr],
-) -> dict[str, Expr]:  # fmt: skip
-    """Return the user's symbols of coordinates, their derivatives, and all other quantities.
-
-    declared: by the name that each has in the system. Names that were given as text (`as_text`)
-    have no symbol of the user. used: the symbols of the user's expressions, by their names. A
-    velocity that has none there is real where its coordinate is, and has either sign.
-    """
-    moving, found = {*coordinates}, dict[str, Expr]()
-    for name, one in declared.items():
-        if name_of(one) in as_text:
-            continue
-        found[name] = one
-        if one in moving and isinstance(one, AppliedUndef):
-            (time,) = one.args
-            found["t"] = time
-            found[f"{name}_dot"], found[f"{name}_ddot"] = one.diff(time), one.diff(time, 2)
-        elif one in moving:
-            for order in ("_dot", "_ddot"):
-                rate = Symbol(f"{one}{order}", real=one.is_real)
-                found[name + order] = used.get(rate.name, rate)
-    return found
+        Names that were given as text have no symbol of the user. A velocity that has none in the
+        user's expressions is real where its coordinate is, and has either sign.
+        """
+        given = self.arguments
+        declarations = (given.coordinates, given.parameters, given.inputs, given.definitions)
+        as_text = {one for group in declarations for one in group if isinstance(one, str)}
+        moving, found = {*coordinates}, dict[str, Expr]()
+        for name, one in self.taken.items():
+            if name_of(one) in as_text:
+                continue
+            found[name] = one
+            if one in moving and isinstance(one, AppliedUndef):
+                (time,) = one.args
+                found["t"] = time
+                found[f"{name}_dot"], found[f"{name}_ddot"] = one.diff(time), one.diff(time, 2)
+            elif one in moving:
+                for order in ("_dot", "_ddot"):
+                    rate = Symbol(f"{one}{order}", real=one.is_real)
+                    found[name + order] = self.used.get(rate.name, rate)
+        return found
 
 
 # --- functions that formulas of scenes have -------------------------------------------------------

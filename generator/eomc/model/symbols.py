@@ -30,7 +30,7 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
         return sympy.S.Zero if inner.is_number else None
 
     def _latex(self, printer: Any, exp: str = "") -> str:
-        rate = rf"\frac{{d}}{{dt}} \left({printer._print(self.args[0])}\right)"
+        rate = rf"\frac{{d}}{{dt}} \left({printer.parenthesize(self.args[0], 0)}\right)"
         return rf"\left({rate}\right)^{{{exp}}}" if exp else rate
 
 

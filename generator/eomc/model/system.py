@@ -12,8 +12,9 @@ from functools import partial
 from typing import Any, Never
 
 from eomc.base.errors import SceneError
-from eomc.model import api_arguments, from_sympy
+from eomc.model import api_arguments
 from eomc.model.api_arguments import or_empty
+from eomc.model.from_sympy import Maker, SystemArguments
 from eomc.model.hybrid import add_hybrid_dynamics
 from eomc.model.mechanics import Mechanics
 from eomc.model.symbols import (
@@ -28,6 +29,7 @@ from eomc.model.symbols import (
     symbol,
     t,
 )
+from eomc.scene.scene import RunSettings
 
 __all__ = [
     "Constraint",
@@ -181,17 +183,40 @@ class System(Mechanics):
             raise api_arguments.fault(
                 "kinetic", f"None is not an expression: {api_arguments.LAGRANGIAN}"
             )
-        run = api_arguments.run(
-            h, duration, methods, real, batch, linearize, discretize, tolerance,
-            bool(events or friction), inverse_dynamics,
-        )  # fmt: skip
-        maker = from_sympy.Maker(name)
-        system = maker.make(
-            cls, coordinates, kinetic, potential, or_empty(parameters), dissipation,
-            or_empty(forces), inputs, or_empty(definitions), or_empty(outputs),
-            or_empty(constraints), guess, or_empty(units), title, run,
-            or_empty(limits), or_empty(events), picture, or_empty(friction),
-        )  # fmt: skip
+        run = RunSettings(
+            h=h,
+            duration=duration,
+            methods=api_arguments.as_tuple(methods),
+            real=real,
+            batch=batch,
+            linearize=linearize,
+            discretize=discretize,
+            inverse_dynamics=inverse_dynamics,
+            tolerance=tolerance,
+        )
+        given = SystemArguments(
+            name=name,
+            coordinates=coordinates,
+            kinetic=kinetic,
+            potential=potential,
+            dissipation=dissipation,
+            parameters=or_empty(parameters),
+            forces=or_empty(forces),
+            inputs=inputs,
+            definitions=or_empty(definitions),
+            outputs=or_empty(outputs),
+            constraints=or_empty(constraints),
+            guess=guess,
+            limits=or_empty(limits),
+            events=or_empty(events),
+            friction=or_empty(friction),
+            picture=picture,
+            units=or_empty(units),
+            title=title,
+            run=api_arguments.run_settings(run, bool(events or friction)),
+        )
+        maker = Maker(given)
+        system = maker.make(cls)
         if faults := system.beyond_float():
             raise SceneError(faults)
         system = add_hybrid_dynamics(system, maker.frictions)
