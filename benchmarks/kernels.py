@@ -35,6 +35,7 @@ import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
 from eomc.emit import c_expression
+from eomc.emit.c_expression import CContext
 from eomc.program import program
 from eomc.program.ir import Call, Function, Operand
 from eomc.toolchain import compiler
@@ -168,11 +169,12 @@ def panda_body(function: Function) -> str:
     kept = sorted({n for a in late for n in a.value.names} & known)
     ends = tuple(Operand(S.One, name) for name in kept)
     first = replace(function, body=early, outputs=ends, checks=())
-    configuration = c_expression.body(first, "panda", where, PAIR)
+    configuration = c_expression.body(first, CContext("panda", PAIR), where)
     outside = {name: f"kept[{2 * k}]" for k, name in enumerate(kept)}
     outside |= {f"{name}_dot": f"qd[{k - 1}]" for name, k in joints.items()}
     outside |= {f"{name}_torque": f"u[{k - 1}]" for name, k in joints.items()}
-    velocities = c_expression.body(replace(function, body=late, checks=()), "panda", outside)
+    final = replace(function, body=late, checks=())
+    velocities = c_expression.body(final, CContext("panda"), outside)
     return "\n".join(
         [
             f"#define PANDA_KEPT {len(kept)}",

@@ -37,7 +37,7 @@ EVENTS_PER_STEP = 32  # without events at the same time
 
 
 @dataclass(frozen=True)
-class AdaptiveFields(NameFields):
+class AdaptiveFields:
     """Coefficients and constants that the templates of adaptive steps share, as C literals.
 
     Attributes
@@ -83,7 +83,7 @@ class AdaptiveFields(NameFields):
 
 
 @dataclass(frozen=True)
-class AdaptiveStepView(AdaptiveFields):
+class AdaptiveStepView(NameFields, AdaptiveFields):
     """Data for c/adaptive.c: one step with adaptive step-size control.
 
     The four templates that it includes read the same data.

@@ -282,43 +282,64 @@ class CBody:
         return tuple(line for block in (*self.early, *self.blocks) for line in block.lines)
 
 
+@dataclass(frozen=True)
+class CContext:
+    """The C code in which statements stand: its names and its type of numbers.
+
+    Attributes
+    ----------
+    prefix
+        The scene's name, with which the names of all generated C functions begin.
+    real
+        C type of the numbers.
+    reserved
+        Names that no local variable may have.
+    """
+
+    prefix: str
+    real: Real = DOUBLE
+    reserved: frozenset[str] = frozenset()
+
+
 def body(
     function: Function,
-    prefix: str,
+    context: CContext,
     where: Mapping[str, str],
-    real: Real = DOUBLE,
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
     in_order: bool = False,
-    reserved: frozenset[str] = frozenset(),
     together: bool = False,
 ) -> CBody:
     """Return a function of a program as C statements.
 
     Parameters
     ----------
+    function
+        The function, a list of elementary assignments.
+    context
+        The C code in which the statements stand.
     where
-        The C expression of each variable that is not computed here (`m_c` -> `p->m_c`).
+        The C expression of each variable that the function does not compute, by name. An example
+        is `p->m_c` for the parameter m_c.
     stored
-        C expressions for values that are stored there rather than in local variables.
+        C expressions, by name, of values that are assigned to them rather than to local variables.
     pivots
-        The number of pivots of the whole function, if `function` is a part of it.
+        Number of pivots that are tested in the whole function, if `function` is a part of it. The
+        tolerance of these tests, which detect singular matrices, is proportional to it.
     in_order
-        Keep the order of the terms of sums.
-    reserved
-        Names that no local variable may have.
+        Whether to keep the order of the terms of sums.
     together
-        Compute the sines of several angles together in vector registers.
+        Whether to compute the sines of several angles together in vector registers.
     """
-    stored = stored or {}
+    stored, real = stored or {}, context.real
     inline = _inlined(function)
-    new = _numbered(function, inline, reserved)
+    new = _numbered(function, inline, context.reserved)
     function = rename(function, new)
     inline = frozenset(new[n] for n in inline)
     # A value may have the same name as an argument that is not read here.
     uses = function.uses
     outside = {n: text for n, text in where.items() if n in uses}
-    printer = Printer(prefix, real, outside | dict(stored), in_order)
+    printer = Printer(context.prefix, real, outside | dict(stored), in_order)
     tolerance = 8 * real.epsilon * max(1, pivots, len(function.checks))
 
     def set_to(name: str, text: str) -> str:

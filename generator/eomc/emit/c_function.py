@@ -129,7 +129,7 @@ def static(name: str, result: str, *arguments: CArgument) -> CFunction:
 
 
 @dataclass(frozen=True)
-class Computed:
+class GeneratedFunction:
     """A C function whose body is generated from a function of the eomc program, with its helpers.
 
     Attributes

@@ -11,14 +11,13 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 from sympy import Symbol
 
 from eomc.base.names import MATHEMATICS
 from eomc.derive.frames import wrenches
 from eomc.emit import c_expression, c_function
-from eomc.emit.c_expression import CBody, Real
+from eomc.emit.c_expression import CBody, CContext, Real
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program.ir import Call, Function, rename
@@ -187,17 +186,23 @@ class Target:
         return expressions | {n: local(n) for n in locals_}
 
     def body(
-        self, function: Function, where: Mapping[str, str] | None = None, **options: Any
+        self,
+        function: Function,
+        where: Mapping[str, str] | None = None,
+        stored: Mapping[str, str] | None = None,
+        pivots: int = 0,
+        in_order: bool = False,
+        together: bool = False,
     ) -> CBody:
         """Return the C statements of a function of the program.
 
-        where: C expressions of variables, by name, in addition to those of `Target.where`. options:
-        keyword arguments of `c_expression.body`.
+        where: C expressions of variables, by name, in addition to those of `Target.where`. The
+        other arguments are those of `c_expression.body`.
         """
+        context = CContext(self.prefix, self.real, self.system.names)
         known = self.where() | dict(where or {})
-        reserved = self.system.names
         return c_expression.body(
-            rename_reserved(function), self.prefix, known, self.real, reserved=reserved, **options
+            rename_reserved(function), context, known, stored, pivots, in_order, together
         )
 
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:

@@ -12,12 +12,11 @@ from sympy import Rational
 
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Real
-from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import Method, Row
 
 
 @dataclass(frozen=True)
-class TableauFields(NameFields):
+class TableauFields:
     """Fields of a view: the coefficients of a Runge-Kutta method for second-order equations.
 
     c: the nodes. A, AA: the rows of the matrices A and A A. b, bA: the weights b and b A. All are

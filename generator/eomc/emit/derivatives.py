@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from eomc.emit import c_function as c
-from eomc.emit.c_function import CFunction, Computed
+from eomc.emit.c_function import CFunction, GeneratedFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.coefficients import TableauFields, tableau
 from eomc.emit.functions import SceneFunctions
@@ -42,7 +42,7 @@ class LinearizationView(NameFields):
     TEMPLATE: ClassVar[str] = "c/linearization.c"
     inputs: bool
     width: str
-    slopes: Computed
+    slopes: GeneratedFunction
     linearization: CFunction
     unread: tuple[str, ...]
     signal_call: str
@@ -50,7 +50,7 @@ class LinearizationView(NameFields):
 
 
 @dataclass(frozen=True)
-class DerivativeView(TableauFields):
+class DerivativeView(NameFields, TableauFields):
     """Data for c/derivative.c: a C function for the derivatives of one step.
 
     They are the derivatives of q and q̇ at the end of the step with respect to q, q̇ and u at its
@@ -93,7 +93,7 @@ class DerivativeView(TableauFields):
     linearization: str
     feedback: str
     eliminate: bool
-    projection: Computed | None
+    projection: GeneratedFunction | None
     moved: CFunction | None
     projection_call: str
     move: str
@@ -142,7 +142,7 @@ def linearization(plain: SceneFunctions) -> LinearizationView | None:
             one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
             arguments=(c.output_array(plain.real, "slopes"), *arguments_),
         )  # fmt: skip
-        slopes = Computed(
+        slopes = GeneratedFunction(
             loop_function, (*one.parts, one.function), one.values, one.function.call()
         )
         cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"

@@ -12,7 +12,7 @@ from typing import Any
 
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import REALS, Block, CBody, Real, group_angles
-from eomc.emit.c_function import CArgument, CFunction, Computed
+from eomc.emit.c_function import CArgument, CFunction, GeneratedFunction
 from eomc.emit.c_names import Target, rename_reserved, sentence
 from eomc.emit.public import KINDS, Public, c_array_size, doc, program_function, refuses
 from eomc.integrators.tableaux import METHODS
@@ -282,13 +282,13 @@ class SceneFunctions:
     # functions
 
     @cached_property
-    def evaluations(self) -> tuple[Computed, ...]:
+    def evaluations(self) -> tuple[GeneratedFunction, ...]:
         """The C functions that evaluate quantities such as D or energy, in header order."""
         return tuple(
             self.evaluation(n) for n in KINDS if program_function(self.target, n) is not None
         )
 
-    def evaluation(self, name: str) -> Computed:
+    def evaluation(self, name: str) -> GeneratedFunction:
         """Return the C function, with its body, that evaluates a quantity.
 
         `name` is the name of the quantity, such as D, bias or signal.
@@ -321,13 +321,13 @@ class SceneFunctions:
                 declarations = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
                 calls = (declarations, calls[1], last)
             body = (*self.signals(function), *calls)
-            return Computed(replace(public, body=body), parts, values)
+            return GeneratedFunction(replace(public, body=body), parts, values)
         (*blocks, last), statements_ = self.straight_line_body(function, kind.out)
         if refuses(target, name):
             array = c.listed(self.real, "a", c_array_size(target, kind.shape), statements_.results)
             blocks.append(Block("", (array, *c.unless(statements_.failures, self.singular))))
             last = self._status_block(name)
-        return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
+        return GeneratedFunction(replace(public, body=(*self.signals(function), *blocks, last)))
 
     def _status_block(self, name: str) -> Block:
         """Return the end of a C function with a status: copy the results `a` to the output.
@@ -341,7 +341,7 @@ class SceneFunctions:
             "", (*finite_check, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok))
         )
 
-    def _sum_of_energies(self, energy: CFunction) -> Computed | None:
+    def _sum_of_energies(self, energy: CFunction) -> GeneratedFunction | None:
         """Return the C function `energy` as a call of kinetic_energy plus a call of
         potential_energy.
 
@@ -352,9 +352,9 @@ class SceneFunctions:
         if not read <= {a.name for a in energy.arguments}:
             return None
         body = (Block("", (c.result(" + ".join(part.call() for part in parts)),)),)
-        return Computed(replace(energy, body=body, reads=read, doc=energy.doc[:1]))
+        return GeneratedFunction(replace(energy, body=body, reads=read, doc=energy.doc[:1]))
 
-    def _by_columns(self, public: CFunction, function: Function, name: str) -> Computed:
+    def _by_columns(self, public: CFunction, function: Function, name: str) -> GeneratedFunction:
         """Return a C function that computes a matrix by columns, in a loop.
 
         Each column is the product of the matrix and a unit vector, which a static function
@@ -364,11 +364,11 @@ class SceneFunctions:
         doc = f"{kind.out} times along. {sentence(function)}"
         column = self.static(function, f"{name}_column", "column", doc)
         parts, call = (*column.parts, column.function), column.function.call()
-        return Computed(public, parts, column.values, call, kind.out, kind.symmetric)
+        return GeneratedFunction(public, parts, column.values, call, kind.out, kind.symmetric)
 
     def static(
         self, function: Function, name: str, out: str, doc: str, fails: bool = False
-    ) -> Computed:
+    ) -> GeneratedFunction:
         """Return a static C function that computes a function of the program.
 
         name: name in C. out: name of the array that the results are written to. doc: comment above
@@ -394,10 +394,10 @@ class SceneFunctions:
             "static",
             (doc,),
         )
-        return Computed(function_, parts, values)
+        return GeneratedFunction(function_, parts, values)
 
     @cached_property
-    def projection(self) -> Computed | None:
+    def projection(self) -> GeneratedFunction | None:
         """The static C function that computes the corrections of q and qd onto the constraints.
 
         None without constraints.
@@ -408,7 +408,7 @@ class SceneFunctions:
         return self.static(function, "projection", "d", sentence(function), fails=True)
 
     @cached_property
-    def rotation_errors(self) -> Computed | None:
+    def rotation_errors(self) -> GeneratedFunction | None:
         """The static C function that computes the rotation errors of closed kinematic loops.
 
         It also computes their derivatives. None if no loop constrains the directions of axes. See
@@ -434,7 +434,7 @@ class SceneFunctions:
         return c.static(f"{self.prefix}_rotated", "void", *out, *read)
 
     @cached_property
-    def rate_terms(self) -> Computed | None:
+    def rate_terms(self) -> GeneratedFunction | None:
         """The static C function that computes the rates (time derivatives) of constraint equations.
 
         These are the equations that the projection may drop near singular configurations. The
@@ -447,7 +447,7 @@ class SceneFunctions:
         return self.static(function, "rate_terms", "rates", RATE_TERMS)
 
     @cached_property
-    def projection_along(self) -> Computed | None:
+    def projection_along(self) -> GeneratedFunction | None:
         """The static C function that computes corrections of q and qd and their derivatives.
 
         The corrections move q and qd onto the constraints. The derivatives are along a direction in
@@ -489,7 +489,7 @@ class SceneFunctions:
         return state, self.arguments(*(n for n in ("t", "p") if n in arguments))
 
     @cached_property
-    def acceleration(self) -> Computed:
+    def acceleration(self) -> GeneratedFunction:
         """The C function that computes the accelerations qdd; it returns a status code."""
         function = self.target.program["acceleration"]
         force = "tau + A^T lambda" if self.target.system.constraints else "tau"
@@ -519,7 +519,7 @@ class SceneFunctions:
             reads=reads,
             doc=(*doc, sentence(function)),
         )
-        return Computed(result, parts, values)
+        return GeneratedFunction(result, parts, values)
 
 
 def portable_functions(program: Program, real: Real | None = None) -> SceneFunctions:

@@ -24,7 +24,7 @@ MAX_ITERATIONS = {True: 50, False: 60}  # over the stages, with Newton's method 
 
 
 @dataclass(frozen=True)
-class PortableSourceView(SourceFields):
+class PortableSourceView(NameFields, SourceFields):
     """Data for c/portable/source.c: the source file of the portable C.
 
     adaptive: whether it contains adaptive steps.
@@ -67,7 +67,7 @@ class PortableRK4View(NameFields):
 
 
 @dataclass(frozen=True)
-class PortableExplicitView(TableauFields):
+class PortableExplicitView(NameFields, TableauFields):
     """Data for c/portable/explicit.c: one step of an explicit Runge-Kutta method.
 
     about, step, advance, advance_call, correct: as in `PortableRK4View`. stages: the number of
@@ -118,7 +118,7 @@ class PortableImplicitView(NameFields):
 
 
 @dataclass(frozen=True)
-class PortableGaussView(TableauFields):
+class PortableGaussView(NameFields, TableauFields):
     """Data for c/portable/gauss.c: one step of a Gauss method, solved by iteration.
 
     Attributes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, ClassVar
 
-from eomc.emit.c_function import CFunction, Computed, in_braces
+from eomc.emit.c_function import CFunction, GeneratedFunction, in_braces
 from eomc.emit.c_names import Target
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
@@ -76,10 +76,10 @@ class ProjectionView:
     extent: str
     size: int
     increments: bool
-    projection: Computed
+    projection: GeneratedFunction
     function: CFunction
     call: str
-    rate_terms: Computed | None
+    rate_terms: GeneratedFunction | None
     rate_terms_call: str
     rows: int
     tolerance: str
@@ -164,7 +164,7 @@ class ProjectView(NameFields):
     sum_places: tuple[int, ...]
     pinned: bool
     tiny: str
-    errors: Computed | None
+    errors: GeneratedFunction | None
     error_rows: str
     error_ends: tuple[int, ...]
     rotated: CFunction | None

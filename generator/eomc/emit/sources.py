@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive, views
-from eomc.emit.c_function import CFunction, Computed
+from eomc.emit.c_function import CFunction, GeneratedFunction
 from eomc.emit.derivatives import LinearizationView
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields, Show
@@ -151,7 +151,7 @@ class HeaderView(NameFields):
 
 
 @dataclass(frozen=True)
-class SourceFields(NameFields):
+class SourceFields:
     """Data that the templates of the portable and of the optimised C source share.
 
     Attributes
@@ -177,8 +177,8 @@ class SourceFields(NameFields):
     parameters: tuple[ParameterMember, ...]
     q0: tuple[str, ...]
     qd0: tuple[str, ...]
-    evaluations: tuple[Computed, ...]
-    acceleration: Computed
+    evaluations: tuple[GeneratedFunction, ...]
+    acceleration: GeneratedFunction
     solved: tuple[str, ...]
     constrained: bool
     slopes: str

@@ -31,7 +31,7 @@ Show = Callable[[View], str]  # renders a view: returns the text of its template
 
 @dataclass(frozen=True)
 class PrefixFields:
-    """Fields of the template data of every generated C file.
+    """Fields of the views of most C files.
 
     prefix: the scene's name, with which all C functions and types begin. real: the C type of
     numbers, such as "double".
@@ -42,9 +42,11 @@ class PrefixFields:
 
 
 @dataclass(frozen=True)
-class NameFields(PrefixFields):
-    """Fields of `PrefixFields`, and PREFIX, with which all C macros and enumerators begin."""
+class NameFields:
+    """Fields as in `PrefixFields`, and PREFIX, with which all C macros and enumerators begin."""
 
+    prefix: str
+    real: str
     PREFIX: str
 
 

@@ -345,7 +345,7 @@ class Manifold:
     ) -> Iterator[tuple[list[int], Vector, Vector]]:
         """Yield, for each loop, the axis equations, the rotation error vector a n and its Jacobian.
 
-        Computed from e = 2 tan(a/2) n, whose gradient along n grows as 1/cos(a/2)^2.
+        GeneratedFunction from e = 2 tan(a/2) n, whose gradient along n grows as 1/cos(a/2)^2.
         """
         if not self.rotations:
             return

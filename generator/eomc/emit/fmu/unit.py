@@ -62,7 +62,7 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class SceneEvent:
+class EventEntry:
     """An event of the scene, for the C header of an FMU.
 
     An event triggers when its event function crosses zero. direction: -1 if it triggers when the
@@ -139,7 +139,7 @@ class SceneHeaderView:
     inputs: tuple[str, ...]
     parameters: tuple[str, ...]
     output_count: int
-    events: tuple[SceneEvent, ...]
+    events: tuple[EventEntry, ...]
     feedback: bool
     solved: bool
     acceleration: str
@@ -239,7 +239,7 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
         parameters=tuple(p.name for p in s.parameters),
         output_count=len(s.outputs),
         events=tuple(
-            SceneEvent(e.name, DIRECTIONS[e.direction], ACTIONS.index(e.action)) for e in s.events
+            EventEntry(e.name, DIRECTIONS[e.direction], ACTIONS.index(e.action)) for e in s.events
         ),
         feedback=target.signal_state,
         solved=bool(calls["outputs"]) and takes_qdd(target, "outputs"),

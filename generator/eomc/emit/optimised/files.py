@@ -15,7 +15,7 @@ from eomc.base import resources
 from eomc.emit import adaptive, events, sources
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
-from eomc.emit.c_function import CFunction, Computed
+from eomc.emit.c_function import CFunction, GeneratedFunction
 from eomc.emit.c_names import Target
 from eomc.emit.derivatives import linearization, step_derivatives
 from eomc.emit.functions import SceneFunctions
@@ -26,7 +26,7 @@ from eomc.emit.optimised.runs import prediction_width
 from eomc.emit.optimised.steppers import LaneFields, Steppers
 from eomc.emit.projection import project
 from eomc.emit.sources import SourceFields
-from eomc.emit.views import PrefixFields, Show
+from eomc.emit.views import NameFields, PrefixFields, Show
 from eomc.integrators.tableaux import RK4
 
 # Placeholders in csrc for names, types and sizes of a lane
@@ -36,7 +36,7 @@ BINARY_FUNCTIONS = ("atan2", "pow", "min", "max", PIVOT)
 
 
 @dataclass(frozen=True)
-class OptimisedSourceView(SourceFields):
+class OptimisedSourceView(NameFields, SourceFields):
     """Data for c/optimised/source.c: the source file of the optimised C.
 
     Attributes
@@ -146,7 +146,7 @@ class LaneView(LaneFields):
     angles_at: CFunction
     changes: CFunction
     sincos: str
-    signal: Computed | None
+    signal: GeneratedFunction | None
     signal_call: str
     rates: str
     rates_call: str
@@ -204,10 +204,10 @@ class TwoPointsView(PrefixFields):
     inline: str
     members: str
     angles: str
-    configuration: Computed
+    configuration: GeneratedFunction
     constants: bool
     call: str
-    velocity: Computed
+    velocity: GeneratedFunction
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
             **sources.source_fields(functions, stamp, slopes, show),
             rolled=steppers.two_point,
             unroll=steppers.one.unroll,
-            extent=steppers.one.extent,
+            extent=steppers.one.c_width,
             inline=steppers.one.qualifiers[INLINE],
             wide=_wide(steppers),
             csrc=tuple(_csrc(steppers)),
@@ -441,7 +441,7 @@ def _two_points(steppers: Steppers) -> TwoPointsView:
     return TwoPointsView(
         prefix=one.prefix,
         real=one.real.name,
-        extent=one.extent,
+        extent=one.c_width,
         inline=one.qualifiers[INLINE],
         members=c.struct(f"{one.prefix}_configuration", two.real.name, s.parts.handed),
         angles=one.angle_count,
@@ -495,7 +495,7 @@ def _adaptive(steppers: Steppers) -> adaptive.SweepInterface:
     one, m = steppers.one, adaptive.METHOD
     sweep = steppers.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
     return adaptive.SweepInterface(
-        steppers.stepping(one), sweep, steppers.accelerate(one, a="f"), one.extent,
+        steppers.stepping(one), sweep, steppers.accelerate(one, a="f"), one.c_width,
         bool(steppers.accelerations.constants), runs.constants_call(steppers),
         f"{one.target.PREFIX}_LANES",
         one.project_end_call(s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"

@@ -6,7 +6,7 @@ the constraints included. The lane determines types, arguments and the represent
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ from sympy import Expr, S
 from eomc.emit import c_function as c
 from eomc.emit import projection
 from eomc.emit.c_expression import FOUR, Block, CBody, Printer, Real
-from eomc.emit.c_function import CArgument, CFunction, Computed
+from eomc.emit.c_function import CArgument, CFunction, GeneratedFunction
 from eomc.emit.c_names import Target, rename_reserved, sentence
 from eomc.emit.functions import RATE_TERMS, SceneFunctions
 from eomc.emit.optimised.accelerations import Accelerations
@@ -41,6 +41,34 @@ def interleaved(k: int) -> int:
     it stores the coordinates or angles in the order 0, 2, 1, 3.
     """
     return k - k % FOUR + (0, 2, 1, 3)[k % FOUR]
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Name, arguments and results of a C function that `Lane.generate_function` generates.
+
+    Attributes
+    ----------
+    name
+        The C name, without the scene's prefix and the lane's suffix.
+    out, places
+        The C argument for the results (None if there are none), and the C expression to which each
+        result is assigned, such as "a[0]".
+    takes
+        Names of the arguments described in `Lane.argument`; None for all of `Lane.argument_names`.
+    constants
+        C expressions of precomputed values by name, where they differ from `Lane.where`.
+    extra
+        Additional arguments: for each, the C argument, the names that it supplies, and a format for
+        the C expression of such a name.
+    """
+
+    name: str
+    out: CArgument | None
+    places: Sequence[str]
+    takes: Sequence[str] | None = None
+    constants: Mapping[str, str] | None = None
+    extra: Sequence[tuple[CArgument, frozenset[str], str]] = ()
 
 
 @dataclass(frozen=True)
@@ -165,8 +193,8 @@ class Lane:
         return max(four(n), four(first + four(len(self.accelerations.angles))))
 
     @property
-    def extent(self) -> str:
-        """Number of elements of the C vectors of coordinates (`width`), as a C expression."""
+    def c_width(self) -> str:
+        """The number of elements of the C vectors of coordinates (`width`), as a C expression."""
         return str(self.width) if self.padded else self.NQ
 
     @cached_property
@@ -256,19 +284,14 @@ class Lane:
         """Return the element of a coordinate in the interleaved layout of two points."""
         return f"{array}[{interleaved(self.target.names.index(name))}]"
 
-    def computed(
+    def generate_function(
         self,
         function: Function,
-        name: str,
-        out: CArgument | None,
-        places: Sequence[str],
-        extra: Iterable[tuple[CArgument, frozenset[str], str]] = (),
+        signature: Signature,
         doc: str = "",
-        takes: Sequence[str] | None = None,
-        constants: Mapping[str, str] | None = None,
         in_order: bool = False,
         inline: bool = True,
-    ) -> Computed:
+    ) -> GeneratedFunction:
         """Return a C function that evaluates a function of the program.
 
         The C function stores the results in an argument, and returns where it failed (a `mask`).
@@ -277,20 +300,10 @@ class Lane:
         ----------
         function
             The function of the program.
-        name
-            The C name, without the scene's prefix and the lane's suffix.
-        out, places
-            The C argument for the results (None if there are none), and the C expression to which
-            each result is assigned, such as "a[0]".
-        extra
-            Additional arguments: for each, the C argument, the names that it supplies, and a format
-            for the C expression of such a name.
+        signature
+            The name, the arguments and the results of the C function.
         doc
             The comment above the C function.
-        takes
-            Names of the arguments described in `argument`; by default all of `argument_names`.
-        constants
-            C expressions of precomputed values by name, where they differ from `where`.
         in_order
             Whether the C code adds the terms of sums in the order of the program.
         inline
@@ -298,40 +311,44 @@ class Lane:
             ones.
         """
         function = rename_reserved(function)
-        names_of_arguments = self.argument_names if takes is None else takes
-        supplied = self.names_of | ({"c": frozenset(constants)} if constants is not None else {})
-        supplied_by = [(self.argument(n), supplied[n]) for n in names_of_arguments]
-        supplied_by += [(argument, names) for argument, names, _ in extra]
-        where = dict(self.where if constants is None else constants)
-        for _, names, form in extra:
-            where |= {n: form.format(n) for n in names}
+        out, supplied_by = signature.out, self._supplied_by(signature)
         outer = CFunction(
-            f"{self.prefix}_{name}{self.end}",
+            f"{self.prefix}_{signature.name}{self.end}",
             self.mask,
             (*([out] if out else []), *(a for a, _ in supplied_by)),
             qualifier=self.qualifiers[INLINE if inline else NOINLINE],
             doc=(doc,) if doc else (),
         )
         if outline.is_large(function):
-            return self._in_pieces(outer, function, name, out, places, supplied_by, where, in_order)
+            return self._in_pieces(outer, function, signature, in_order)
+        where = self._expressions(signature)
         body = self.target.body(function, where, pivots=self.pivots, in_order=in_order)
         read = {a.name for a, names in supplied_by if names & function.uses}
         reads = read | {a.name for a in outer.arguments[:1] if a is out}
-        statements = self._statements(function, body, places)
-        return Computed(replace(outer, body=statements, reads=frozenset(reads)))
+        statements = self._statements(function, body, signature.places)
+        return GeneratedFunction(replace(outer, body=statements, reads=frozenset(reads)))
+
+    def _supplied_by(self, signature: Signature) -> list[tuple[CArgument, frozenset[str]]]:
+        """Return the C arguments of a function except `out`, each with the names it supplies."""
+        constants, takes = signature.constants, signature.takes
+        supplied = self.names_of | ({"c": frozenset(constants)} if constants is not None else {})
+        names = self.argument_names if takes is None else takes
+        extra = [(argument, names) for argument, names, _ in signature.extra]
+        return [*((self.argument(n), supplied[n]) for n in names), *extra]
+
+    def _expressions(self, signature: Signature) -> dict[str, str]:
+        """Return the C expressions of precomputed and additional values of a function, by name."""
+        where = dict(self.where if signature.constants is None else signature.constants)
+        for _, names, form in signature.extra:
+            where |= {n: form.format(n) for n in names}
+        return where
 
     def _in_pieces(
-        self,
-        outer: CFunction,
-        function: Function,
-        name: str,
-        out: CArgument | None,
-        places: Sequence[str],
-        supplied_by: Sequence[tuple[CArgument, frozenset[str]]],
-        where: Mapping[str, str],
-        in_order: bool,
-    ) -> Computed:
+        self, outer: CFunction, function: Function, signature: Signature, in_order: bool
+    ) -> GeneratedFunction:
         """Return a long function as calls of outlined functions, which share values in a struct."""
+        name, out, places = signature.name, signature.out, signature.places
+        supplied_by, where = self._supplied_by(signature), self._expressions(signature)
         parts = outline.split(function, outline.PIECE)
         shared = {n: c.member("v", n) for part in parts for n in part.keeps}
         values = f"{self.prefix}_{name}_values{self.end}"
@@ -340,7 +357,7 @@ class Lane:
         for k, part in enumerate(parts, 1):
             f = part.function
             body = self.target.body(
-                f, dict(where) | {n: shared[n] for n in part.reads},
+                f, where | {n: shared[n] for n in part.reads},
                 stored={n: shared[n] for n in part.keeps}, pivots=self.pivots,
                 in_order=in_order,
             )  # fmt: skip
@@ -367,7 +384,7 @@ class Lane:
         reads = frozenset(a.name for f in pieces for a in f.arguments)
         struct = c.struct(values, self.real.name, list(shared)) if shared else ""
         body_ = tuple(Block("", tuple(lines)) for lines in blocks)
-        return Computed(replace(outer, body=body_, reads=reads), tuple(pieces), struct)
+        return GeneratedFunction(replace(outer, body=body_, reads=reads), tuple(pieces), struct)
 
     @property
     def pivots(self) -> int:
@@ -421,13 +438,14 @@ class Lane:
         return [self.target.element("a", n) for n in self.target.names]
 
     @cached_property
-    def rates(self) -> Computed:
+    def rates(self) -> GeneratedFunction:
         """The C function for the accelerations from the state, its sines and the inputs."""
         doc = sentence(self.accelerations.function)
-        return self.computed(self.accelerations.rotated[1], "rates", self.out, self.places, doc=doc)
+        signature = Signature("rates", self.out, self.places)
+        return self.generate_function(self.accelerations.rotated[1], signature, doc)
 
     @cached_property
-    def signal(self) -> Computed | None:
+    def signal(self) -> GeneratedFunction | None:
         """The C function for the scene's signals: formulas for the inputs u by time and state.
 
         None if the scene has no signals.
@@ -438,14 +456,15 @@ class Lane:
         arguments += ["q", "qd"] if self.target.signal_state else []
         arguments += ["c"] if self.accelerations.constants else []
         parameters = {n: c.member("c", n) for n in self.accelerations.parameter_names}
-        return self.computed(
-            self.target.program["signal"], "signals", c.output_array(self.real.name, "u"),
-            [f"u[{self.target.enum[n]}]" for n in self.target.input_names],
-            doc="The scene's signals.", takes=arguments, constants=parameters,
-        )  # fmt: skip
+        places = [f"u[{self.target.enum[n]}]" for n in self.target.input_names]
+        out = c.output_array(self.real.name, "u")
+        signature = Signature("signals", out, places, arguments, parameters)
+        return self.generate_function(
+            self.target.program["signal"], signature, "The scene's signals."
+        )
 
     @cached_property
-    def compute_constants(self) -> Computed:
+    def compute_constants(self) -> GeneratedFunction:
         """The C function that precomputes expressions that depend on the parameters only.
 
         It fails if the parameters make the mass matrix D singular.
@@ -453,12 +472,12 @@ class Lane:
         parameters, target = frozenset(self.accelerations.parameter_names), self.target
         p = c.input_array(f"{self.prefix}_params", "p")
         out = c.output_array(self.constants, "c") if self.accelerations.constants else None
-        return self.computed(
-            self.accelerations.staged[0], "compute_constants", out,
-            [c.member("c", n) for n in self.accelerations.constants],
-            [(p, parameters, c.member("p", "{}"))] if target.needs_p else (),
-            doc="Constants of the parameters.", takes=(), constants={},
-        )  # fmt: skip
+        places = [c.member("c", n) for n in self.accelerations.constants]
+        extra = [(p, parameters, c.member("p", "{}"))] if target.needs_p else ()
+        signature = Signature("compute_constants", out, places, (), {}, extra)
+        return self.generate_function(
+            self.accelerations.staged[0], signature, "Constants of the parameters."
+        )
 
     def linear(self, what: str, vector: str, offset: bool) -> CFunction:
         """Return the C function for the angles of the accelerations, or for changes of them.
@@ -539,7 +558,7 @@ class Lane:
     # two points
 
     @cached_property
-    def configuration(self) -> Computed:
+    def configuration(self) -> GeneratedFunction:
         """The C function for the position-dependent part of the accelerations.
 
         It computes this part for two configurations q at once.
@@ -549,13 +568,13 @@ class Lane:
         out = c.output_array(f"{self.prefix}_configuration", "k")
         takes = [n for n in self.argument_names if n in ("q", "s", "c")]
         places = [c.member("k", n) for n in parts.handed]
-        return self.computed(
-            parts.configuration, "configurations", out, places, takes=takes, in_order=True,
-            inline=parts.short,
-        )  # fmt: skip
+        signature = Signature("configurations", out, places, takes)
+        return self.generate_function(
+            parts.configuration, signature, in_order=True, inline=parts.short
+        )
 
     @cached_property
-    def velocity(self) -> Computed:
+    def velocity(self) -> GeneratedFunction:
         """The C function for the velocity-dependent part, which returns the accelerations.
 
         It reads the position-dependent part, which `configuration` computes for two configurations
@@ -566,11 +585,11 @@ class Lane:
         shared, form = frozenset(parts.handed), f"{c.member('k', '{}')}[point]"
         argument = c.input_array(f"{self.prefix}_configuration", "k")
         extra = [(argument, shared, form), (CArgument("int", "point"), shared, form)]
+        signature = Signature("velocities", self.out, self.places, extra=extra)
         doc = "The accelerations at point 0 or 1 of k."
-        return self.computed(
-            parts.velocity, "velocities", self.out, self.places, extra, doc=doc, in_order=True,
-            inline=parts.short,
-        )  # fmt: skip
+        return self.generate_function(
+            parts.velocity, signature, doc, in_order=True, inline=parts.short
+        )
 
     # projection onto the constraints
 
@@ -612,17 +631,16 @@ class Lane:
         )  # fmt: skip
 
     @cached_property
-    def correction(self) -> Computed:
+    def correction(self) -> GeneratedFunction:
         """The C function for the corrections of q and q̇ that satisfy the constraints."""
         function = self.accelerations.correction[0]
         places = [f"d[{k}]" for k in range(len(function.outputs))]
-        return self.computed(
-            function, "projection", c.output_array(self.real.name, "d"), places,
-            doc=sentence(function), takes=self._constraint_arguments(),
-        )  # fmt: skip
+        out, takes = c.output_array(self.real.name, "d"), self._constraint_arguments()
+        signature = Signature("projection", out, places, takes)
+        return self.generate_function(function, signature, sentence(function))
 
     @cached_property
-    def rate_terms(self) -> Computed | None:
+    def rate_terms(self) -> GeneratedFunction | None:
         """The C function for the rates of constraint equations that corrections may drop.
 
         It also computes the sum of |terms| of each rate, as its scale. None if there are none.
@@ -632,10 +650,10 @@ class Lane:
             return None
         parameters = {n: c.member("c", n) for n in self.accelerations.parameter_names}
         places = [f"rates[{k}]" for k in range(len(function.outputs))]
-        return self.computed(
-            function, "rate_terms", c.output_array(self.real.name, "rates"), places, doc=RATE_TERMS,
-            takes=self._constraint_arguments(sines=False), constants=parameters, inline=False,
-        )  # fmt: skip
+        takes = self._constraint_arguments(sines=False)
+        out = c.output_array(self.real.name, "rates")
+        signature = Signature("rate_terms", out, places, takes, parameters)
+        return self.generate_function(function, signature, RATE_TERMS, inline=False)
 
     def _constraint_arguments(self, sines: bool = True) -> tuple[str, ...]:
         """Return the arguments that the constraints depend on, among q, qd, s, t, c."""
@@ -657,7 +675,7 @@ class Lane:
             L=self.end,
             lane=self.real.name,
             mask=self.mask,
-            extent=self.extent,
+            extent=self.c_width,
             increments=True,
             sines=f"{self.prefix}_sines{self.end}" if sines else "",
             sines_call=f"{self.prefix}_sines_at{self.end}(&own, at)"

@@ -151,7 +151,7 @@ class OptimisedBatchView(NameFields, StepFields):
 
 
 @dataclass(frozen=True)
-class AdaptiveLanesView(AdaptiveFields):
+class AdaptiveLanesView(NameFields, AdaptiveFields):
     """Data for c/optimised/adaptive_lanes.c: adaptive steps of many instances.
 
     The instances are computed side by side in vector registers.

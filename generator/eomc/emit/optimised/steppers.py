@@ -217,7 +217,7 @@ class OptimisedExplicitView(PrefixFields, LaneFields, StepFields):
 
 
 @dataclass(frozen=True)
-class OptimisedGaussView(TableauFields):
+class OptimisedGaussView(NameFields, TableauFields):
     """Data for c/optimised/gauss.c: one step of a Gauss method with Newton's method.
 
     Attributes
@@ -500,7 +500,7 @@ class Steppers:
 
         extent: length of the C vectors of coordinates. lane: one number or a vector register.
         """
-        return self.functions.names | {"extent": lane.extent}
+        return self.functions.names | {"extent": lane.c_width}
 
     # what a step takes
 
@@ -546,7 +546,7 @@ class Steppers:
             **self.looping(lane),
             **lane.names,
             **self.driven,
-            extent=lane.extent,
+            extent=lane.c_width,
             noinline=lane.qualifiers[NOINLINE],
             constants_type=lane.constants,
             title=RK4.title,
@@ -635,7 +635,7 @@ class Steppers:
             prefix=lane.prefix,
             real=real.name,
             unroll=lane.unroll,
-            extent=lane.extent,
+            extent=lane.c_width,
             **lane.names | ({} if m.stages < 4 else {"inline": lane.qualifiers[NOINLINE]}),
             **self.driven,
             clear=lane.clear,
