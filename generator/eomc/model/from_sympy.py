@@ -176,11 +176,13 @@ class Maker:
 
         of: class of the result, such as System. Raises EomcError for invalid arguments.
         """
-        given = self.arguments
-        starts = api_arguments.symbols(given.coordinates, "coordinates", None)
-        parameters = api_arguments.mapping(given.parameters, "parameters", "{m: 2.0}")
-        forces = api_arguments.by_name(given.forces, "forces", "{x: F}")
-        definitions = api_arguments.mapping(given.definitions, "definitions", "{y: l*cos(theta)}")
+        arguments = self.arguments
+        starts = api_arguments.symbols(arguments.coordinates, "coordinates", None)
+        parameters = api_arguments.mapping(arguments.parameters, "parameters", "{m: 2.0}")
+        forces = api_arguments.by_name(arguments.forces, "forces", "{x: F}")
+        definitions = api_arguments.mapping(
+            arguments.definitions, "definitions", "{y: l*cos(theta)}"
+        )
         units = self._units()
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
@@ -188,10 +190,12 @@ class Maker:
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         coordinates = [*self._with_initial_values(coordinates, starts.values(), declared)]
         coordinates = self._mark_fixed(coordinates, [*starts])
-        pending = api_arguments.symbols(given.inputs, "inputs", 0)
+        pending = api_arguments.symbols(arguments.inputs, "inputs", 0)
         named = map(name_of, (*starts, *parameters, *pending, *definitions))
-        outputs = [*map(str, given.outputs)]
-        api_arguments.check_units(units, [*named, *map(str, given.constraints), *outputs], outputs)
+        outputs = [*map(str, arguments.outputs)]
+        api_arguments.check_units(
+            units, [*named, *map(str, arguments.constraints), *outputs], outputs
+        )
         input_names = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(pending, declared)
         self.known = {c.q for c in coordinates} | {c.qd for c in coordinates} | {t}
@@ -204,13 +208,13 @@ class Maker:
             ordered.append((defined, expr))
         if unknown := [f for f in forces if f not in map(name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
-        rubbed = api_arguments.by_name(given.friction, "friction", "{x: mu*m*g}")
+        rubbed = api_arguments.by_name(arguments.friction, "friction", "{x: mu*m*g}")
         sticks = [f"{self.map[x].name}_sticks" for x in starts if name_of(x) in rubbed]
         used_inputs = input_names.values()
         drawn, drawn_text = None, ""
-        if given.picture is not None:
+        if arguments.picture is not None:
             drawn, drawn_text = picture_scene(
-                given.picture, self._expression, coordinates, declared, used_inputs, ordered
+                arguments.picture, self._expression, coordinates, declared, used_inputs, ordered
             )
         energies = self._energies(ordered, [c.qd for c in coordinates], used_inputs)
         fields: dict[str, Any] = {
@@ -226,10 +230,12 @@ class Maker:
             **self._constraints(coordinates, ordered, used_inputs, units),
             "events": tuple(self._events(starts, declared)),
             "outputs": tuple(
-                self._outputs(starts, coordinates, units, [*map(str, given.constraints), *sticks])
+                self._outputs(
+                    starts, coordinates, units, [*map(str, arguments.constraints), *sticks]
+                )
             ),
-            "run": given.run,
-            "title": given.title or self.name.replace("_", " ").capitalize(),
+            "run": arguments.run,
+            "title": arguments.title or self.name.replace("_", " ").capitalize(),
         }
         self.frictions = list(self._frictions(starts, declared))
         whole = sympy.srepr(sorted(fields.items())) + drawn_text + str(self.frictions or "")
@@ -531,8 +537,13 @@ class Maker:
         Names that were given as text have no symbol of the user. A velocity that has none in the
         user's expressions is real where its coordinate is, and has either sign.
         """
-        given = self.arguments
-        declarations = (given.coordinates, given.parameters, given.inputs, given.definitions)
+        arguments = self.arguments
+        declarations = (
+            arguments.coordinates,
+            arguments.parameters,
+            arguments.inputs,
+            arguments.definitions,
+        )
         as_text = {one for group in declarations for one in group if isinstance(one, str)}
         moving, found = {*coordinates}, dict[str, Expr]()
         for name, one in self.taken.items():

@@ -194,7 +194,7 @@ class System(Mechanics):
             inverse_dynamics=inverse_dynamics,
             tolerance=tolerance,
         )
-        given = SystemArguments(
+        system_arguments = SystemArguments(
             name=name,
             coordinates=coordinates,
             kinetic=kinetic,
@@ -215,7 +215,7 @@ class System(Mechanics):
             title=title,
             run=api_arguments.run_settings(run, bool(events or friction)),
         )
-        maker = Maker(given)
+        maker = Maker(system_arguments)
         system = maker.make(cls)
         if faults := system.beyond_float():
             raise SceneError(faults)
