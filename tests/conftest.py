@@ -33,7 +33,7 @@ from eomc.verify.sampling import Sampler
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
     from eomc.toolchain.compiler import Compiler
-    from eomc.verify.reference import Reference, Vector
+    from eomc.verify.reference import ReferenceModel, Vector
     from eomc.verify.sampling import SampleBudget
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
@@ -118,7 +118,7 @@ def _trial(*what: Any) -> None:
 extension.build, extension.run, extension.try_load = _build_once, _link, _trial
 
 _ahead = Sampler._predicted_ranges
-_seen: dict[tuple[int, SampleBudget], tuple[Reference, Vector]] = {}
+_seen: dict[tuple[int, SampleBudget], tuple[ReferenceModel, Vector]] = {}
 
 
 def _ahead_once(sampler: Sampler, effort: SampleBudget) -> Vector:

@@ -43,7 +43,7 @@ class Scene:
             fast = built(self.sources, Path(folder) / "fast", "fast", kept)
             plain = built(self.sources, Path(folder) / "plain", "plain", kept)
             report = check(self.made, fast, plain=plain)
-        return [row.name for row in report.rows if not row.passed]
+        return [row.name for row in report.results if not row.passed]
 
 
 def by_check(

@@ -150,7 +150,7 @@ class Bench:
 
     def _check(self) -> list[str]:
         report = checking.check(self.system, self.shipped.load())
-        return [row.name for row in report.rows if not row.passed]
+        return [row.name for row in report.results if not row.passed]
 
     def judge(self, mutant: Mutant) -> tuple[str, str]:
         """killed, survived or equivalent, and by what."""

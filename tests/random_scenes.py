@@ -97,12 +97,12 @@ def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
     except Exception as fault:
         return Outcome(seed, "check raised", _words(fault))
     verdict = ("caught", "wrong pass") if negate else ("false alarm", "passed")
-    about = [row for row in report.rows if any(word in row.name for word in JUDGES)]
+    about = [row for row in report.results if any(word in row.name for word in JUDGES)]
     return Outcome(
         seed,
         verdict[report.passed],
         what,
-        tuple(f"{r.name}: {r.error:.4g} {r.unit}" for r in report.rows if not r.passed),
+        tuple(f"{r.name}: {r.error:.4g} {r.unit}" for r in report.results if not r.passed),
         tuple(f"{r.name}: {r.unit}" for r in about if r.unit.startswith("not judged")),
         len(about),
         round(time.perf_counter() - began, 2),

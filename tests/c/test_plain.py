@@ -28,7 +28,7 @@ from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 from eomc.verify import checks_plain
 from eomc.verify.comparison import Comparison
-from eomc.verify.report import Row
+from eomc.verify.report import CheckResult
 
 STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow
 -Werror""".split()
@@ -218,11 +218,11 @@ def test_flags_that_ignore_nan_are_refused(name: str, form: str, tmp_path: Path)
 # --- what it computes -----------------------------------------------------------------------------
 
 
-def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[Row]:
+def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[CheckResult]:
     """The rows of the plain form that a check has."""
     comparison = Comparison(made(name), fast, np.random.default_rng(0), states, plain)
     checks_plain.report(comparison)
-    return comparison.rows
+    return comparison.results
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from eomc import pipeline
 from eomc.cli.main import main
 from eomc.verify import check
-from eomc.verify.report import Report, Row
+from eomc.verify.report import CheckReport, CheckResult
 
 
 @pytest.fixture
@@ -255,7 +255,9 @@ def test_a_command_without_a_scene_says_what_is_missing(command: str, here: Path
 def test_a_check_that_fails_names_the_scene(
     quiet: tuple[str, ...], here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    report = Report("simple_pendulum", (Row("D", 7.0, 1.0, False, "units"),), 1, 0, "none")
+    report = CheckReport(
+        "simple_pendulum", (CheckResult("D", 7.0, 1.0, False, "units"),), 1, 0, "none"
+    )
     monkeypatch.setattr(check, "check", lambda *_, **__: report)
     monkeypatch.setattr(pipeline, "load", lambda *_, **__: None)
     done = eomc("check", "p.toml", *quiet)

@@ -264,4 +264,6 @@ def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
         checks_inputs_outputs.report_closed_loop(of)
-        assert [(row.name, row.passed) for row in of.rows] == [("closed loop", passed)], of.rows
+        assert [(row.name, row.passed) for row in of.results] == [("closed loop", passed)], (
+            of.results
+        )

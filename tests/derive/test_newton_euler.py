@@ -31,7 +31,7 @@ from eomc.program.program import Program
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import check, symbolic
-from eomc.verify.reference import Reference
+from eomc.verify.reference import ReferenceModel
 from eomc.verify.taylor import TaylorReference
 
 FEW = settings(
@@ -95,7 +95,7 @@ states = partial(links.states, count=2, seed=7, reach=1.2)
 class Asked:
     """An independent answer at a state."""
 
-    def __init__(self, answer: Reference, state: Mapping[str, float]) -> None:
+    def __init__(self, answer: ReferenceModel, state: Mapping[str, float]) -> None:
         made = self.made = answer.system
         self.answer = answer
         self.q, self.qd, self.u = (
@@ -126,7 +126,7 @@ def value(function: Function, state: Mapping[str, float], made: System) -> np.nd
     return np.array([column for column, _ in columns]).T.ravel()
 
 
-def assert_every_route_agrees(made: System, answer: Reference, some: bool = True) -> None:
+def assert_every_route_agrees(made: System, answer: ReferenceModel, some: bool = True) -> None:
     """All that the answer knows, by every route, within rounding; some: at one state at least.
 
     Energies and forces are sums of some hundred terms that may cancel: 1e-12 of the largest that

@@ -58,7 +58,7 @@ def test_names_that_temporaries_have_too(
     text: str, run: str, modules: Modules, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter that a function does not read once had its name taken, and its value too."""
-    monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
+    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
     made = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
     report = check(made, modules.unoptimised(made), states=4)
     assert report.passed, report.table()

@@ -144,4 +144,4 @@ def test_the_check_agrees_by_virtual_work_of_point_masses(tmp_path: Path, text: 
     made = from_scene(parse(text, "test.toml"))
     report = check(made, eomc.load(made, tmp_path))
     assert report.passed, report.table()
-    assert any(row.name == "power of forces of bodies" and row.judged for row in report.rows)
+    assert any(row.name == "power of forces of bodies" and row.judged for row in report.results)

@@ -94,7 +94,7 @@ VALID = {
 @pytest.mark.parametrize("name", VALID)
 def test_valid_scenes_build_and_have_the_values_of_the_reference(name: str) -> None:
     built = made(VALID[name])
-    rows = check(built, eomc.load(built, BUILDS), states=4).rows
+    rows = check(built, eomc.load(built, BUILDS), states=4).results
     values = [row for row in rows if row.name in ("D", "C", "g", "bias", "acceleration")]
     assert len(values) >= 4
     assert [row for row in values if not row.passed] == []

@@ -124,8 +124,8 @@ def test_orders_by_check() -> None:
     for scene in ("cartpole_driven", "kapitza_pendulum"):  # inputs, explicit time
         path = variant(scene, f"gauss_{scene}", method=ALL)
         report = check(eomc.read(path), eomc.load(path, MODULES))
-        assert [row for row in report.rows if not row.passed] == []
-        assert {f"order of {m}" for m in GAUSS} <= {row.name for row in report.rows}
+        assert [row for row in report.results if not row.passed] == []
+        assert {f"order of {m}" for m in GAUSS} <= {row.name for row in report.results}
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_a_wrong_coefficient_is_found_by_check(
     monkeypatch.setitem(tableaux.METHODS, "gauss6", broken)
     path = variant("cartpole", "gauss_wrong", method='["rk4", "gauss6"]')
     report = check(eomc.read(path), eomc.load(path, tmp_path))
-    assert {r.name for r in report.rows if not r.passed} >= {"order of gauss6"}
+    assert {r.name for r in report.results if not r.passed} >= {"order of gauss6"}
 
 
 @pytest.mark.parametrize("name", GAUSS)

@@ -104,12 +104,12 @@ def test_five_sweeps_are_stable_where_they_suffice() -> None:
 
 def test_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """With an input and its signal; beside rk4."""
-    monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
+    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
     path = driven()
     made = Comparison(eomc.read(path), eomc.load(path, MODULES), np.random.default_rng(0), 4)
-    made.convergence_rows()
-    assert [row for row in made.rows if not row.passed] == []
-    assert {"order of gauss16", "rk4 beside gauss16"} <= {row.name for row in made.rows}
+    made.add_convergence_checks()
+    assert [row for row in made.results if not row.passed] == []
+    assert {"order of gauss16", "rk4 beside gauss16"} <= {row.name for row in made.results}
 
 
 @pytest.mark.slow
@@ -118,8 +118,8 @@ def test_order_by_check(name: str) -> None:
     """Inputs, signals, explicit time."""
     path = variant(name, f"g16_check_{name}", method='["rk4", "gauss16"]')
     report = check(eomc.read(path), eomc.load(path, MODULES))
-    assert [row for row in report.rows if not row.passed] == []
-    assert {"order of gauss16", "gauss16 beside rk4"} <= {row.name for row in report.rows}
+    assert [row for row in report.results if not row.passed] == []
+    assert {"order of gauss16", "gauss16 beside rk4"} <= {row.name for row in report.results}
 
 
 @pytest.mark.slow
@@ -134,7 +134,7 @@ def test_a_wrong_coefficient_is_found_by_check(
     text = Path("scenes/cartpole.toml").read_text(encoding="utf-8")
     path.write_text(text.replace("[run]", '[run]\nmethod = ["gauss16"]'), encoding="utf-8")
     report = check(eomc.read(path), eomc.load(path, tmp_path))
-    assert "order of gauss16" in {row.name for row in report.rows if not row.passed}
+    assert "order of gauss16" in {row.name for row in report.results if not row.passed}
 
 
 # case: a step at which the method's own error has gone below that of rounding

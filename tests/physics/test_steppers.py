@@ -139,8 +139,8 @@ def test_a_wrong_coefficient_is_found_by_check(
         # which say nothing of it
         monkeypatch.setattr(of, row, lambda *_: Measurement(math.nan, "not looked at"))
     made = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)
-    made.convergence_rows()
-    assert [row.name for row in made.rows if not row.passed] == ["order of dp8"]
+    made.add_convergence_checks()
+    assert [row.name for row in made.results if not row.passed] == ["order of dp8"]
 
 
 def test_a_method_that_is_not_there_is_refused_by_name(cartpole: ModuleType) -> None:

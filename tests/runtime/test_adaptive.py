@@ -428,7 +428,7 @@ def test_check_compares_both_forms_with_the_reference(scene: str, real: str) -> 
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         plain = eomc.load(system, BUILDS, form="plain")
         report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
-    rows = [row for row in report.rows if "adaptive" in row.name]
+    rows = [row for row in report.results if "adaptive" in row.name]
     assert len(rows) == 8 and all(row.passed for row in rows), rows
 
 

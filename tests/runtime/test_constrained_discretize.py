@@ -211,7 +211,7 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
         checks_derivatives.report_step_derivatives(of)
-        assert [row.passed for row in of.rows] == [passed], of.rows
+        assert [row.passed for row in of.results] == [passed], of.results
 
 
 @pytest.mark.slow
@@ -220,4 +220,4 @@ def test_what_is_steep_in_a_velocity_passes_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(RUBBED), from_scene(parse(RUBBED, "test.toml"))
     of = Comparison(made, m, np.random.default_rng(0), 4)
     checks_derivatives.report_step_derivatives(of)
-    assert [row.passed for row in of.rows] == [True], of.rows
+    assert [row.passed for row in of.results] == [True], of.results

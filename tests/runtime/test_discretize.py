@@ -312,5 +312,5 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
         checks_derivatives.report_step_derivatives(of)
-        assert [row.passed for row in of.rows] == [passed] * 3, of.rows
-    assert [row.name for row in of.rows] == [f"discretize by {x}" for x in m.methods]
+        assert [row.passed for row in of.results] == [passed] * 3, of.results
+    assert [row.name for row in of.results] == [f"discretize by {x}" for x in m.methods]

@@ -77,7 +77,7 @@ def test_the_check_compares_both_forms_and_slopes(real: str, tmp_path: Path) -> 
     system = from_scene(parse(BALL + f'linearize = true\nreal = "{real}"\n', "test.toml"))
     fast, plain_form = (eomc.load(system, tmp_path, form=form) for form in ("fast", "plain"))
     report = check(system, fast, plain=plain_form, states=4)
-    rows = {row.name: row for row in report.rows if "outputs" in row.name}
+    rows = {row.name: row for row in report.results if "outputs" in row.name}
     assert {*rows} == {f"{form}outputs{of}" for form in ("", "plain C: ") for of in ("", ": C, D")}
     assert all(row.passed for row in rows.values()), rows
 

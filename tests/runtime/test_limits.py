@@ -214,7 +214,7 @@ def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: boo
     module: Any = Wrong(limited) if wrong else limited
     of = Comparison(from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4)
     checks_inputs_outputs.report_limits(of)
-    (row,) = of.rows
+    (row,) = of.results
     assert row.name == "limits of inputs" and row.passed is not wrong, row
 
 

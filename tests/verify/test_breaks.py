@@ -27,21 +27,21 @@ from eomc.program import program, routes
 from eomc.program.ir import Sum
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.report import Report
+from eomc.verify.report import CheckReport
 
 Breakage = Callable[[pytest.MonkeyPatch], None]
 SCENE = "cartpole_driven"
 
 
-def checked(folder: Path, scene: str = SCENE, states: int = 8) -> Report:
+def checked(folder: Path, scene: str = SCENE, states: int = 8) -> CheckReport:
     """The check of a scene built anew, under a digest of its own."""
     digest = hashlib.sha256(str(folder).encode()).hexdigest()
     made = replace(scene_system(scene), digest=digest)
     return check(made, eomc.load(made, folder), states=states)
 
 
-def failed(report: Report) -> set[str]:
-    return {row.name for row in report.rows if not row.passed}
+def failed(report: CheckReport) -> set[str]:
+    return {row.name for row in report.results if not row.passed}
 
 
 @pytest.fixture(autouse=True)
@@ -190,7 +190,7 @@ def test_unbroken_it_passes(scene: str) -> None:
 def test_broken_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     breakage, rows = BREAKAGES[what]
     breakage(monkeypatch)
-    without = "advice_row" if rows & OF_RUNS else "convergence_rows"
+    without = "add_advice_check" if rows & OF_RUNS else "add_convergence_checks"
     monkeypatch.setattr(Comparison, without, lambda *_: None)
     report = checked(tmp_path, states=8 if rows & OF_RUNS else 4)
     assert not report.passed

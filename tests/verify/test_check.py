@@ -20,10 +20,10 @@ from eomc.model.system import System, symbol
 from eomc.scene.read import parse
 from eomc.verify import sampling
 from eomc.verify import symbolic as references
-from eomc.verify.check import check, value_rows
+from eomc.verify.check import add_value_checks, check
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence
-from eomc.verify.report import Measurement, Report
+from eomc.verify.report import CheckReport, Measurement
 from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import SymbolicReference, derive
 
@@ -96,12 +96,12 @@ def reference(name: str) -> SymbolicReference:
     return derive(scene_system(name))
 
 
-def failed(report: Report) -> set[str]:
-    return {row.name for row in report.rows if not row.passed}
+def failed(report: CheckReport) -> set[str]:
+    return {row.name for row in report.results if not row.passed}
 
 
 @cache
-def right() -> Report:
+def right() -> CheckReport:
     """The check of a mass on a spring, which several tests read."""
     return check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
 
@@ -123,9 +123,9 @@ def test_what_is_right_passes(name: str) -> None:
     """Also in other arithmetic: the simplified equations round differently."""
     report = check(scene_system(name), StandIn(simplified(reference(name))))
     assert report.passed, report.table()
-    values = [row for row in report.rows if row.unit == "units of rounding"]
+    values = [row for row in report.results if row.unit == "units of rounding"]
     assert max(row.error for row in values) < 2
-    order = next(row for row in report.rows if row.name == "order of rk4")
+    order = next(row for row in report.results if row.name == "order of rk4")
     assert order.error == pytest.approx(4, abs=0.2)
 
 
@@ -141,9 +141,9 @@ QUICK = (
 )  # fmt: skip
 
 
-def checked(what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = None) -> Report:
+def checked(what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = None) -> CheckReport:
     """The check of what is broken, without rows of runs that say nothing of it."""
-    without = "advice_row" if what in LONG else "convergence_rows"
+    without = "add_advice_check" if what in LONG else "add_convergence_checks"
     monkeypatch.setattr(Comparison, without, lambda *_: None)
     name, break_, _ = BROKEN[what]
     module = StandIn(reference(name))
@@ -172,7 +172,7 @@ def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
     assert report.states == LARGE.states
     assert report.reference == "Taylor arithmetic"
     assert "6 random states, against Taylor arithmetic" in " ".join(report.table().split())
-    values = [row for row in report.rows if row.unit == "units of rounding"]
+    values = [row for row in report.results if row.unit == "units of rounding"]
     assert max(row.error for row in values) < 10  # sizes are smaller than with one by one
 
 
@@ -196,7 +196,7 @@ def test_what_is_wrong_fails_as_if_large(
 
 
 def test_a_module_that_raises_fails_with_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
+    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     module = StandIn(reference("mass_spring"))
     module.g = lambda *place, **how: {}["k"]  # type: ignore[method-assign]
     report = check(scene_system("mass_spring"), module, states=4)
@@ -211,7 +211,7 @@ def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
     system = System.make("dry", [x], v**2 / 2, x**2 / 2, forces={x: -sympy.sign(v)}, h=0.05)
     report = check(system, StandIn(derive(system)), states=8)
     assert report.passed, report.table()
-    order = next(row for row in report.rows if row.name == "order of rk4")
+    order = next(row for row in report.results if row.name == "order of rk4")
     assert order.judged and 3.5 < order.error < 4.5
 
 
@@ -219,11 +219,11 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
     """It says so, in the table and in JSON, and passes; without a jump it fails."""
     x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Measurement(1.0)
     monkeypatch.setattr(Convergence, "order", low)
-    monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
+    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
     for force, passed in ((sympy.sign(v), True), (sympy.tanh(v), False)):
         system = System.make("dry", [x], v**2 / 2, 0, forces={x: -force}, h=0.05)
         report = check(system, StandIn(derive(system)), states=4)
-        (row,) = (row for row in report.rows if row.name == "order of rk4")
+        (row,) = (row for row in report.results if row.name == "order of rk4")
         assert row.passed == passed and row.judged != passed
         assert ("not to be expected with sign" in " ".join(report.table().split())) == passed
 
@@ -231,7 +231,7 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
 def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     unseen = Measurement(math.nan, "too few halvings")
     monkeypatch.setattr(Convergence, "order", lambda *_: unseen)
-    monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
+    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
     report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
     assert report.passed
     assert "not judged: too few halvings" in " ".join(report.table().split())
@@ -258,7 +258,7 @@ def test_a_coordinate_without_inertia_is_reported() -> None:
 
 def test_cancelling_terms_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """C is 0 only as the difference of equal terms: rounding in it is not held against 0."""
-    monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
+    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     a, b = symbol("a"), symbol("b")
     angle, rate = a + b, symbol("a_dot") + symbol("b_dot")
     kinetic = sum((f(angle).diff(a) * rate) ** 2 for f in (sympy.sin, sympy.cos)) * 7 / 2
@@ -271,10 +271,10 @@ def test_each_method_has_its_row_of_one_step() -> None:
     for methods in (("rk4", "dp8", "gauss4"), ("gauss8", "euler")):
         names = list[str]()
         given = SimpleNamespace(
-            methods=methods, row=lambda name, *_, names=names: names.append(name), value=len,
+            methods=methods, add_check=lambda name, *_, names=names: names.append(name), value=len,
             steps=None, runs=None, run_energy=None, step_by=len,
         )  # fmt: skip
-        value_rows(cast(Comparison, given))
+        add_value_checks(cast(Comparison, given))
         assert [n.removeprefix("one step of ") for n in names if "one step of" in n] == [
             m for m in methods if m != "rk4"
         ]
@@ -287,7 +287,7 @@ def test_the_report_can_be_read_by_programs_and_people() -> None:
     assert told["passed"] is True
     assert told["reference"] == "equations written out"
     assert {row["name"] for row in told["rows"]} >= {"D", "acceleration", "run", "order of rk4"}
-    assert all(row.name in report.table() for row in report.rows)
+    assert all(row.name in report.table() for row in report.results)
     assert max(map(len, report.table().splitlines())) <= 100
 
 
@@ -343,7 +343,7 @@ linearize = "parameters"
 def test_derivatives_are_compared_with_differences(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str
 ) -> None:
-    monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
+    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     text = f'{SLOPES}real = "{real}"\n'
     module = modules.unoptimised(text)
 
@@ -361,7 +361,7 @@ def test_derivatives_are_compared_with_differences(
     report = check(system_of(parse(text)), Bent(), states=4)
     rows = {"": set(), "sensitivity": {"sensitivity"}}.get(wrong, {"linearize", "closed loop"})
     assert failed(report) == rows, report.table()
-    assert {"linearize", "sensitivity"} <= {row.name for row in report.rows}
+    assert {"linearize", "sensitivity"} <= {row.name for row in report.results}
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole", "mass_spring"), "mass_spring"))
@@ -370,12 +370,12 @@ def test_advice_on_h_is_held_against_runs(modules: Modules, name: str) -> None:
     system = scene_system(name)
     for by, good in ((1.0, True), (1 / 16, False), (16.0, False)):
         made = Comparison(system, Advising(modules(name), by), np.random.default_rng(0), 4)
-        made.advice_row("rk4")
-        (row,) = made.rows
+        made.add_advice_check("rk4")
+        (row,) = made.results
         assert row.name == "h of rk4" and row.passed == good, row
         assert not good or row.error in (0.25, 0.5, 1, 2)
 
 
 def test_where_no_mode_turns_there_is_no_h_to_test() -> None:
-    (row,) = (r for r in right().rows if r.name == "h of rk4")
+    (row,) = (r for r in right().results if r.name == "h of rk4")
     assert row.passed and math.isinf(row.error) and row.unit.startswith("no limit to test")

@@ -85,7 +85,7 @@ def bounded() -> Iterator[None]:
 def test_events_without_end_are_left_after_what_is_compared(of: Comparison) -> None:
     """Of a run of 5 s, which would take memory as long as it went on."""
     checks_adaptive.report_runs(of)
-    assert [row.passed for row in of.rows] == [True] * 3, of.rows
+    assert [row.passed for row in of.results] == [True] * 3, of.results
 
 
 def test_a_row_of_stiff_steps_takes_them(of: Comparison) -> None:

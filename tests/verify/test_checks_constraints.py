@@ -57,7 +57,7 @@ def failed(module: Any, report: Callable[[Comparison], None]) -> set[str]:
     """Of the rows that one part of the check adds."""
     made = Comparison(BOB, module, np.random.default_rng(0), 4)
     report(made)
-    return {row.name for row in made.rows if not row.passed}
+    return {row.name for row in made.results if not row.passed}
 
 
 class Bent:
@@ -75,7 +75,7 @@ class Bent:
 
 @pytest.mark.slow
 def test_what_is_right_passes(bob: ModuleType) -> None:
-    rows = check(BOB, bob, states=4).rows
+    rows = check(BOB, bob, states=4).results
     assert {row.name for row in rows} >= {"tangent", "negative D along the rows"}
     assert all(row.passed for row in rows)
 

@@ -55,11 +55,11 @@ def ball(modules: Modules) -> ModuleType:
 def failed(system: System, ball: ModuleType) -> set[str]:
     made = Comparison(system, ball, np.random.default_rng(0), 4)
     checks_events.report_functions(made)
-    return {row.name for row in made.rows if not row.passed}
+    return {row.name for row in made.results if not row.passed}
 
 
 def test_what_is_right_passes(ball: ModuleType) -> None:
-    rows = check(BALL, ball, states=4).rows
+    rows = check(BALL, ball, states=4).results
     assert {"events", "jumps"} <= {row.name for row in rows}
     assert all(row.passed for row in rows)
 
@@ -105,5 +105,5 @@ def test_where_formulas_are_not_real_there_is_nothing_to_compare(modules: Module
     of = Comparison(made, modules.unoptimised(made), np.random.default_rng(0), 8)
     checks_events.report_functions(of)
     checks_inputs_outputs.report_outputs(of)
-    assert {"events", "jumps", "outputs"} <= {row.name for row in of.rows}
-    assert all(row.passed for row in of.rows)
+    assert {"events", "jumps", "outputs"} <= {row.name for row in of.results}
+    assert all(row.passed for row in of.results)

@@ -57,22 +57,22 @@ def comparison(modules: Modules) -> Comparison:
 
 def failed(of: Comparison, module: Any) -> set[str]:
     """The rows that do not pass of a module in the comparison's place."""
-    right, of.rows, of.module = of.module, [], module
+    right, of.results, of.module = of.module, [], module
     try:
         checks_bodies.report_frames(of, of.system.scene)
         checks_bodies.report_inverse_dynamics(of)
     finally:
         of.module = right
-    return {row.name for row in of.rows if not row.passed}
+    return {row.name for row in of.results if not row.passed}
 
 
 @pytest.mark.parametrize("name", ["", *ROWS])
 def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
     found = failed(comparison, Wrong(comparison.module, name))
-    assert sorted(row.name for row in comparison.rows) == sorted(ROWS.values())
+    assert sorted(row.name for row in comparison.results) == sorted(ROWS.values())
     # forces are held against the Jacobians
     also = {"forces at frames"} if name == "jacobian" else set()
-    assert found == ({ROWS[name], *also} if name else set()), comparison.rows
+    assert found == ({ROWS[name], *also} if name else set()), comparison.results
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_of_what_hardly_moves_differences_are_no_rounding(stiff: Comparison, nam
     """They were, along lines no longer than such a coordinate's way."""
     also = {"forces at frames"} if name == "jacobian" else set()
     found = failed(stiff, Wrong(stiff.module, name))
-    assert found == ({ROWS[name], *also} if name else set()), stiff.rows
+    assert found == ({ROWS[name], *also} if name else set()), stiff.results
 
 
 @pytest.mark.slow
@@ -104,5 +104,5 @@ def test_joints_that_move_together(modules: Modules) -> None:
     comparison = Comparison(made, module, np.random.default_rng(0), 6)
     checks_bodies.report_frames(comparison, made.scene)
     checks_bodies.report_inverse_dynamics(comparison)
-    assert len(comparison.rows) == len(ROWS)
-    assert all(row.passed for row in comparison.rows), comparison.rows
+    assert len(comparison.results) == len(ROWS)
+    assert all(row.passed for row in comparison.results), comparison.results

@@ -68,8 +68,8 @@ def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list
     made, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
-    assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
+    assert [row.name for row in comparison.results] == ["outputs", "outputs: C, D"]
+    assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
 
 
 ON_A_ROD = """eomc = 1
@@ -112,7 +112,7 @@ def test_wrong_ones_of_multipliers_fail(
     )
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
+    assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
     made, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    assert [row.passed for row in comparison.rows] == [True, True], comparison.rows
+    assert [row.passed for row in comparison.results] == [True, True], comparison.results
 
 
 CANCELLING = """eomc = 1
@@ -150,7 +150,7 @@ def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules)
     made, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    assert {row.name: row.passed for row in comparison.rows} == {"outputs": True}
+    assert {row.name: row.passed for row in comparison.results} == {"outputs": True}
 
 
 @pytest.mark.parametrize("wrong", [{}, {"F": 1e-7}])
@@ -160,5 +160,5 @@ def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str,
     made, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    found = {row.name: row.passed for row in comparison.rows}
+    found = {row.name: row.passed for row in comparison.results}
     assert found == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}

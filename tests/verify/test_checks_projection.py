@@ -14,7 +14,7 @@ from stand_in import StandIn
 from eomc.verify import symbolic
 from eomc.verify.checks_constraints import ProjectionChecks, report_projection
 from eomc.verify.comparison import Comparison
-from eomc.verify.report import Row
+from eomc.verify.report import CheckResult
 
 SYSTEM = scene_system("pendulum_xy")
 
@@ -36,12 +36,12 @@ class Projecting:
         return found
 
 
-def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, Row]:
+def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, CheckResult]:
     monkeypatch.setattr(ProjectionChecks, "refusals", lambda _: 0.0)  # which ask a C function
     random = np.random.default_rng(0)
     made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
     report_projection(made, module, "")
-    return {row.name: row for row in made.rows}
+    return {row.name: row for row in made.results}
 
 
 @pytest.mark.slow

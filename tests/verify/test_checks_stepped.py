@@ -77,7 +77,7 @@ def aside(run: Any) -> None:
 def row(module: Any) -> Any:
     made = Comparison(SWING, module, np.random.default_rng(0), 4, None)
     checks_events.report_fixed_steps(made)
-    (found,) = made.rows
+    (found,) = made.results
     assert found.name == "events in steps of rk4" and not module._model._passes_over
     return found
 

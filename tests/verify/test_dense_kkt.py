@@ -13,7 +13,7 @@ from conftest import tiers
 from eomc.base.errors import EomcError
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.verify import kkt, symbolic
-from eomc.verify.reference import Reference
+from eomc.verify.reference import ReferenceModel
 from eomc.verify.taylor import TaylorReference
 
 NAMES = list(constrained.cases())
@@ -23,7 +23,7 @@ QUICK = ("pendulum_on_a_winch", "chaplygin_sleigh")
 RUNS = [n for n in SMALL if constrained.cases()[n]["rk4_measured"]]
 
 
-def answers(name: str) -> list[Reference]:
+def answers(name: str) -> list[ReferenceModel]:
     system = constrained.system(name)
     return [TaylorReference(system), *([symbolic.derive(system)] if name in SMALL else [])]
 

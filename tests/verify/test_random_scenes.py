@@ -25,7 +25,7 @@ from eomc.verify.check import check
 from eomc.verify.checks_derivatives import largest_error, module_derivatives
 from eomc.verify.checks_runs import FINE, RunChecks
 from eomc.verify.comparison import Comparison
-from eomc.verify.report import Measurement, Report
+from eomc.verify.report import CheckReport, Measurement
 from eomc.verify.sampling import State
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.
@@ -219,12 +219,12 @@ REGRESSIONS = {
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def checked(text: str, modules: Modules) -> Report:
+def checked(text: str, modules: Modules) -> CheckReport:
     return check(from_scene(parse(text, "test.toml")), modules.unoptimised(text))
 
 
 @cache
-def right(text: str, modules: Modules) -> Report:
+def right(text: str, modules: Modules) -> CheckReport:
     """As it is, for several tests."""
     return checked(text, modules)
 
@@ -233,7 +233,7 @@ def right(text: str, modules: Modules) -> Report:
 def test_right_modules_pass(modules: Modules, what: str) -> None:
     report = right(REGRESSIONS[what], modules)
     assert report.passed, report.table()
-    about = [row for row in report.rows if any(word in row.name for word in JUDGES)]
+    about = [row for row in report.results if any(word in row.name for word in JUDGES)]
     assert all(row.judged for row in about), report.table()
 
 
@@ -392,7 +392,7 @@ def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
 ) -> None:
     monkeypatch.setattr(RunChecks, "rounded", lambda *_: 99.0)
     text = WELL.replace("-depth*exp(-x**2)", potential).replace(', "gauss8", "gauss16"', "")
-    (row,) = (r for r in checked(text, modules).rows if r.name == "rk4 rounding")
+    (row,) = (r for r in checked(text, modules).results if r.name == "rk4 rounding")
     bends = "max" in potential
     assert row.passed == bends and row.judged != bends
     assert (row.unit == "not judged: steps leap over max") == bends
@@ -414,7 +414,7 @@ def test_what_shorter_steps_make_less_is_no_rounding(
 
 
 def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -> None:
-    (row,) = (r for r in right(DRAG, modules).rows if r.name == "h of rk4")
+    (row,) = (r for r in right(DRAG, modules).results if r.name == "h of rk4")
     assert row.passed and row.limit == 2 and 1 <= row.error < 1.1
     assert "eigenvalues" in row.unit
 
@@ -448,13 +448,13 @@ def test_steps_too_long_for_the_motion_do_not_say_how_far_it_goes(modules: Modul
     stiff = comparison.advice.stiffest_state
     assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * comparison.advice.scale)
     report = right(LEAVING, modules)
-    (row,) = (r for r in report.rows if r.name == "h of gauss16")
+    (row,) = (r for r in report.results if r.name == "h of gauss16")
     assert row.judged and report.passed, report.table()
 
 
 def test_a_method_of_order_1_balances_power_at_order_1(modules: Modules) -> None:
     text = ORDER_1.replace('["euler", "dp8"]', '"euler"')
-    (row,) = (r for r in checked(text, modules).rows if r.name == "power balance")
+    (row,) = (r for r in checked(text, modules).results if r.name == "power balance")
     assert row.error == pytest.approx(1, abs=0.1) and row.limit == 0.5
 
 

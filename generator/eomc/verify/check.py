@@ -1,9 +1,9 @@
-"""Comparison of a compiled module with the reference and with general laws of mechanics.
+"""All checks of a compiled module, against the reference and against general laws of mechanics.
 
-The report of `eomc check` has one line, called a row, for each check. There are two kinds. A value
-of the module is compared with the independent `reference`, in units of rounding (see `sampling`). A
-property (symmetry, order of convergence, power balance) is tested on the module alone, whatever
-the reference returns.
+There are two kinds of checks. A value of the module is compared with the independent `reference`,
+in units of rounding (see `sampling`). A property (symmetry, order of convergence, power balance) is
+tested on the module alone, whatever the reference returns. The report of `eomc check` has one line
+for each check.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from eomc.verify.checks_bodies import BodyChecks
 from eomc.verify.checks_refusals import RefusalChecks
 from eomc.verify.checks_runs import RunChecks
 from eomc.verify.comparison import Comparison
-from eomc.verify.report import LIMIT, Report
+from eomc.verify.report import LIMIT, CheckReport
 from eomc.verify.sampling import VALUES
 
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
@@ -38,7 +38,7 @@ SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wron
 
 def check(
     system: System, module: Any, *, plain: Any = None, seed: int = 0, states: int | None = None
-) -> Report:
+) -> CheckReport:
     """Compare a compiled module with the independent reference in Python; return the report.
 
     Parameters
@@ -56,8 +56,9 @@ def check(
 
     Returns
     -------
-    Report
-        One row for each check. If the module raises an exception, the row fails and shows it.
+    CheckReport
+        The results of all checks. If the module raises an exception in a check, the check fails
+        and its result shows the exception.
 
     Raises
     ------
@@ -75,18 +76,20 @@ def check(
             model._passes_over = False
 
 
-def _report(comparison: Comparison, module: Any) -> Report:
-    """Append all checks."""
+def _report(comparison: Comparison, module: Any) -> CheckReport:
+    """Run all checks and return the report."""
     system = comparison.system
-    comparison.row("names, defaults, start", 0, "that differ", comparison.metadata_differences)
+    comparison.add_check(
+        "names, defaults, start", 0, "that differ", comparison.metadata_differences
+    )
     compiled = hasattr(module, "_model")
     if comparison.expected:
-        value_rows(comparison)
-        property_rows(comparison)
+        add_value_checks(comparison)
+        add_property_checks(comparison)
         if system.constraints:
             checks_constraints.report(comparison)
         if compiled:  # what is compiled has several ways to one answer
-            compiled_rows(comparison)
+            add_compiled_checks(comparison)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
             BodyChecks(comparison, scene).report()
@@ -106,47 +109,47 @@ def _report(comparison: Comparison, module: Any) -> Report:
             checks_adaptive.report_runs(comparison)
         checks_plain.report(comparison)
     else:
-        comparison.row("states", 1, "states with a regular D", lambda: 0.0, minimum=True)
+        comparison.add_check("states", 1, "states with a regular D", lambda: 0.0, minimum=True)
     kind = "Taylor arithmetic" if comparison.large else "equations written out"
     counts = len(comparison.expected), comparison.sampler.rejected
-    return Report(system.name, tuple(comparison.rows), *counts, kind)
+    return CheckReport(system.name, tuple(comparison.results), *counts, kind)
 
 
-def value_rows(comparison: Comparison) -> None:
+def add_value_checks(comparison: Comparison) -> None:
     """Append checks of values, single steps and short runs to the report of `eomc check`.
 
     They compare the compiled module with the reference, the independent evaluation in Python.
     """
-    row, rounding = comparison.row, "units of rounding"
+    add, rounding = comparison.add_check, "units of rounding"
     for name in (*VALUES, "acceleration"):
-        row(name, LIMIT, rounding, partial(comparison.value, name))
+        add(name, LIMIT, rounding, partial(comparison.value, name))
     if comparison.methods[0] == "rk4":  # which is what the reference steps by
-        row("one step", LIMIT, rounding, comparison.steps)
-        row("run", LIMIT, rounding + ", times steps and growth", comparison.runs)
+        add("one step", LIMIT, rounding, comparison.steps)
+        add("run", LIMIT, rounding + ", times steps and growth", comparison.runs)
     for method in comparison.methods[comparison.methods[0] == "rk4" :]:
-        row(f"one step of {method}", LIMIT, rounding, partial(comparison.step_by, method))
-    row("run: its energy", LIMIT, rounding, comparison.run_energy)
+        add(f"one step of {method}", LIMIT, rounding, partial(comparison.step_by, method))
+    add("run: its energy", LIMIT, rounding, comparison.run_energy)
 
 
-def property_rows(comparison: Comparison) -> None:
+def add_property_checks(comparison: Comparison) -> None:
     """Append checks of laws that the module's values must obey to the report of `eomc check`.
 
     Examples: D is symmetric, and derivatives agree with difference quotients.
     """
-    row, rounding = comparison.row, "units of rounding"
-    row("D = D^T", LIMIT, rounding, comparison.symmetry)
+    add, rounding = comparison.add_check, "units of rounding"
+    add("D = D^T", LIMIT, rounding, comparison.symmetry)
     if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
-        row("D > 0", 0, "least eigenvalue of D, scaled", comparison.definiteness, minimum=True)
-    row("bias = C qd + g", LIMIT, rounding, comparison.bias)
+        add("D > 0", 0, "least eigenvalue of D, scaled", comparison.definiteness, minimum=True)
+    add("bias = C qd + g", LIMIT, rounding, comparison.bias)
     force = "tau + A^T lambda" if comparison.system.constraints else "tau"
-    row(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion)
+    add(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion)
     checks_derivatives.report_acceleration_derivatives(comparison)
     if comparison.dtype == np.float64:  # single precision leaves its differences too few digits
-        row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", comparison.skewness)
-        comparison.convergence_rows()
+        add("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", comparison.skewness)
+        comparison.add_convergence_checks()
 
 
-def compiled_rows(comparison: Comparison) -> None:
+def add_compiled_checks(comparison: Comparison) -> None:
     """Append checks of runs, refusals and batches to the report of `eomc check`.
 
     They need a module compiled from C. Batches are checked if the module has functions for them.

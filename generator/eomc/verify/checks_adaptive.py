@@ -55,7 +55,7 @@ def report_runs(check: Comparison) -> None:
         for tol, stiff in ((10 * tight**0.5, False), (tight, False), (tight**0.5, True)):
             measure = partial(_largest_error, check, module, tol, stiff)
             how = "stiff" if stiff else f"{tol:g}"
-            check.row(f"{form}adaptive steps, {how}", ERROR_LIMIT, ERROR_UNIT, measure)
+            check.add_check(f"{form}adaptive steps, {how}", ERROR_LIMIT, ERROR_UNIT, measure)
 
 
 def resolves_steps(check: Comparison, s: State, h: float) -> bool:
@@ -200,8 +200,8 @@ def report_refusals(check: Comparison, refusals: RefusalChecks) -> None:
     if check.system.run.tolerance is None:
         return
     checks = AdaptiveRefusalChecks(check, refusals)
-    check.row("adaptive steps: refusals", 0, "runs that end otherwise", checks.wrong_refusals)
-    check.row("adaptive steps: longest", 0, "runs that end otherwise", checks.longest)
+    check.add_check("adaptive steps: refusals", 0, "runs that end otherwise", checks.wrong_refusals)
+    check.add_check("adaptive steps: longest", 0, "runs that end otherwise", checks.longest)
 
 
 class AdaptiveRefusalChecks:
@@ -360,11 +360,17 @@ def report_batches(check: Comparison, singular: list[State]) -> None:
     if check.system.run.tolerance is None or not check.system.run.batch:
         return
     checks = AdaptiveBatchChecks(check, singular)
-    check.row("adaptive steps of many", BATCH_LIMIT, BATCH_UNIT, checks.compare_with_single_runs)
+    check.add_check(
+        "adaptive steps of many", BATCH_LIMIT, BATCH_UNIT, checks.compare_with_single_runs
+    )
     for module, form in check.forms:
         many = AdaptiveBatchChecks(check, singular, module)
-        check.row(f"{form}adaptive steps of many: bits", 0, "instances", many.differing_instances)
-        check.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.wrong_refusals)
+        check.add_check(
+            f"{form}adaptive steps of many: bits", 0, "instances", many.differing_instances
+        )
+        check.add_check(
+            f"{form}adaptive steps of many: refusals", 0, "instances", many.wrong_refusals
+        )
 
 
 class EventRecorder:

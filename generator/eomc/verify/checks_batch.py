@@ -51,14 +51,14 @@ class BatchChecks:
 
         They concern the values, the equality of bits with single runs, and instances that fail.
         """
-        row = self.check.row
+        add = self.check.add_check
         for method in self.check.methods:
-            row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
+            add(f"batch of {method}", ALIKE, "units of rounding, from single runs",
                 partial(self.compare_with_single_steps, method))  # fmt: skip
-            row(f"batch of {method}: places", 0, "batches with other bits",
+            add(f"batch of {method}: places", 0, "batches with other bits",
                 partial(self.places, method))  # fmt: skip
             if not self.check.system.constraints:  # which move the starts that fail
-                row(f"batch of {method}: failures", 0, "instances that end otherwise",
+                add(f"batch of {method}: failures", 0, "instances that end otherwise",
                     partial(self.failures, method))  # fmt: skip
 
     def sample_instances(self) -> list[State]:

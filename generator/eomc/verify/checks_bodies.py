@@ -87,7 +87,7 @@ class BodyChecks:
         limit = max(RELATIVE_LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
-            self.check.row(f"{label} of bodies", limit, "of its size, from point masses",
+            self.check.add_check(f"{label} of bodies", limit, "of its size, from point masses",
                            partial(self.compare, name))  # fmt: skip
 
     def compare(self, name: str) -> float:
@@ -575,18 +575,18 @@ def report_frames(check: Comparison, scene: Scene) -> None:
     for module, form in check.forms:
         frames = FrameChecks(check, module, scene)
 
-        def row(name: str, limit: float, measure: Callable[[Expected], float]) -> None:
+        def add(name: str, limit: float, measure: Callable[[Expected], float]) -> None:
             largest = partial(check.largest, measure, FRAME_STATES)
-            check.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
+            check.add_check(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
 
         if check.system.output_frames:
-            row("poses of frames", RELATIVE_LIMIT, frames.poses)
-            row("velocities of frames", RELATIVE_LIMIT, frames.velocities)
-            row("accelerations of frames", ACCELERATION_LIMIT, frames.accelerations)
-            row("Jacobians of frames", RELATIVE_LIMIT, frames.jacobians)
-            row("forces at frames", RELATIVE_LIMIT, frames.forces)
+            add("poses of frames", RELATIVE_LIMIT, frames.poses)
+            add("velocities of frames", RELATIVE_LIMIT, frames.velocities)
+            add("accelerations of frames", ACCELERATION_LIMIT, frames.accelerations)
+            add("Jacobians of frames", RELATIVE_LIMIT, frames.jacobians)
+            add("forces at frames", RELATIVE_LIMIT, frames.forces)
         if run.momentum:
-            row("momentum", RELATIVE_LIMIT, frames.momentum)
+            add("momentum", RELATIVE_LIMIT, frames.momentum)
 
 
 def report_inverse_dynamics(check: Comparison) -> None:
@@ -598,7 +598,7 @@ def report_inverse_dynamics(check: Comparison) -> None:
         measure = partial(
             check.largest, partial(_inverse_dynamics_error, check, module), FRAME_STATES
         )
-        check.row(f"{form}inverse dynamics", LIMIT, "units of rounding", measure)
+        check.add_check(f"{form}inverse dynamics", LIMIT, "units of rounding", measure)
 
 
 def _inverse_dynamics_error(check: Comparison, module: Any, e: Expected) -> float:

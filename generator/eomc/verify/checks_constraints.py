@@ -58,24 +58,24 @@ def report(check: Comparison) -> None:
     """
     checks = ConstraintChecks(check, check.module)
     for name in VALUES:
-        check.row(name, LIMIT, UNITS, partial(check.value, name))
+        check.add_check(name, LIMIT, UNITS, partial(check.value, name))
     if check.dtype == np.float64:  # single precision leaves differences too few digits
-        check.row("A beside differences", SLOPE_LIMIT, "of A", checks.slopes)
+        check.add_check("A beside differences", SLOPE_LIMIT, "of A", checks.slopes)
         if check.system.run.needs_derivatives and not check.system.modes:
-            check.row("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent)
-    check.row("power of multipliers", LIMIT, UNITS, checks.power)
+            check.add_check("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent)
+    check.add_check("power of multipliers", LIMIT, UNITS, checks.power)
     if check.system.reactions:
         limit = max(WORK_TOLERANCE, WORK_ROUNDINGS * check.eps)
-        check.row("reactions: virtual work", limit, "of its size", checks.reactions)
+        check.add_check("reactions: virtual work", limit, "of its size", checks.reactions)
     for module, form in check.forms:
         own = ConstraintChecks(check, module)
         if form:
             find = partial(_values, check, module)
-            check.row("plain C: constraints", LIMIT, UNITS, find)
+            check.add_check("plain C: constraints", LIMIT, UNITS, find)
         report_projection(check, module, form)
         for method in check.methods:
             measure = partial(own.residual_along_run, method)
-            check.row(f"{form}{method} on the constraints", MAX_RESIDUAL, UNITS, measure)
+            check.add_check(f"{form}{method} on the constraints", MAX_RESIDUAL, UNITS, measure)
 
 
 def _values(check: Comparison, module: Any) -> float:
@@ -329,9 +329,9 @@ def report_projection(check: Comparison, module: Any, form: str) -> None:
     module: the module of the optimised or the portable C code. form: prefix of the checks' names.
     """
     checks = ProjectionChecks(check, module)
-    check.row(f"{form}project", LIMIT, UNITS, partial(checks.projected, False))
-    check.row(f"{form}project, held", LIMIT, UNITS, partial(checks.projected, True))
-    check.row(f"{form}project: refusals", 0, "calls that end otherwise", checks.refusals)
+    check.add_check(f"{form}project", LIMIT, UNITS, partial(checks.projected, False))
+    check.add_check(f"{form}project, held", LIMIT, UNITS, partial(checks.projected, True))
+    check.add_check(f"{form}project: refusals", 0, "calls that end otherwise", checks.refusals)
 
 
 def report_massless(check: Comparison, refusals: RefusalChecks) -> None:
@@ -340,10 +340,10 @@ def report_massless(check: Comparison, refusals: RefusalChecks) -> None:
     With these parameters D has no positive eigenvalue. refusals: the checks of refusals.
     """
     checks = MasslessChecks(check, refusals)
-    check.row("no inertia: refusals", 0, "calls that do not refuse", checks.refuse)
+    check.add_check("no inertia: refusals", 0, "calls that do not refuse", checks.refuse)
     if not checks.states:
-        last = check.rows[-1]
-        check.rows[-1] = replace(last, unit=f"{last.unit}: no parameters take all inertia away")
+        last = check.results[-1]
+        check.results[-1] = replace(last, unit=f"{last.unit}: no parameters take all inertia away")
 
 
 @dataclass(frozen=True)

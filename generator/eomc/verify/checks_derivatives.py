@@ -17,7 +17,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
 from eomc.verify.comparison import Comparison
-from eomc.verify.reference import STENCIL, Reference, Vector
+from eomc.verify.reference import STENCIL, ReferenceModel, Vector
 from eomc.verify.report import LIMIT, Measurement, largest
 from eomc.verify.sampling import (
     MAX_DISTANCE,
@@ -32,7 +32,7 @@ WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
 
 
 def differentiate(
-    reference: Reference, s: State, scale: Vector, defaults: Mapping[str, float],
+    reference: ReferenceModel, s: State, scale: Vector, defaults: Mapping[str, float],
     name: str = "acceleration",
 ) -> Iterator[tuple[Vector, Vector]]:  # fmt: skip
     """Yield derivatives of the reference's accelerations at a state, as difference quotients.
@@ -44,7 +44,7 @@ def differentiate(
 
     Parameters
     ----------
-    reference : Reference
+    reference : ReferenceModel
         The independent evaluation of the system in Python.
     s : State
         The state.
@@ -111,7 +111,7 @@ def report_acceleration_derivatives(check: Comparison) -> None:
     for name in ("linearize", "sensitivity"):
         if _is_required(check, name):
             find = partial(largest_error, check, name)
-            check.row(name, limit, "of the largest derivative", find)
+            check.add_check(name, limit, "of the largest derivative", find)
 
 
 def _is_required(check: Comparison, name: str) -> bool:
@@ -212,7 +212,9 @@ def report_step_derivatives(check: Comparison) -> None:
     for module, form in check.forms:
         for method in check.methods:
             measure = partial(_largest_step_error, check, module, method, few, exact)
-            check.row(f"{form}discretize by {method}", limit, "of the largest derivative", measure)
+            check.add_check(
+                f"{form}discretize by {method}", limit, "of the largest derivative", measure
+            )
 
 
 def _largest_step_error(

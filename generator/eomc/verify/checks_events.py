@@ -45,7 +45,7 @@ def report_functions(check: Comparison) -> None:
                 find = partial(
                     _function_error, check, module, name, replace(system, outputs=tuple(formulas))
                 )
-                check.row(f"{form}{name}", LIMIT, "units of rounding", find)
+                check.add_check(f"{form}{name}", LIMIT, "units of rounding", find)
 
 
 def _function_error(check: Comparison, module: Any, name: str, system: System) -> float:
@@ -69,7 +69,7 @@ def report_fixed_steps(check: Comparison) -> None:
     """Append checks of events in fixed steps to the report of `eomc check`, for each method."""
     for module, form in check.forms:
         for method in check.methods:
-            check.row(
+            check.add_check(
                 f"{form}events in steps of {method}", LIMIT, "units of rounding",
                 partial(_largest_error, check, module, method),
             )  # fmt: skip

@@ -48,7 +48,7 @@ def report_outputs(check: Comparison) -> None:
     formulas = Formulas(check.system)
     limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
     for module, form in check.forms:
-        check.row(
+        check.add_check(
             f"{form}outputs", LIMIT, "units of rounding", partial(_values, check, module, formulas)
         )
         if check.system.run.needs_derivatives:
@@ -56,10 +56,10 @@ def report_outputs(check: Comparison) -> None:
                 "of the largest derivative",
                 partial(_slope_error, check, module, formulas),
             )
-            check.row(f"{form}outputs: C, D", limit, unit, slopes)
+            check.add_check(f"{form}outputs: C, D", limit, unit, slopes)
             if check.system.run.linearize == "parameters" and check.system.parameters:
                 by_parameters = partial(_slope_error, check, module, formulas, by_parameters=True)
-                check.row(f"{form}outputs: by parameters", limit, unit, by_parameters)
+                check.add_check(f"{form}outputs: by parameters", limit, unit, by_parameters)
 
 
 def _values(check: Comparison, module: Any, formulas: Formulas) -> float:
@@ -306,7 +306,7 @@ def report_closed_loop(check: Comparison) -> None:
     formulas = Formulas(replace(check.system, outputs=signals, inputs=()))
     limit, unit = max(SLOPE_LIMIT, LIMIT * check.eps), "of the largest derivative"
     for module, form in check.forms:
-        check.row(
+        check.add_check(
             f"{form}closed loop", limit, unit, partial(_closed_loop_error, check, module, formulas)
         )
 
@@ -348,7 +348,7 @@ def report_limits(check: Comparison) -> None:
     if all(x is None for i in check.system.inputs for x in i.limits):
         return
     for module, form in check.forms:
-        check.row(
+        check.add_check(
             f"{form}limits of inputs", 0, "that differ", partial(_differing_results, check, module)
         )
 

@@ -73,7 +73,7 @@ def report(check: Comparison) -> None:
     for method in check.methods:
         if METHODS[method].newton and check.dtype == np.float64:
             unit = "sweeps a step more than Newton's method"
-            check.row(
+            check.add_check(
                 f"{method} in stiff steps",
                 MAX_EXTRA_SWEEPS,
                 unit,

@@ -48,23 +48,25 @@ def report(check: Comparison) -> None:
     unit, plain = "units of rounding", check.plain
     twin = copy.copy(check)
     twin.module = plain
-    check.row(
+    check.add_check(
         "plain C",
         LIMIT,
         unit,
         lambda: float(np.max([twin.value(name) for name in COMPARED_VALUES])),
     )
     if check.methods[0] == "rk4":
-        check.row("plain C: one step", LIMIT, unit, twin.steps)
-        check.row("plain C: run", LIMIT, unit + ", times steps and growth", twin.runs)
-    check.row("plain C beside fast", LIMIT, unit, partial(_values, check, plain))
+        check.add_check("plain C: one step", LIMIT, unit, twin.steps)
+        check.add_check("plain C: run", LIMIT, unit + ", times steps and growth", twin.runs)
+    check.add_check("plain C beside fast", LIMIT, unit, partial(_values, check, plain))
     if (
         hasattr(check.module, "linearize")
         and _slopes(check.module, check.expected[0].state) is not None
     ):
-        check.row("plain C beside fast: A, B", LIMIT, unit, partial(_linearization, check, plain))
+        check.add_check(
+            "plain C beside fast: A, B", LIMIT, unit, partial(_linearization, check, plain)
+        )
     for method in check.methods:
-        check.row(
+        check.add_check(
             f"plain C beside fast: {method}", LIMIT, unit + ", times steps and growth",
             partial(_runs, check, plain, method),
         )  # fmt: skip

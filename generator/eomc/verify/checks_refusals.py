@@ -72,34 +72,36 @@ class RefusalChecks:
 
     def report(self) -> None:
         """Append checks of refusals to the report of `eomc check`."""
-        row = self.check.row
+        add = self.check.add_check
         if self.check.system.constraints:
             self.report_constrained()
         else:
             self.report_singular()
-        row("not finite", 0, "calls that do not refuse", self.nonfinite_errors)
+        add("not finite", 0, "calls that do not refuse", self.nonfinite_errors)
         for method in self.check.methods:
             find = partial(self.overflow, method)
-            row(f"{method} too long", 0, "runs that end otherwise", find)
+            add(f"{method} too long", 0, "runs that end otherwise", find)
 
     def report_singular(self) -> None:
         """Append the checks of a singular mass matrix D, for a system without constraints."""
-        row, unit = self.check.row, "states judged wrongly"
-        row("singular D", 0, unit, self.definite)
+        add, unit = self.check.add_check, "states judged wrongly"
+        add("singular D", 0, unit, self.definite)
         if not self.singular:
-            last = self.check.rows[-1]
-            self.check.rows[-1] = replace(last, unit=unit + ": D is regular at all that were tried")
-        row("singular D: refusals", 0, "calls that do not refuse", self.refuse)
-        row("singular D in a run", 0, "runs that go on", self.run_into)
+            last = self.check.results[-1]
+            self.check.results[-1] = replace(
+                last, unit=unit + ": D is regular at all that were tried"
+            )
+        add("singular D: refusals", 0, "calls that do not refuse", self.refuse)
+        add("singular D in a run", 0, "runs that go on", self.run_into)
 
     def report_constrained(self) -> None:
         """Append the checks of states with negative inertia, for a system with constraints.
 
         At such a state vᵀ D v < 0 for a velocity v that the constraints permit.
         """
-        row, unit = self.check.row, "calls that do not refuse"
-        row("negative D along the rows", 0, unit, self.negative_inertia_errors)
-        row("negative D along the rows: refusals", 0, unit, self.refuse)
+        add, unit = self.check.add_check, "calls that do not refuse"
+        add("negative D along the rows", 0, unit, self.negative_inertia_errors)
+        add("negative D along the rows: refusals", 0, unit, self.refuse)
 
     # where D is singular
 

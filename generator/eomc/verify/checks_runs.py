@@ -193,22 +193,22 @@ class RunChecks:
 
     def report(self) -> None:
         """Append checks of runs to the report of `eomc check`."""
-        row, rounding = self.check.row, "units of rounding"
+        add, rounding = self.check.add_check, "units of rounding"
         if self.check.methods[0] == "rk4":
             unit = rounding + ", times steps and growth"
-            row("long steps", self.limit, unit, self.long)
-            row("short steps", SHORT_LIMIT, unit, self.short)
+            add("long steps", self.limit, unit, self.long)
+            add("short steps", SHORT_LIMIT, unit, self.short)
         if np.any(self.sampler.angles):
-            row("sines around the circle", SINES, rounding, self.sines)
+            add("sines around the circle", SINES, rounding, self.sines)
         if np.any(self.sampler.angles) or _reads_time(self.check.system):
-            row("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
+            add("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
         if self.model.nu and self.check.methods[0] == "rk4":
-            row("inputs row by row", self.limit, rounding, self.inputs)
-        row("every entry written", 0, "values with entries left", self.written)
+            add("inputs row by row", self.limit, rounding, self.inputs)
+        add("every entry written", 0, "values with entries left", self.written)
         for method in self.check.methods:
-            row(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
+            add(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
             if self.check.dtype == np.float64 and METHODS[method].order >= EXACT:
-                row(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
+                add(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
 
     limit = 1e3
 
@@ -571,7 +571,7 @@ def report_vanishing_sines(check: Comparison) -> None:
     There is none in single precision, which takes its sines from double precision.
     """
     if np.any(check.sampler.angles) and check.dtype == np.float64:
-        check.row(
+        check.add_check(
             "sines that vanish",
             VANISHING_LIMIT,
             "units of rounding",

@@ -23,7 +23,7 @@ from eomc.verify.convergence import (
     Place,
 )
 from eomc.verify.reference import Vector
-from eomc.verify.report import Measurement, Row, largest, units
+from eomc.verify.report import CheckResult, Measurement, largest, units
 from eomc.verify.sampling import (
     EPS,
     LARGE,
@@ -52,10 +52,9 @@ def _corrected(e: Expected) -> Vector | float:
 
 
 class Comparison:
-    """Comparison of one module with the reference: states, expected values and the report's rows.
+    """Comparison of one module with the reference: states, expected values, results of checks.
 
-    The reference is the independent evaluation of the equations in Python. A row is one line of the
-    report of `eomc check`.
+    The reference is the independent evaluation of the equations in Python.
 
     Parameters
     ----------
@@ -84,91 +83,93 @@ class Comparison:
         self.effort = LARGE if self.large else SMALL
         self.sampler = Sampler(self.reference, random, self.effort)
         self.expected = self.sampler.states(self.effort.states if states is None else states)
-        self.rows: list[Row] = []
+        self.results: list[CheckResult] = []
         self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
-    def convergence_rows(self) -> None:
-        """Append checks of convergence orders, advised step sizes and power balance to the report.
+    def add_convergence_checks(self) -> None:
+        """Check convergence orders, advised step sizes and the power balance; add the results.
 
-        `convergence.Convergence` and `advice.Advice` measure them.
+        `convergence.Convergence` and `convergence.Advice` measure them.
         """
         runs, methods = self.convergence, self.methods
         for method in methods:
             least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
             find = partial(runs.order, method)
-            self.smooth_row(f"order of {method}", least, "order observed", find)
+            self.add_smooth_check(f"order of {method}", least, "order observed", find)
         for method in methods[1:]:
             unit = "of the two methods' own errors"
-            self.row(
+            self.add_check(
                 f"{method} beside {methods[0]}", 2, unit, partial(runs.compare_methods, method)
             )
         unit = "order at which it closes"
-        self.smooth_row("power balance", runs.closing_limit, unit, runs.closing)
+        self.add_smooth_check("power balance", runs.closing_limit, unit, runs.closing)
         for method in methods:
             if math.isfinite(min(METHODS[method].limits)):
-                self.advice_row(method)
+                self.add_advice_check(method)
 
-    def row(
+    def add_check(
         self, name: str, limit: float, unit: str, measure: Callable[[], float | Measurement],
         minimum: bool = False,
     ) -> None:  # fmt: skip
-        """Measure a number and append a row, one line of the report, with the result.
+        """Measure a number and append the result of the check, one line of the report.
 
         name: what is checked. limit: largest permitted number; with `minimum`, the number must
         exceed it. unit: description of the number. measure: function that returns the number.
 
-        The row fails if `measure` raises an exception. If `measure` returns a Measurement, this may
-        replace unit and limit, or give a reason why nothing is judged; in the latter case the row
-        passes.
+        The check fails if `measure` raises an exception. If `measure` returns a Measurement, this
+        may replace unit and limit, or give a reason why nothing is judged; in the latter case the
+        check passes.
         """
         try:
             result = measure()
         except Exception as fault:  # whatever the module raises is an outcome of the check
-            self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
+            self.results.append(
+                CheckResult(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}")
+            )
             return
         error, why = (result.value, result.why) if isinstance(result, Measurement) else (result, "")
         if isinstance(result, Measurement) and result.unit:
             passed = error <= result.limit
-            self.rows.append(Row(name, error, result.limit, passed, result.unit))
+            self.results.append(CheckResult(name, error, result.limit, passed, result.unit))
             return
         if why:
             idle = math.isinf(error)
             unit = ("no limit to test: " if idle else "not judged: ") + why
-            self.rows.append(Row(name, error, limit, True, unit, judged=idle))
+            self.results.append(CheckResult(name, error, limit, True, unit, judged=idle))
             return
-        self.rows.append(
-            Row(name, error, limit, error > limit if minimum else error <= limit, unit)
+        self.results.append(
+            CheckResult(name, error, limit, error > limit if minimum else error <= limit, unit)
         )
 
-    def smooth_row(
+    def add_smooth_check(
         self, name: str, limit: float, unit: str, measure: Callable[[], Measurement]
     ) -> None:
-        """Append a row for a measured order of convergence, which must exceed `limit`.
+        """Check a measured order of convergence, which must exceed `limit`; add the result.
 
-        The arguments are those of `row`. If the order is too low and the scene has discontinuities
-        or kinks, which reduce it, the row is not judged.
+        The arguments are those of `add_check`. If the order is too low and the scene has
+        discontinuities or kinks, which reduce it, the check is not judged.
         """
-        self.row(name, limit, unit, measure, minimum=True)
-        row = self.rows[-1]
+        self.add_check(name, limit, unit, measure, minimum=True)
+        row = self.results[-1]
         if math.isinf(row.error):
-            self.rows[-1] = replace(row, unit=unit + ": exact, no error to measure")
+            self.results[-1] = replace(row, unit=unit + ": exact, no error to measure")
         elif not row.passed and self.corners and not math.isnan(row.error):
             note = f"not judged: {unit} not to be expected with {self.corners}"
-            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+            self.results[-1] = replace(row, passed=True, unit=note, judged=False)
 
-    def advice_row(self, method: str) -> None:
-        """Append a row for the step size h that the module advises for `method`.
+    def add_advice_check(self, method: str) -> None:
+        """Check the step size h that the module advises for `method`; add the result.
 
-        It passes if runs with an eighth of the advised h are stable and runs with twice that h are
-        unstable.
+        The check passes if runs with an eighth of the advised h are stable and runs with twice that
+        h are unstable.
         """
         unit = "of the advised h, where runs are lost"
         find = partial(self.advice.failing_fraction, method)
-        self.row(f"h of {method}", PARTS[0], unit, find, minimum=True)
-        row = self.rows[-1]
+        self.add_check(f"h of {method}", PARTS[0], unit, find, minimum=True)
+        row = self.results[-1]
         if not row.passed and self.corners:
             note = f"not judged: no matter with {self.corners}"
-            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+            self.results[-1] = replace(row, passed=True, unit=note, judged=False)
 
     @cached_property
     def advice(self) -> Advice:

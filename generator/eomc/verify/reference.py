@@ -38,7 +38,7 @@ MATRICES = ("D", "C", "constraint_jacobian")
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", "power_terms")
 
 
-class Reference(ABC):
+class ReferenceModel(ABC):
     """Independent evaluation in Python of a system's equations of motion D q̈ + bias = τ.
 
     Checks compare compiled modules with it. All methods take one state or b states at once. For one
@@ -398,7 +398,7 @@ VECTORS = ("g", "bias", "tau", "friction")
 WITH_KINETIC_ENERGY = ("kinetic", "energy", "jacobi")
 
 
-class DiscreteReference(Reference):
+class DiscreteReference(ReferenceModel):
     """Reference of a system with discrete variables: parameters that jumps at events set.
 
     A reference is the independent evaluation of the equations in Python. system: the system, with
@@ -406,7 +406,7 @@ class DiscreteReference(Reference):
     the discrete variables as parameters.
     """
 
-    def __init__(self, system: System, core: Reference) -> None:
+    def __init__(self, system: System, core: ReferenceModel) -> None:
         self.system, self.core = system, core
         names = [c.name for c in system.coordinates]
         self.continuous_indices = [k for k, name in enumerate(names) if name not in system.discrete]
@@ -415,7 +415,7 @@ class DiscreteReference(Reference):
     def terms(self, name: str, s: Mapping[str, Any]) -> float:
         """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
 
-        s: the arguments of `evaluate` by name. See `Reference.terms`.
+        s: the arguments of `evaluate` by name. See `ReferenceModel.terms`.
         """
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
         values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
@@ -432,7 +432,7 @@ class DiscreteReference(Reference):
     def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        """Return the value of `name`; see `Reference.value`."""
+        """Return the value of `name`; see `ReferenceModel.value`."""
         value = np.asarray(self.core.value(name, *self._core_arguments(q, qd, t, u, values)))
         if name in WITH_KINETIC_ENERGY:
             value = value + np.sum(qd[..., self.discrete_indices] ** 2, axis=-1) / 2
@@ -445,7 +445,7 @@ class DiscreteReference(Reference):
     def mass_and_force(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
-        """Return D and τ - bias; see `Reference.mass_and_force`."""
+        """Return D and τ - bias; see `ReferenceModel.mass_and_force`."""
         D, force = self.core.mass_and_force(*self._core_arguments(q, qd, t, u, values))
         return self._with_discrete_block(D, 1.0), self._with_discrete_columns(force)
 

@@ -1,4 +1,4 @@
-"""Results of checks: measured numbers, and the report with one row for each check."""
+"""Results of checks: measured numbers, and the report with one line for each check."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 class Measurement:
     """A measured value, or the reason `why` nothing can be judged.
 
-    With a reason, the report's row passes; the value inf then means that there is nothing to test.
-    unit, limit: replace those of the row if the value is of another quantity than the row's.
+    With a reason, the check passes; the value inf then means that there is nothing to test. unit,
+    limit: replace those of the check if the value is of another quantity than the check's.
     """
 
     value: float
@@ -57,10 +57,10 @@ LIMIT = 1e3
 
 
 @dataclass(frozen=True)
-class Row:
+class CheckResult:
     """One line of the report: a check with its measured error, its limit, and the unit of both.
 
-    passed: whether the check has passed. judged: False if nothing could be judged; the row then
+    passed: whether the check has passed. judged: False if nothing could be judged; the check then
     counts as passed and `unit` gives the reason.
     """
 
@@ -73,27 +73,27 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Report:
-    """The report of `eomc check`: its rows, one for each check, and how they were obtained.
+class CheckReport:
+    """The report of `eomc check`: the results of all checks, and how they were obtained.
 
-    states: number of states used. rejected: number of random states left out since their mass
-    matrix D was not regular. reference: how the expected values were computed, either "equations
-    written out" (formulas) or "Taylor arithmetic" (numerical).
+    scene: name of the scene. states: number of states used. rejected: number of random states left
+    out since their mass matrix D was not regular. reference: how the expected values were computed,
+    either "equations written out" (formulas) or "Taylor arithmetic" (numerical).
     """
 
     scene: str
-    rows: tuple[Row, ...]
+    results: tuple[CheckResult, ...]
     states: int
     rejected: int
     reference: str
 
     @property
     def passed(self) -> bool:
-        """True if every row has passed."""
-        return all(row.passed for row in self.rows)
+        """True if every check has passed."""
+        return all(result.passed for result in self.results)
 
     def table(self) -> str:
-        """Return the rows as a text table, 100 columns wide, for a terminal."""
+        """Return the results as a text table, 100 columns wide, for a terminal."""
         from rich.box import SIMPLE_HEAD
         from rich.console import Console
         from rich.table import Table
@@ -106,9 +106,9 @@ class Report:
         table.add_column("found", justify="right")
         table.add_column("limit", justify="right")
         table.add_column("in")
-        for row in self.rows:
-            mark = ("ok" if row.judged else "?") if row.passed else "FAILED"
-            table.add_row(mark, row.name, f"{row.error:.3g}", f"{row.limit:g}", row.unit)
+        for x in self.results:
+            mark = ("ok" if x.judged else "?") if x.passed else "FAILED"
+            table.add_row(mark, x.name, f"{x.error:.3g}", f"{x.limit:g}", x.unit)
         text = io.StringIO()
         Console(file=text, width=100).print(table)
         return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
@@ -118,7 +118,7 @@ class Report:
 
         An error that is not finite becomes None.
         """
-        rows = [asdict(row) for row in self.rows]
+        rows = [asdict(row) for row in self.results]
         for row in rows:
             row["error"] = row["error"] if math.isfinite(row["error"]) else None
         return {

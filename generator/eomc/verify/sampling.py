@@ -20,7 +20,7 @@ from sympy import Symbol
 
 from eomc.model.loops import find_wrong_rotations
 from eomc.verify import kkt
-from eomc.verify.reference import Reference, Vector
+from eomc.verify.reference import ReferenceModel, Vector
 
 EPS = 2.0**-52
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
@@ -207,7 +207,7 @@ class Sampler:
 
     Parameters
     ----------
-    reference : Reference
+    reference : ReferenceModel
         Evaluates the system's equations in Python.
     random : Generator
         Source of random numbers.
@@ -225,7 +225,7 @@ class Sampler:
     """
 
     def __init__(
-        self, reference: Reference, random: np.random.Generator, effort: SampleBudget
+        self, reference: ReferenceModel, random: np.random.Generator, effort: SampleBudget
     ) -> None:
         self.reference, self.random = reference, random
         self.system = system = reference.system
@@ -562,7 +562,7 @@ class Sampler:
         each input x_i. With more than MOST_NUDGES inputs, the sum is estimated from DRAWS random
         changes of all inputs, as the root of the sum of squares.
 
-        function: f, with the arguments of `Reference.evaluate` for many states at once.
+        function: f, with the arguments of `ReferenceModel.evaluate` for many states at once.
         """
         near = perturb_each_input(s, self.defaults)
         many = len(near) > MOST_NUDGES

@@ -26,7 +26,7 @@ from eomc.verify.reference import (
     MATRICES,
     SCALARS,
     DiscreteReference,
-    Reference,
+    ReferenceModel,
     Values,
     Vector,
     by_rows,
@@ -145,7 +145,7 @@ def without_definitions(system: System) -> System:
     )  # fmt: skip
 
 
-def reference_for(system: System) -> Reference:
+def reference_for(system: System) -> ReferenceModel:
     """Return the reference of a system: its independent evaluation in Python, used by the checks.
 
     It is symbolic (`derive`) for a small system, otherwise numerical (`TaylorReference`). If jumps
@@ -225,7 +225,7 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 
 @dataclass(frozen=True)
-class SymbolicReference(Reference):
+class SymbolicReference(ReferenceModel):
     """Reference whose equations of motion are SymPy expressions in q, qd, t, u and the parameters.
 
     A reference is the independent evaluation of a system in Python, with which modules are
@@ -286,7 +286,7 @@ class SymbolicReference(Reference):
     def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        """Return the value of `name`; see `Reference.value`."""
+        """Return the value of `name`; see `ReferenceModel.value`."""
         if q.ndim == 1:
             return self._value_at_state(name, q, qd, float(t), u, values)
         states = self._states(q, qd, t, u, values)

@@ -34,7 +34,7 @@ from sympy import Expr
 
 from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
-from eomc.verify.reference import SCALARS, Reference, Values, Vector
+from eomc.verify.reference import SCALARS, ReferenceModel, Values, Vector
 
 BLOCK = 2**16  # entries of (nq, nq) matrices, of so many states at once: what caches hold
 
@@ -141,7 +141,7 @@ class EvaluationPoint:
         return row
 
 
-class TaylorReference(Reference):
+class TaylorReference(ReferenceModel):
     """Reference that evaluates equations of motion with arrays of derivatives instead of formulas.
 
     A reference is the independent evaluation of a system in Python, with which modules are
@@ -177,7 +177,7 @@ class TaylorReference(Reference):
     def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
-        """Return the value of `name`; see `Reference.value`."""
+        """Return the value of `name`; see `ReferenceModel.value`."""
         inputs = None if u is None else np.asarray(u, float)
         if q.ndim == 1:
             row = None if inputs is None else inputs[None]
