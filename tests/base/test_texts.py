@@ -50,7 +50,7 @@ from eomc.emit.optimised import files
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text
-from eomc.report.equations import write_equations
+from eomc.report.equations_text import write_equations
 from eomc.scene import schema
 from eomc.scene.read import parse
 

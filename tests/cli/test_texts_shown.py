@@ -86,9 +86,7 @@ def test_the_page_of_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def drawn(title: str, unit: str) -> Any:
     made = with_texts(derived().system, unit)
-    t = np.linspace(0, 1, 11)
-    q = np.cos(t)[:, None]
-    return plot.figure(replace(made, title=title), t, q, q, 5 + 0 * t)
+    return plot.make_figure(replace(made, title=title), curves())
 
 
 @pytest.mark.slow
@@ -96,15 +94,16 @@ def drawn(title: str, unit: str) -> Any:
 def test_figures(given: str, tmp_path: Path) -> None:
     text = PAYLOADS[given]
     drawn(text, text).savefig(tmp_path / "figure.svg")
-    plot.draw(with_texts(derived().system, text), *drawing(), tmp_path / "drawn.svg", title=text)
+    made = with_texts(derived().system, text)
+    plot.write_figure(made, curves(), tmp_path / "drawn.svg", title=text)
     for file in ("figure.svg", "drawn.svg"):
         ElementTree.parse(tmp_path / file)
 
 
-def drawing() -> tuple[Any, ...]:
+def curves() -> plot.RunCurves:
     t = np.linspace(0, 1, 11)
     q = np.cos(t)[:, None]
-    return t, q, q, 5 + 0 * t
+    return plot.RunCurves(t, q, q, 5 + 0 * t)
 
 
 def test_no_text_of_a_figure_is_mathematics_or_latex() -> None:

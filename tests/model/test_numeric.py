@@ -12,7 +12,7 @@ import sympy
 from eomc.model.algebra import compiled
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import symbol
-from eomc.report import equations
+from eomc.report.equations_text import write_equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 from eomc.verify.checks_inputs_outputs import Formulas
@@ -74,7 +74,7 @@ def test_arguments_and_definitions_hide_nothing(name: str, modules: Any) -> None
 @pytest.mark.parametrize("name", ["E", "Max", "Matrix"])
 def test_source_of_equations_runs_whatever_parameters_are_called(name: str) -> None:
     system, space = from_scene(parse(named(name))), dict[str, Any]()
-    exec(equations.write_equations(system, "python"), space)  # our own text
+    exec(write_equations(system, "python"), space)  # our own text
     found = space["g"][0] - space["tau"][0]
     values = {sympy.Symbol(name, real=True): 2, sympy.Symbol("x", real=True): sympy.Rational(3, 10)}
     assert -float(found.subs(values)) / 2 == pytest.approx(expected(0.3))

@@ -16,7 +16,7 @@ import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
 from eomc.model.from_sympy import formula_text, in_python
-from eomc.report.drawing import drawing
+from eomc.report.drawing import draw_mechanism
 from eomc.scene import formulas
 from eomc.scene.read import parse
 
@@ -73,9 +73,9 @@ def same(one: Any, other: Any) -> None:
 def test_it_is_drawn_as_that_of_a_scene() -> None:
     scene = from_scene(parse(SCENE + PICTURE))
     system = made(tomllib.loads(PICTURE)["picture"])
-    same(drawing(system, T, Q), drawing(scene, T, Q))
-    longer = drawing(system.with_parameters({"l": 3.0}), T, Q)
-    same(longer, drawing(scene.with_parameters({"l": 3.0}), T, Q))
+    same(draw_mechanism(system, T, Q), draw_mechanism(scene, T, Q))
+    longer = draw_mechanism(system.with_parameters({"l": 3.0}), T, Q)
+    same(longer, draw_mechanism(scene.with_parameters({"l": 3.0}), T, Q))
 
 
 def test_expressions_stand_as_formulas_do() -> None:
@@ -98,7 +98,7 @@ def test_expressions_stand_as_formulas_do() -> None:
             "axes": "xz",
         },
     )  # fmt: skip
-    same(drawing(system, T, Q), drawing(from_scene(parse(SCENE + PICTURE)), T, Q))
+    same(draw_mechanism(system, T, Q), draw_mechanism(from_scene(parse(SCENE + PICTURE)), T, Q))
 
 
 @pytest.mark.parametrize(

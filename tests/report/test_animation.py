@@ -14,10 +14,9 @@ from report.pictures import SCENES, chain, humanoid, motion, scene, system
 
 from eomc.base.errors import EomcError
 from eomc.report import animation
-from eomc.report.drawing import drawing
-from eomc.report.labels import html_name
-from eomc.report.system_of_run import system_of
-from eomc.report.timeline import Timeline, instance_numbers, select_instances
+from eomc.report.drawing import draw_mechanism
+from eomc.report.style import html_name
+from eomc.report.timeline import Timeline, instance_numbers, select_instances, system_of
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
@@ -68,7 +67,7 @@ def test_positions_are_those_of_the_run_to_the_stated_resolution():
     made = scene("cartpole")
     run = motion(made)
     given = data(animation.page([Timeline(system(made), run)]))["runs"][0]
-    shown = drawing(system(made), run.t, run.q)
+    shown = draw_mechanism(system(made), run.t, run.q)
     d = given["drawing"]
     moving = values(d["moving"], (len(run.t), d["count"], 2))
     (box,) = [m for m in d["marks"] if m[0] == "box"]
@@ -211,7 +210,7 @@ def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
     assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
     fifth = system_of(batch).with_parameters({"l": batch._params[4, 2]})
-    alone = drawing(fifth, batch.t[rows], batch.q[4, rows])
+    alone = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
     path = alone.points[:, alone.paths[0].point]
     assert np.abs(moving[:, own] - path).max() <= d["moving"]["scale"]

@@ -12,8 +12,7 @@ import pytest
 from report.pictures import chain, humanoid, motion, scene, system
 
 from eomc.report import animation
-from eomc.report.system_of_run import system_of
-from eomc.report.timeline import BatchTimeline, Timeline
+from eomc.report.timeline import BatchTimeline, Timeline, system_of
 
 pytestmark = [
     pytest.mark.slow,

@@ -26,8 +26,8 @@ from eomc.cli.main import main
 from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import Event, System
-from eomc.report import cost_of_digits, linearised, mathml, page
-from eomc.report.cost_of_digits import Point, Report
+from eomc.report import cost_of_digits, overview, page
+from eomc.report.cost_of_digits import WorkPrecisionPoint, WorkPrecisionReport
 
 REPORTS = ROOT / "build" / "tests" / "reports"
 OSCILLATING = """eomc = 1
@@ -52,7 +52,7 @@ def oscillator() -> System:
 
 
 @cache
-def measured() -> Report:
+def measured() -> WorkPrecisionReport:
     return cost_of_digits.measure(oscillator(), REPORTS, longest=0.02, methods=("rk4", "dp8"))
 
 
@@ -135,9 +135,9 @@ def test_a_difference_of_an_oscillator_does_not_grow() -> None:
 def test_what_grows_as_the_motion_does_is_not_chaos() -> None:
     """x'' = x for 40 s: differences grow by e^40, and so does x, which keeps all its digits."""
     t = np.linspace(0, 40, 65)
-    running = linearised._judged(t, np.exp(t), 1e-3 * np.expm1(t), 1e-3 * np.exp(t))
+    running = cost_of_digits._classify_growth(t, np.exp(t), 1e-3 * np.expm1(t), 1e-3 * np.exp(t))
     assert not running.wild and running.horizon == math.inf
-    bounded = linearised._judged(t, np.exp(t), np.ones(65), np.ones(65))
+    bounded = cost_of_digits._classify_growth(t, np.exp(t), np.ones(65), np.ones(65))
     assert bounded.wild and bounded.rate == pytest.approx(1)
     assert bounded.horizon == pytest.approx(math.log(0.1 * 2**53), abs=40 / 64)
 
@@ -190,12 +190,15 @@ def test_condition_and_jumps_are_reported(tmp_path: Path) -> None:
 
 
 def test_stable_steps_of_known_eigenvalues() -> None:
-    assert linearised.stable_step(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(0.0283)
-    assert linearised.stable_step(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(
+    assert cost_of_digits.stable_step(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(
+        0.0283
+    )
+    assert cost_of_digits.stable_step(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(
         2.79e-3
     )
-    assert linearised.stable_step(np.array([5 + 0j]), (2.83, 2.79)) == math.inf  # grows by itself
-    assert linearised.stable_step(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
+    growing = np.array([5 + 0j])
+    assert cost_of_digits.stable_step(growing, (2.83, 2.79)) == math.inf
+    assert cost_of_digits.stable_step(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
 
 
 class _Page(HTMLParser):
@@ -227,7 +230,7 @@ def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
         monkeypatch.setitem(sys.modules, name, None)
-    mathml._convert.cache_clear()
+    overview._convert.cache_clear()
     monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measured())
     scene = tmp_path / "oscillating.toml"
     scene.write_text(OSCILLATING)
@@ -266,7 +269,7 @@ def test_the_first_steps_are_few_to_a_turn(
     """Of 12 radians at most, a quarter of that to be sure; a motion without modes has eight."""
     asked, like = [], measured().lines[0].points[0]
 
-    def point(_: object, __: object, name: str, duration: float, steps: int) -> Point:
+    def point(_: object, __: object, name: str, duration: float, steps: int) -> WorkPrecisionPoint:
         asked.append(steps)
         return replace(like, seconds=math.inf)
 

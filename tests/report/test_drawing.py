@@ -12,7 +12,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.kinematics import Kinematics
 from eomc.model.system import System, symbol
 from eomc.program.assembly import assembled
-from eomc.report.drawing import drawing
+from eomc.report.drawing import draw_mechanism
 from eomc.scene.read import parse
 
 GOLDEN = Path(__file__).parent / "drawings.json"
@@ -24,7 +24,7 @@ DRAWN = [
 
 def drawn(made, rows=121):
     run = motion(made, rows=rows)
-    return drawing(system(made), run.t, run.q)
+    return draw_mechanism(system(made), run.t, run.q)
 
 
 def marks(found, kind):
@@ -57,7 +57,7 @@ def test_drawings_are_as_they_were_read(name):
 def test_frames_are_where_the_other_kinematics_has_them(made):
     made = made()
     run = motion(made, rows=3)
-    found = drawing(system(made), run.t, run.q)
+    found = draw_mechanism(system(made), run.t, run.q)
     other = Kinematics(made, made.assembly)
     kept = ["xyz".index(axis) for axis in found.axes]
     for row in range(3):
@@ -86,7 +86,7 @@ def closed(joint):
     text = (SCENES / "four_bar.toml").read_text()
     text = text[: text.index("[picture]")] + text[text.index("[run]") :]
     made = assembled(from_scene(parse(text.replace('joint  = "revolute"', joint))))
-    return drawing(made, np.zeros(1), np.array([[c.start for c in made.coordinates]]))
+    return draw_mechanism(made, np.zeros(1), np.array([[c.start for c in made.coordinates]]))
 
 
 def test_a_loop_is_drawn_as_a_joint_that_its_bodies_reach():
@@ -219,7 +219,7 @@ def test_without_a_picture_only_paths_of_named_points_are_drawn():
     text = (OWN / "ball_beam.toml").read_text()
     made = from_scene(parse(text[: text.index("[picture]")]))
     run = motion(made.scene)
-    found = drawing(made, run.t, run.q)
+    found = draw_mechanism(made, run.t, run.q)
     assert [m.kind for m in found.marks] == ["dot"]
     assert [p.name for p in found.paths] == ["(x_b, y_b)"] and found.labels == ("x_b", "y_b")
     assert found.unit == "m"
@@ -232,29 +232,29 @@ def test_what_jumps_set_is_drawn_as_it_is_then():
         events={"grows": {"when": "t - 1", "action": "jump", "l": "3*l"}},
         picture={"lines": [[["x", 0], ["x", "l"]]]},
     )  # fmt: skip
-    found = drawing(made, np.array([0.0, 2.0]), np.array([[0.0, 2.0], [0.5, 6.0]]))
+    found = draw_mechanism(made, np.array([0.0, 2.0]), np.array([[0.0, 2.0], [0.5, 6.0]]))
     assert sorted(found.points[:, :, 1].tolist()) == [[0, 2], [0, 6]]
 
 
 def test_what_has_no_place_is_not_drawn():
     r, theta = symbol("r"), symbol("theta")
     made = System.make("polar", [r, theta], symbol("r_dot") ** 2 + symbol("theta_dot") ** 2)
-    assert drawing(made, np.zeros(1), np.ones((1, 2))) is None
+    assert draw_mechanism(made, np.zeros(1), np.ones((1, 2))) is None
     pair = {symbol("x"): r * sympy.cos(theta), symbol("y"): symbol("r_dot")}
     named = System.make("rates", [r, theta], made.kinetic, definitions=pair)
-    assert drawing(named, np.zeros(1), np.ones((1, 2))) is None  # y is no place
+    assert draw_mechanism(named, np.zeros(1), np.ones((1, 2))) is None  # y is no place
 
 
 def test_parameters_of_the_run_count():
     made = from_scene(scene("simple_pendulum")).with_parameters({"l": 3.0})
-    found = drawing(made, np.zeros(1), np.zeros((1, 1)))
+    found = draw_mechanism(made, np.zeros(1), np.zeros((1, 1)))
     assert np.allclose(marks(found, "line")[0][0, 1], [0, -3])
 
 
 def test_what_has_no_value_is_left_out():
     made = scene("kepler_orbit")
     text = (SCENES / "kepler_orbit.toml").read_text().replace('["x", "y"]', '["sqrt(x)", "y"]')
-    found = drawing(system(parse(text)), np.zeros(2), np.array([[-1.0, 0], [4, 1]]))
+    found = draw_mechanism(system(parse(text)), np.zeros(2), np.array([[-1.0, 0], [4, 1]]))
     assert np.isnan(found.points[0]).any() and np.allclose(found.points[1].max(axis=0), [2, 1])
     assert made.picture
 
@@ -262,9 +262,9 @@ def test_what_has_no_value_is_left_out():
 def test_far_travel_is_told():
     made = scene("slung_load")
     run = motion(made)
-    assert not drawing(system(made), run.t, run.q).travels
+    assert not draw_mechanism(system(made), run.t, run.q).travels
     run.q[:, 0] += 100 * run.t
-    assert drawing(system(made), run.t, run.q).travels
+    assert draw_mechanism(system(made), run.t, run.q).travels
 
 
 if __name__ == "__main__":

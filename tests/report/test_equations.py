@@ -22,8 +22,8 @@ import eomc
 from eomc import pipeline
 from eomc.cli.main import main
 from eomc.model.symbols import symbol
-from eomc.report import equations_text
-from eomc.report.equations import derive, write_equations
+from eomc.report.equations import derive, write_latex
+from eomc.report.equations_text import write_equations
 from eomc.report.typeset import Typesetter
 from eomc.runtime.labels import tex
 from eomc.verify import symbolic
@@ -66,7 +66,7 @@ def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
     x, v, a = symbols("x x_dot x_ddot", real=True)
     assert sympy.expand(found.lhs - (m * a + c * v + k * x)) == 0
     assert sympy.expand(found.rhs - (F - k_3 * x**3)) == 0
-    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in equations_text.latex(derive(made))
+    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in write_latex(derive(made))
     text = unicodedata.normalize("NFC", str(derive(made)))
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
 
@@ -81,7 +81,7 @@ def test_decimals_of_a_scene_stay_decimals() -> None:
     """0.028, not 7/250; a third and an eighth stay fractions."""
     potential = "0.0125*x**2/2 + 0.007*x*(1 + m) - m*sin(x)/400 + x**3/8"
     made = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
-    text, latex = (form(derive(made)) for form in (str, equations_text.latex))
+    text, latex = (form(derive(made)) for form in (str, write_latex))
     assert "- 0.0025⋅m⋅cos(x) = 0" in text and "0.007 + 0.007⋅m + 0.0125⋅x" in text
     assert r"- 0.0025 m \cos {x} = 0" in latex and r"\frac{3 x^{2}}{8}" in latex
     found = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
@@ -135,7 +135,7 @@ def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
 
 
 def test_terms_stand_as_a_textbook_has_them() -> None:
-    latex = equations_text.latex(derive(pipeline.read(SCENES / "spring_pendulum.toml")))
+    latex = write_latex(derive(pipeline.read(SCENES / "spring_pendulum.toml")))
     assert (
         r"& m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
         in latex

@@ -24,8 +24,9 @@ from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.model.tree import Tree
-from eomc.report import large_system
-from eomc.report.equations import Equations, derive, write_equations
+from eomc.report import equations_text
+from eomc.report.equations import Equations, derive
+from eomc.report.equations_text import write_equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 
@@ -169,7 +170,7 @@ def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
 
 
 def test_the_short_form_has_what_each_joint_is() -> None:
-    latex = large_system.latex(large())
+    latex = equations_text.describe_in_latex(large())
     for said in (
         r"\text{arm\_1 on the world}, \; k = 1, \; p = 0:", r"s_{3} = 2 \, a - c",
         r"\alpha_{1} = 0.05", r"S_{2} = (0, e_{", r"m_{1} = m, \; c_{1} = \left(", "P' &=",

@@ -16,7 +16,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.report import cost_of_digits, equations, mathml, overview, page
+from eomc.report import cost_of_digits, equations, overview, page
 from eomc.scene.read import parse
 
 pytest.importorskip("matplotlib")
@@ -74,14 +74,14 @@ def made() -> str:
 
 
 def test_equations_become_mathml() -> None:
-    first, rest = mathml.lines(equations.derive(system()))
+    first, rest = overview.write_mathml(equations.derive(system()))
     ((more, line),) = first
     assert not more and line.startswith("<math") and 'displaystyle="true"' in line
     assert "<mi>k</mi>" in line and "push" in re.sub("<[^>]+>", "", line)
     symbols = [re.sub("<[^>]+>", "", line)[0] for _, line in rest[:6]]
     assert symbols == ["K", "P", "L", "D", "C", "g"]
     swing = equations.derive(pipeline.read(ROOT / "scenes" / "furuta_pendulum.toml"))
-    first, _ = mathml.lines(swing)
+    first, _ = overview.write_mathml(swing)
     assert [more for more, _ in first] == [False, True, False]
     assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
 
@@ -91,9 +91,9 @@ def test_without_latex2mathml_equations_say_what_to_install(
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
         monkeypatch.setitem(sys.modules, name, None)
-    mathml._convert.cache_clear()
+    overview._convert.cache_clear()
     with pytest.raises(EomcError, match="need latex2mathml: pip install latex2mathml"):
-        mathml.lines(equations.derive(system()))
+        overview.write_mathml(equations.derive(system()))
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 from report.pictures import motion, scene, system
 
 from eomc.report import picture
-from eomc.report.drawing import drawing
+from eomc.report.drawing import draw_mechanism
 
 pytest.importorskip("matplotlib")
 
@@ -104,7 +104,7 @@ def test_a_mechanism_that_travels_is_shown_where_it_starts():
     made = scene("slung_load")
     run = motion(made)
     run.q[:, 0] += 100 * run.t
-    shown = picture.Mechanism(run.t, drawing(system(made), run.t, run.q))
+    shown = picture.Mechanism(run.t, draw_mechanism(system(made), run.t, run.q))
     on = axes()
     shown.draw(on)
     assert on.dataLim.width < 20
@@ -115,5 +115,5 @@ def test_what_has_no_value_is_left_out():
     run = motion(made, rows=5)
     run.q[2] = np.nan
     on = axes()
-    picture.Mechanism(run.t, drawing(system(made), run.t, run.q)).draw(on)
+    picture.Mechanism(run.t, draw_mechanism(system(made), run.t, run.q)).draw(on)
     assert on.get_lines()

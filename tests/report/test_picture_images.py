@@ -8,7 +8,7 @@ import pytest
 from report.pictures import motion, scene, system
 
 from eomc.report import picture
-from eomc.report.drawing import drawing
+from eomc.report.drawing import draw_mechanism
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
@@ -42,7 +42,7 @@ def drawn(made):
 def made(name):
     what = scene(name)
     run = motion(what)
-    return drawing(system(what), run.t, run.q)
+    return draw_mechanism(system(what), run.t, run.q)
 
 
 def apart(one, other):

@@ -37,7 +37,7 @@ def oscillator(duration: float = 2.0) -> System:
                        duration=duration)  # fmt: skip
 
 
-def digits_right(name: str, made: reference_solution.Reference) -> float:
+def digits_right(name: str, made: reference_solution.ReferenceSolution) -> float:
     """Digits in common with the case's result, relative to the largest value on the way."""
     case = cases()[name]
     exact = [*case["q_ref"], *case["qd_ref"]]
@@ -85,12 +85,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(folder: Path) -> reference_solution.Reference:
+def made(folder: Path) -> reference_solution.ReferenceSolution:
     """That of the oscillator."""
     return reference_solution.solve(oscillator(), rows=8, root=folder)
 
 
-def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> None:
+def test_an_oscillator_is_cos_all_along(made: reference_solution.ReferenceSolution) -> None:
     with mpmath.workdps(40):
         for k, (q, qd) in enumerate(zip(made.q[:, 0], made.qd[:, 0], strict=True)):
             t = mpmath.mpf(2) * k / 8
@@ -101,7 +101,9 @@ def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> N
     np.testing.assert_array_equal(made.t, np.arange(9) / 4)
 
 
-def test_differences_are_right_below_double_precision(made: reference_solution.Reference) -> None:
+def test_differences_are_right_below_double_precision(
+    made: reference_solution.ReferenceSolution,
+) -> None:
     nearest = made.q.astype(float)
     off = made.error_of(nearest, made.qd.astype(float))[:, 0]
     expected = [float(Fraction(float(x)) - Fraction(str(s))) for x, s in zip(
@@ -111,7 +113,7 @@ def test_differences_are_right_below_double_precision(made: reference_solution.R
 
 
 def test_it_is_kept_until_start_or_parameters_change(
-    made: reference_solution.Reference, folder: Path, monkeypatch: pytest.MonkeyPatch
+    made: reference_solution.ReferenceSolution, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = oscillator()
     with monkeypatch.context() as patch:

@@ -48,7 +48,7 @@ WRITERS: dict[str, Callable[[Any, Path], Any]] = {
 
 def _figure(run: Any, file: Path) -> None:
     system = pipeline.read(SCENES / "cartpole_driven.toml")
-    plot.draw(system, run.t, run.q, run.qd, run.energy, file)
+    plot.write_figure(system, plot.RunCurves(run.t, run.q, run.qd, run.energy), file)
 
 
 def limit() -> None:

@@ -14,7 +14,7 @@ import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System, symbol
-from eomc.report import equations, equations_text
+from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
@@ -183,7 +183,7 @@ def test_no_other_formula_has_them() -> None:
 
 def test_equations_show_them() -> None:
     system = from_scene(parse(BALL, "test.toml"))
-    assert "tension = -2⋅λ_rod⋅l" in equations_text.text(equations.derive(system))
+    assert "tension = -2⋅λ_rod⋅l" in equations.write_text(equations.derive(system))
 
 
 @pytest.mark.slow

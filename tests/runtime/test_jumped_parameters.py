@@ -17,7 +17,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.system import System
 from eomc.program.assembly import assembled
-from eomc.report import equations
+from eomc.report.equations_text import write_equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
 from eomc.verify.reference import DiscreteReference
@@ -168,7 +168,7 @@ def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
     core = with_constant_parameters(system)
     assert [c.name for c in core.coordinates] == ["x", "theta"]
     assert {p.name: p.value for p in core.parameters}["l"] == 0.5
-    assert "q = (x, theta)" in equations.write_equations(system)
+    assert "q = (x, theta)" in write_equations(system)
 
 
 MARKED = """eomc = 1

@@ -85,13 +85,13 @@ def show_command(scene: Path, root: Path, form: str | None) -> None:
     name, digest = pipeline.name_and_digest(scene)
 
     def make() -> dict[str, str]:
-        from eomc.report import equations, equations_text
+        from eomc.report import equations_text
 
         system = pipeline.read(scene)
         if form == "cost":
             text = equations_text.cost(system)
         else:
-            text = equations.write_equations(system, form or "text")
+            text = equations_text.write_equations(system, form or "text")
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):

@@ -163,7 +163,11 @@ def run_command(arguments: RunArguments) -> None:
     has_work = module._model.has_power or len(run.events) > 0  # forces, or jumps
     balance = run.balance() if has_work and simulation.is_short else None
     if plot:
-        _plot(module, run, arguments, parameters, balance.words if balance else "")
+        from eomc.report.plot import RunCurves, write_figure
+
+        curves = RunCurves.of_run(run, balance.words if balance else "")
+        system = pipeline.read(scene).with_parameters(parameters)
+        write_figure(system, curves, plot, wrap=arguments.wrap)
     if animate:
         with status_line(f"drawing {animate.name}", silent):
             run.animate(animate)
@@ -208,23 +212,6 @@ def _simulate(module: Any, arguments: RunArguments, start: Mapping[str, Any]) ->
     except (ValueError, MemoryError, module.MotionError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None
     return Simulation(run, seconds, beyond_stability, beyond_duration)
-
-
-def _plot(
-    module: Any, run: Run, arguments: RunArguments, parameters: Mapping[str, float], words: str
-) -> None:
-    """Write the figure of a run. words: the energy balance in words, or ""."""
-    from eomc.report import plot as plots
-
-    assert arguments.plot is not None
-    drawn = run._drawn
-    system = pipeline.read(arguments.scene).with_parameters(parameters)
-    jacobi = drawn.jacobi if module._model.has_jacobi else None
-    inputs = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
-    plots.draw(
-        system, drawn.t, drawn.q, drawn.qd, drawn.energy, arguments.plot, jacobi=jacobi,
-        outputs=drawn.outputs, words=words, inputs=inputs, wrap=arguments.wrap,
-    )  # fmt: skip
 
 
 def _with_events(module: ModuleType, arguments: Sequence[str]) -> ModuleType:

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.emit.render import environment
-from eomc.report.labels import html_name
-from eomc.report.marks import Drawing
-from eomc.report.system_of_run import Source, system_of
-from eomc.report.timeline import BatchTimeline, Panel, Timeline
+from eomc.report.drawing import Drawing
+from eomc.report.style import html_name
+from eomc.report.timeline import BatchTimeline, Panel, Source, Timeline, system_of
 from eomc.runtime.atomic_write import atomic_write
 
 Array = NDArray[np.float64]

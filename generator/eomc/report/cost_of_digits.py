@@ -14,6 +14,7 @@ import math
 import os
 import statistics
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,6 +24,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eomc import pipeline
 from eomc.base.errors import EomcError, SceneError
@@ -30,17 +32,12 @@ from eomc.integrators.tableaux import GAUSS16, METHODS
 from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.report import reference_solution
-from eomc.report.linearised import (
-    Complex,
-    Growth,
-    at_rows,
-    growth,
-    simulate,
-    spectrum,
-    stable_step,
-)
-from eomc.report.reference_solution import Reference
+from eomc.report.reference_solution import ReferenceSolution
+from eomc.runtime.growth import growth as growth_factor
+from eomc.runtime.growth import mean_mass_matrix, norm_root
 from eomc.verify.reference import Vector
+
+Complex = NDArray[np.complex128]
 
 ROW_COUNT = 256  # rows at which runs are compared with the reference
 DIGITS = range(3, 16)
@@ -54,7 +51,7 @@ LARGE_CONDITION = 1e8  # condition number of D, diagonal scaled to 1, above whic
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class WorkPrecisionPoint:
     """Accuracy and computing time of one run, with fixed steps or with adaptive steps.
 
     Errors of positions and velocities are relative to the largest value of each component along the
@@ -101,7 +98,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Line:
+class WorkPrecisionCurve:
     """Results of one stepper (integration method): its runs from coarse to fine, and their summary.
 
     For adaptive steps, all numbers but `order` are nan. Step sizes h are in s.
@@ -129,7 +126,7 @@ class Line:
 
     method: str
     order: int
-    points: tuple[Point, ...]
+    points: tuple[WorkPrecisionPoint, ...]
     observed: float
     usable_h: float
     stable_to: float
@@ -137,7 +134,35 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Report:
+class Growth:
+    """Growth of a small perturbation of the initial state along a motion.
+
+    Attributes
+    ----------
+    t
+        Times (n,) in s.
+    amplification
+        Factors (n,) by which the perturbation has grown up to the times `t`.
+    rate
+        Mean exponential growth rate of the perturbation in 1/s, over the second half of the motion.
+        If the distance of the motion from its start grows too, the perturbation is first divided
+        by the factor of that growth.
+    wild
+        True if this growth is exponential, as in chaotic motion.
+    horizon
+        Time in s at which rounding errors have grown to a tenth of the size of the motion; inf if
+        they do not grow that far.
+    """
+
+    t: Vector
+    amplification: Vector
+    rate: float
+    wild: bool
+    horizon: float
+
+
+@dataclass(frozen=True)
+class WorkPrecisionReport:
     """Cost of accuracy of one scene: the results of all steppers and properties of the motion.
 
     Attributes
@@ -169,7 +194,7 @@ class Report:
     title: str
     duration: float
     digits: float
-    lines: tuple[Line, ...]
+    lines: tuple[WorkPrecisionCurve, ...]
     growth: Growth
     eigenvalue: complex
     condition: tuple[float, float, Vector]
@@ -180,18 +205,18 @@ class Report:
     skipped: Mapping[str, str]
 
     @property
-    def points(self) -> tuple[Point, ...]:
-        """The runs of all steppers, each as a `Point`."""
+    def points(self) -> tuple[WorkPrecisionPoint, ...]:
+        """The runs of all steppers, each as a `WorkPrecisionPoint`."""
         return tuple(p for line in self.lines for p in line.points)
 
-    def best(self, digits: float) -> Point | None:
+    def best(self, digits: float) -> WorkPrecisionPoint | None:
         """Return the fastest run with at least `digits` correct digits at all times, or None."""
         good = (p for p in self.points if p.along <= 10.0**-digits)
         return min(good, key=lambda p: p.seconds, default=None)
 
     @property
-    def finest(self) -> Point:
-        """The most accurate run: that with the smallest value of `Point.along`."""
+    def finest(self) -> WorkPrecisionPoint:
+        """The most accurate run: that with the smallest value of `WorkPrecisionPoint.along`."""
         return min(self.points, key=lambda p: p.along)
 
 
@@ -202,7 +227,7 @@ def measure(
     longest: float = MAX_RUN_SECONDS,
     methods: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda completed, total: None,
-) -> Report:
+) -> WorkPrecisionReport:
     """Measure computing time and error of all steppers for one scene.
 
     Each run starts from the scene's initial state and lasts for the scene's duration.
@@ -221,7 +246,7 @@ def measure(
 
     Returns
     -------
-    Report
+    WorkPrecisionReport
 
     Raises
     ------
@@ -235,9 +260,9 @@ def measure(
     reference = reference_solution.solve(system, rows=ROW_COUNT, root=root)
     progress(1, total)
     module, skipped = variant(system, names, Path(root) / system.name / "report")
-    values, at, place = spectrum(module, reference)
+    values, at, place = compute_spectrum(module, reference)
     baseline = _Baseline(
-        reference, at_rows(module.jacobi, reference), _energy_scale(module, reference)
+        reference, evaluate_along(module.jacobi, reference), _energy_scale(module, reference)
     )
     lines = []
     for k, name in enumerate(module.methods):
@@ -249,13 +274,13 @@ def measure(
     points = [p for line in lines for p in line.points]
     finest = min((p for p in points if not p.adaptive), key=lambda p: p.along)
     fastest = max(values, key=abs, default=0j)
-    return Report(
+    return WorkPrecisionReport(
         scene=system.name,
         title=system.title or system.name,
         duration=system.run.duration,
         digits=float(reference.digits[-1]),
         lines=tuple(lines),
-        growth=growth(module, reference, finest.method, finest.steps),
+        growth=measure_growth(module, reference, finest.method, finest.steps),
         eigenvalue=complex(fastest),
         condition=(at, *place),
         corners=nonsmooth_functions(system),
@@ -301,14 +326,14 @@ def variant(system: System, names: Sequence[str], root: Path) -> tuple[ModuleTyp
     return pipeline.load(with_methods(usable), root), skipped
 
 
-# --- runs ---------------------------------------------------------------------------------------
+# --- runs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Baseline:
     """Reference solution, Jacobi's integral along it, and the scale of energy errors in J."""
 
-    reference: Reference
+    reference: ReferenceSolution
     jacobi: Vector
     energy: float
 
@@ -316,14 +341,14 @@ class _Baseline:
 def _line(
     module: ModuleType, baseline: _Baseline, name: str, values: Complex, duration: float,
     longest: float,
-) -> Line:  # fmt: skip
+) -> WorkPrecisionCurve:  # fmt: skip
     """Run one stepper with decreasing h, from unstable steps to the limit of rounding or time."""
     method = METHODS[name]
     stable_to = stable_step(values, method.limits)
     speed = float(np.max(np.abs(values), initial=0.0)) or 1.0 / duration
     coarse = min(stable_to, 12.0 / speed)
     power = max(3, math.floor(math.log2(duration / coarse)) - 1)
-    points: list[Point] = []
+    points: list[WorkPrecisionPoint] = []
     while power <= 26:
         p = _point(module, baseline, name, duration, 2**power)
         points.append(p)
@@ -349,7 +374,7 @@ def _line(
         if not p.along < USELESS_ERROR:
             break
         usable_h = p.h
-    return Line(
+    return WorkPrecisionCurve(
         method=name,
         order=method.order,
         points=tuple(points),
@@ -360,20 +385,24 @@ def _line(
     )
 
 
-def _adaptive(module: ModuleType, baseline: _Baseline, duration: float, longest: float) -> Line:
+def _adaptive(
+    module: ModuleType, baseline: _Baseline, duration: float, longest: float
+) -> WorkPrecisionCurve:
     """Run adaptive steps with all tolerances, from loose to tight."""
-    points: list[Point] = []
+    points: list[WorkPrecisionPoint] = []
     for tol in TOLERANCES:
         points.append(_point_of_tolerance(module, baseline, duration, tol))
         if points[-1].seconds > longest:
             break
     order = 2 * len(GAUSS16.c)  # whose sweeps go to the end
-    return Line(ADAPTIVE, order, tuple(points), math.nan, math.nan, math.nan, math.nan)
+    return WorkPrecisionCurve(
+        ADAPTIVE, order, tuple(points), math.nan, math.nan, math.nan, math.nan
+    )
 
 
 def _point(
     module: ModuleType, baseline: _Baseline, name: str, duration: float, steps: int
-) -> Point:
+) -> WorkPrecisionPoint:
     """Return the result of a run with fixed steps."""
     h, rows = duration / steps, len(baseline.reference.t) - 1
     every = max(1, steps // rows)
@@ -384,7 +413,7 @@ def _point(
 
 def _point_of_tolerance(
     module: ModuleType, baseline: _Baseline, duration: float, tol: float
-) -> Point:
+) -> WorkPrecisionPoint:
     """Return the result of a run with adaptive steps."""
     run = simulate(module, tol=tol, times=baseline.reference.t)
     repeat = partial(simulate, module, tol=tol, duration=duration)  # a row a step, which are few
@@ -393,7 +422,7 @@ def _point_of_tolerance(
 
 def _compare(
     module: ModuleType, baseline: _Baseline, run: Any, repeat: Callable[[], Any], stride: int
-) -> Point:
+) -> WorkPrecisionPoint:
     """Compare a run with every `stride`-th row of the reference, and time it.
 
     The time is the median of several runs by `repeat`, which store no intermediate rows.
@@ -424,15 +453,175 @@ def _compare(
     def finite(x: float) -> float:
         return x if math.isfinite(x) else math.inf
 
-    return Point(
+    return WorkPrecisionPoint(
         method=run.method, h=run.h, steps=run.steps, status=run.status, q=finite(q), qd=finite(qd),
         end=finite(max(q, qd)), along=finite(along), energy=finite(energy), energies=energies,
         seconds=statistics.median(durations), evaluations=timed.evaluations,
     )  # fmt: skip
 
 
-def _energy_scale(module: ModuleType, reference: Reference) -> float:
+def simulate(module: ModuleType, **options: Any) -> Any:
+    """Return the run of `module.simulate(**options)`, with all its warnings suppressed."""
+    # failures and advice are what is measured here
+    quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
+    with quiet, np.errstate(all="ignore"):
+        return module.simulate(**options)
+
+
+def _energy_scale(module: ModuleType, reference: ReferenceSolution) -> float:
     """Return the largest K plus the range of P along the motion, in J; 1 if nothing moves."""
-    K = at_rows(module.kinetic_energy, reference)
-    P = at_rows(module.potential_energy, reference, velocities=False)
+    K = evaluate_along(module.kinetic_energy, reference)
+    P = evaluate_along(module.potential_energy, reference, velocities=False)
     return float(np.max(np.abs(K)) + np.ptp(P)) or 1.0
+
+
+# --- the linearised motion ------------------------------------------------------------------------
+#
+# The eigenvalues are those of ∂[q̇; q̈]/∂x, x = [q; q̇], by central differences of the module's
+# accelerations.
+
+SEGMENT_COUNT = 64  # of the motion, each with one transition matrix
+DIFFERENCE_STEP = 1e-6  # relative to the scale of each coordinate and velocity
+CHAOS_GROWTH = (
+    30.0  # over the second half of the motion; perturbations of regular motions grow 2 to 4 times
+)
+EPSILON = 2.0**-53
+
+
+def evaluate_along(
+    function: Any, reference: ReferenceSolution, *, velocities: bool = True
+) -> Vector:
+    """Evaluate a function of a generated module at each state and time of a reference solution.
+
+    function: called as function(q, qd, t=t), or as function(q, t=t) if `velocities` is False.
+    Returns the array of the values, one for each time of the reference.
+    """
+    n = reference.q.shape[1]
+    x = reference.halves[0]
+    states = (
+        ((row[:n], row[n:]) if velocities else (row[:n],), t)
+        for row, t in zip(x, reference.t, strict=True)
+    )
+    return np.array([function(*state, t=float(t)) for state, t in states])
+
+
+def stable_step(values: Complex, limits: tuple[float, float]) -> float:
+    """Return the largest step size h in s that is stable for all eigenvalues λ (1/s) in `values`.
+
+    A step is stable if (h Im λ/limits[0])² + (h Re λ/limits[1])² <= 1. limits: largest stable h ω
+    of the method for undamped solutions, and largest stable h |λ| for decaying ones; this ellipse
+    through both approximates the stability region of most methods. The real part of an eigenvalue
+    is ignored if it is positive. Returns inf if every step size is stable.
+    """
+    turn = np.abs(values.imag) / limits[0]
+    decay = np.maximum(-values.real, 0.0) / limits[1]
+    fastest = float(np.max(np.hypot(turn, decay), initial=0.0))
+    return 1 / fastest if fastest > 0 else math.inf
+
+
+def compute_spectrum(
+    module: ModuleType, reference: ReferenceSolution
+) -> tuple[Complex, float, tuple[float, Vector]]:
+    """Compute eigenvalues of the linearised motion and condition numbers of the mass matrix D.
+
+    Returns three values: the eigenvalues (1/s) of ∂[q̇; q̈]/∂[q; q̇] at all states of the reference
+    solution, in one array; the largest condition number of D, scaled to a diagonal of ones; and the
+    time and coordinates (t, q) at which it occurs.
+    """
+    n, scale = reference.q.shape[1], reference.scale
+    worst, place = 0.0, (0.0, reference.halves[0][0, :n])
+    values: list[Complex] = []
+    for x, t in zip(reference.halves[0], reference.t, strict=True):
+        D = np.asarray(module.D(x[:n], t=float(t)))
+        size = np.sqrt(np.abs(np.diag(D)))
+        condition = (
+            float(np.linalg.cond(D / np.outer(size, size))) if np.all(size > 0) else math.inf
+        )
+        if condition > worst:
+            worst, place = condition, (float(t), x[:n].copy())
+        displacement = np.diag(scale * DIFFERENCE_STEP)
+        states = np.vstack([x + displacement, x - displacement])
+        try:
+            a = module.acceleration(states[:, :n], states[:, n:], t=float(t))
+        except ArithmeticError:  # MotionError: no linearisation where there is no motion
+            continue
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:] = np.eye(n)
+        A[n:] = ((a[: 2 * n] - a[2 * n :]) / (2 * DIFFERENCE_STEP * scale[:, None])).T
+        if np.all(np.isfinite(A)):
+            values.append(np.asarray(np.linalg.eigvals(A), complex))
+    return np.concatenate(values) if values else np.zeros(0, complex), worst, place
+
+
+def _project(module: ModuleType, x: Vector, t: float) -> Vector:
+    """Project the state x = [q; q̇] onto the constraints, if the module has any."""
+    if not module._model.constraint_names:
+        return x
+    n = len(x) // 2
+    return np.hstack(module.project(x[:n], x[n:], t=t))
+
+
+def measure_growth(
+    module: ModuleType, reference: ReferenceSolution, method: str, steps: int
+) -> Growth:
+    """Return the growth of a perturbation of the initial state along a reference solution.
+
+    The motion is divided into segments, and the transition matrix of each segment is computed by
+    differences of runs of the generated `module` from perturbed states. The growth up to a time is
+    the norm of the product of these matrices; `runtime.growth` defines the norm. method: stepper of
+    the runs. steps: number of steps over the whole motion.
+    """
+    n, scale = reference.q.shape[1], reference.scale
+    stride = (len(reference.t) - 1) // SEGMENT_COUNT
+    steps = max(1, min(steps, 2**16) // SEGMENT_COUNT)
+    products = [np.eye(2 * n)]
+    duration = float(reference.t[-1])
+    for k in range(SEGMENT_COUNT):
+        x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
+        ends = []
+        for displacement in (np.zeros(2 * n), *np.diag(scale * DIFFERENCE_STEP)):
+            y = _project(module, x + displacement, t0)
+            run = simulate(
+                module, method=method, q0=y[:n], qd0=y[n:], h=duration / SEGMENT_COUNT / steps,
+                steps=steps, every=steps, t0=t0,
+            )  # fmt: skip
+            ends.append(np.hstack([run.q[-1], run.qd[-1]]) / scale)
+        with np.errstate(all="ignore"):
+            products.append(((np.array(ends[1:]) - ends[0]).T / DIFFERENCE_STEP) @ products[-1])
+    x, t = reference.halves[0][::stride], reference.t[::stride]
+    D = mean_mass_matrix(module, x[:, :n], t)
+    moved = np.moveaxis(np.array(products), 2, 0) * scale  # by one scale of each at the start
+    root = norm_root(D, [*moved], duration)
+    start = np.diag(scale)
+    factors = [growth_factor(root, start, (scale * P.T).T) for P in products]
+    amplification = np.maximum.accumulate(np.maximum(factors, 1.0))
+    sizes = np.linalg.norm((x - x[0]) @ root.T, axis=1)  # of the motion itself
+    return _classify_growth(
+        t, amplification, np.maximum.accumulate(sizes), np.linalg.norm(x @ root.T, axis=1)
+    )
+
+
+def _classify_growth(t: Vector, amplification: Vector, sizes: Vector, values: Vector) -> Growth:
+    """Return the growth, which counts as exponential relative to that of the motion only.
+
+    sizes: largest distance of the motion from its start so far; values: size of the state; both in
+    the norm.
+    """
+    half, duration = len(t) // 2, float(t[-1])
+    own = (
+        amplification[-1] / max(sizes[-1] / sizes[half], 1.0)
+        if sizes[half] > 0
+        else amplification[-1]
+    )
+    rise = math.log(own / amplification[half]) if math.isfinite(own) else math.inf
+    rate, wild = rise / (duration / 2), rise > math.log(CHAOS_GROWTH)
+    # of a rounding at any time on the way
+    propagated = EPSILON * amplification * np.maximum.accumulate(values / amplification)
+    most = 0.1 * (sizes[-1] or values.max() or 1.0)
+    unreliable = np.flatnonzero(~(propagated <= most))
+    horizon = math.inf
+    if len(unreliable):
+        horizon = float(t[unreliable[0]])
+    elif wild and rate > 0:
+        horizon = float(duration + math.log(most / propagated[-1]) / rate)
+    return Growth(t=t, amplification=amplification, rate=rate, wild=wild, horizon=horizon)

@@ -1,334 +1,337 @@
-"""Equations and operation counts as text for terminals, LaTeX and Python."""
+"""Text and LaTeX of the equations of a system, and the costs of its generated functions.
+
+Equations that would fill many pages are not written out. Instead, the text shows what they follow
+from: the Newton-Euler recursion over the joints or the energies over their definitions, together
+with the other forces and constraints.
+"""
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 
 import sympy
-from sympy import Expr, MatrixBase
-from sympy.core.function import Application
-from sympy.printing.str import StrPrinter
+from sympy import Expr
 
-from eomc.base import texts
+from eomc.base.errors import EomcError
 from eomc.derive import lagrange
-from eomc.model.symbols import resolved
-from eomc.model.system import Constraint, System, t
+from eomc.model.hybrid import with_constant_parameters
+from eomc.model.rational import Vector
+from eomc.model.symbols import needed
+from eomc.model.system import System, t
+from eomc.model.tree import Link, Tree
 from eomc.program import program
 from eomc.program.routes import ROUTES
-from eomc.report.derived import Derived, Terms
-from eomc.report.typeset import WIDE, Typesetter, distribute_decimal
+from eomc.report import equations
+from eomc.report.equations import (
+    constraint_note,
+    derive,
+    equation_form,
+    right_hand_side,
+    title_line,
+)
+from eomc.report.typeset import (
+    CONTINUATION,
+    WIDE,
+    Typesetter,
+    latex_sum,
+    named_lines,
+    readable,
+    section,
+    wrap,
+)
 from eomc.runtime.labels import tex
 
-MAX_ENVIRONMENT_LENGTH = 3_000  # characters: KaTeX accepts about a page
-CONTINUATION = r"  & \quad "  # prefix of a line that continues the previous one
-
-_MEANING = {
-    "kinetic": "kinetic energy",
-    "potential": "potential energy",
-    "linear_potential": "potential linear in the velocities",
-    "L": "Lagrangian K - P",
-    "D": "mass matrix",
-    "C": "Coriolis matrix, Christoffel form",
-    "g": "potential forces",
-    "tau": "generalized forces",
-    "A": "derivatives of the constraints along q, or q̇ where they are of rates",
-    "jacobi": "Jacobi integral, conserved in place of K + P",
-    "power": "power into the system",
-}
-_SYMBOL = {
-    "kinetic": "K", "potential": "P", "linear_potential": "U", "jacobi": "h", "power": "power",
-    "tau": "τ",
-}  # fmt: skip
-_LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
+MAX_DEFINITIONS = 60  # definitions that are shown
+LINES_PER_ENVIRONMENT = 40  # joints that fill a page
+T, DQ = r"^{\mathsf{T}}", r"\dot{q}"
 
 
-def _values(equations: Derived) -> dict[str, Expr | MatrixBase]:
-    """Return the expressions to be printed, by name."""
-    values = {name: getattr(equations, name) for name in _MEANING}
-    if equations.named:
-        values["L"] = sympy.Symbol("K") - sympy.Symbol("P")
-        if equations.linear_potential is not None:
-            values["L"] -= sympy.Symbol("U")
-    if not equations.system.constraints:
-        del values["A"]
-    if all(e == 0 for e in equations.tau):
-        del values["tau"]
-    return {name: value for name, value in values.items() if value is not None}
+def write_equations(system: System, form: str = "text") -> str:
+    """Derive the equations of motion of a system and return them as text.
+
+    The Lagrangian L, the scalar equations, D, C, g and all other parts are simplified and printed
+    as in a textbook. If they would fill many pages, the text instead describes how they are
+    computed and how many operations this takes.
+
+    Parameters
+    ----------
+    system : System
+    form : {"text", "latex", "python"}
+        "text" is Unicode text for a terminal; "python" is source code with SymPy matrices.
+
+    Raises
+    ------
+    EomcError
+        If the form is "python" and the equations would fill many pages.
+    """
+    try:
+        derived = derive(system)
+    except EomcError:
+        if form == "python":
+            raise
+        system = with_constant_parameters(system)
+        return describe_in_latex(system) if form == "latex" else describe(system)
+    if form == "python":
+        return equations.write_python(derived)
+    return equations.write_latex(derived.set_out) if form == "latex" else str(derived)
 
 
-# --- text -----------------------------------------------------------------------------------------
+# --- large systems as text ------------------------------------------------------------------------
 
 
-def text(equations: Derived) -> str:
-    """Return the equations as Unicode text for a terminal, in lines of at most WIDE + 4 columns."""
-    system, write = equations.system, Typesetter(equations.system)
-    values, section_lines = _values(equations), list[str]()
-    parts = [wrap(f"{title_line(system)}: {equation_form('tau' in values, system)}")]
-    lines = []
-    for left, force in zip(equations.left, equations.right, strict=True):
-        lines += [
-            *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
-            "",
-        ]
-    parts.append(section("equations of motion", lines[:-1]))
+def describe(system: System) -> str:
+    """Return text that describes how the equations of a large system are formed and computed.
+
+    The text contains the recursion over the joints or the energies, the constraints, and the
+    numbers of operations of the generated functions.
+    """
+    write = Typesetter(system)
+    parts = [
+        wrap(f"{title_line(system)}: {equation_form(_driven(system), system)}"),
+        "Written out, these equations would fill many pages. They are those of L = K - P,\n"
+        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_hand_side(_driven(system), system)}.",
+    ]
+    if system.tree is not None:
+        parts.append(_recursion(system.tree, write))
+    known = _shown_definitions(system)
+    if known is not None and (known or _energies(system)):
+        section_lines: list[str] = []
+        for name, e in [*((str(s), e) for s, e in known), *_energies(system)]:
+            section_lines += named_lines(write, name, e)
+        parts.append(section("energies, over definitions; a dot is d/dt", section_lines))
     if system.constraints:
         section_lines = []
-        for c, zero in zip(system.constraints, equations.zero, strict=True):
-            section_lines += [*write.text_lines(write.terms(zero), []), *constraint_note(c)]
+        for c in system.constraints:
+            if known is not None:
+                section_lines += write.text_lines(write.terms(c.formula), [])
+            section_lines += constraint_note(c)
         parts.append(section("constraints", section_lines))
-    if equations.named:
-        section_lines = [line for s, e in equations.named for line in named_lines(write, s.name, e)]
-        parts.append(section("where, here and below", section_lines))
-    for name, value in values.items():
-        head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
-        if name == "L" and equations.linear_potential is not None:
-            head += " - U"
-        parts.append(section(head, list(_value_lines(write, name, value))))
-    if system.outputs:
-        section_lines = []
-        for name, formula in _outputs(system):
-            section_lines += named_lines(write, name, formula)
-        parts.append(section("outputs", section_lines))
-    return "\n\n".join(parts)
+    return "\n\n".join([*parts, "What computes them:", costs(system)])
 
 
-def section(head: str, lines: list[str]) -> str:
-    """Return `head` and a colon, followed by `lines` indented by four spaces, as one text."""
-    return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
+def _recursion(tree: Tree, write: Typesetter) -> str:
+    """Return the Newton-Euler recursion (Featherstone, 2008, table 5.1) and the list of joints."""
+    lines = [
+        "outward from parent p; S is the joint's axis, v a twist, a its rate, f a wrench:",
+        "    v = X v_p + S q̇",
+        "    a = X a_p + S q̈ + v × S q̇",
+        "inward:",
+        "    f = I a + v ×* I v + the sum of Xᵀ f over its children",
+        "    τ = S · f",
+        "",
+    ]
+    for link in tree.links:
+        parent = "the world" if link.parent < 0 else tree.links[link.parent].name
+        how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
+        by = str(write.text(write.ordered(link.q))).strip()
+        lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
+    return section(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
 
 
-def title_line(system: System) -> str:
-    """Return the title of a system, or its name if it has no title, on one line."""
-    return texts.line(system.title or system.name)
+def _shown_definitions(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
+    """Return the definitions that the shown formulas depend on; None if they are too many."""
+    applied = (e for pair in system.applied for e in pair)
+    shown = [*(c.formula for c in system.constraints), *applied, system.dissipation, *system.forces]
+    shown += [e for _, e in _energies(system)]
+    known = needed(system.definitions, shown)
+    return known if len(known) <= MAX_DEFINITIONS else None
 
 
-def equation_form(driven: bool, system: System) -> str:
-    """Return the form of the equations and the order of the coordinates q, as one line.
-
-    An example is "D q̈ + C q̇ + g = τ, q = (x, theta)". driven: True if the right-hand side has
-    generalized forces τ.
-    """
-    return f"D q̈ + C q̇ + g = {right_hand_side(driven, system)}, q = ({_order(system)})"
-
-
-def right_hand_side(driven: bool, system: System) -> str:
-    """Return the right-hand side of D q̈ + C q̇ + g as text: "τ", "Aᵀλ", "τ + Aᵀλ" or "0".
-
-    driven: True if there are generalized forces τ. Aᵀλ is present if the system has constraints.
-    """
-    return " + ".join([*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]) or "0"
+def _energies(system: System) -> list[tuple[str, Expr]]:
+    """Return the energies (name, formula) that the recursion over the tree does not include."""
+    linear = [("U", system.linear_potential)] if system.linear_potential != 0 else []
+    if system.tree is None:
+        return [("K", system.kinetic), ("P", system.potential), *linear]
+    remaining = (("K'", system.tree.other_kinetic), ("P'", system.tree.other_potential), *linear)
+    return [(name, e) for name, e in remaining if e != 0]
 
 
-def constraint_note(c: Constraint) -> list[str]:
-    """Return a list of one line: the name of a constraint, its kind, and if it is redundant.
-
-    The kind is "positions" for a holonomic constraint, else "rates".
-    """
-    parts = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
-    parts += ["implied by others, its multiplier 0"] if c.redundant else []
-    return [f"    {', '.join(parts)}"]
+# --- large systems in LaTeX -----------------------------------------------------------------------
 
 
-def _order(system: System) -> str:
-    return ", ".join(c.name for c in system.coordinates)
+def describe_in_latex(system: System) -> str:
+    """Return LaTeX that describes how the equations of a large system are formed and computed.
 
-
-def wrap(words: str) -> str:
-    """Return text wrapped to lines of WIDE columns; all lines but the first are indented."""
-    return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
-
-
-def _flat(terms: Terms) -> Iterator[tuple[Expr, Expr]]:
-    """Yield the terms of an equation, with sums without velocities split into their terms."""
-    for monomial, c in terms:
-        if monomial == 1:
-            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(distribute_decimal(c)))
-        else:
-            yield monomial, c
-
-
-def _terms(write: Typesetter, e: Expr) -> list[tuple[bool, Expr]]:
-    return [] if e == 0 else write.terms(e)
-
-
-def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iterator[str]:
-    """Yield the lines of an energy or matrix; of a matrix that is too wide, the nonzero entries."""
-    if not isinstance(value, MatrixBase):
-        yield from _sum_lines(write, value)
-        return
-    block = write.text(write.ordered(value))
-    if block.width() <= WIDE:
-        yield from (line.rstrip() for line in str(block).splitlines())
-        return
-    for (i, j), entry in _entries(name, value):
-        yield from named_lines(write, f"{_SYMBOL.get(name, name)}_{i}{j}", entry)
-
-
-def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
-    return write.text_lines(write.terms(e))
-
-
-def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
-    """Return the text lines of the equation `name` = `e`."""
-    return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
-
-
-def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Expr]]:
-    """Yield ((row, column), entry) of the nonzero entries, from 1; of D the upper half only."""
-    comma = "," if value.rows > 9 else ""
-    for i in range(value.rows):
-        for j in range(value.cols):
-            if value[i, j] != 0 and not (name == "D" and j < i):
-                yield (str(i + 1), f"{comma}{j + 1}" if value.cols > 1 else ""), value[i, j]
-
-
-def _outputs(system: System) -> list[tuple[str, Expr]]:
-    """Return the outputs as (name, formula) with all definitions substituted."""
-    known = resolved(system.definitions)
-    known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
-    return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
-
-
-# --- LaTeX ----------------------------------------------------------------------------------------
-
-
-def latex(equations: Derived) -> str:
-    """Return the equations as LaTeX: align* environments of the package amsmath.
-
-    The equations of motion come first, then the energies, matrices and outputs.
+    It consists of align* environments of the package amsmath.
     """
     return "\n".join(
-        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}"
-        for body in environment_bodies(equations)
+        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in _environment_bodies(system)
     )
 
 
-def environment_bodies(equations: Derived) -> list[str]:
-    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment.
-
-    Each text has about MAX_ENVIRONMENT_LENGTH characters at most.
-    """
-    results: list[str] = []
-    for lines in latex_lines(equations):
-        results.append("")
-        for line in lines:
-            if len(results[-1]) > MAX_ENVIRONMENT_LENGTH and not line.startswith(CONTINUATION):
-                results.append("")
-            results[-1] += (" \\\\\n" if results[-1] else "") + line
-    return results
-
-
-def latex_lines(equations: Derived) -> tuple[list[str], list[str]]:
-    """Return the equations as a pair of lists of LaTeX lines.
-
-    The first list contains the equations of motion with constraints and abbreviations. The second
-    contains all other formulas: energies, matrices and outputs. A line that continues the previous
-    one begins with CONTINUATION.
-    """
-    system, write = equations.system, Typesetter(equations.system)
-    motion = []
-    for left, force in zip(equations.left, equations.right, strict=True):
-        terms = [write.term(a, b) for a, b in _flat(left)]
-        first, *more = write.latex_lines(terms, _terms(write, force))
-        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
-    for zero in equations.zero:
-        first, *more = write.latex_lines(write.terms(zero), [])
-        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
-    for name, value in equations.named:
-        motion += latex_sum(write, tex(name.name), value)
-    lines = []
-    for name, value in _values(equations).items():
-        symbol = _LATEX.get(name, name)
-        if isinstance(value, MatrixBase):
-            if write.text(write.ordered(value)).width() <= WIDE:
-                lines.append(f"  {symbol} &= {write.latex(write.ordered(value))}")
-                continue
-            for (i, j), entry in _entries(name, value):
-                lines += latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)
-        else:
-            lines += latex_sum(write, symbol, value)
-    for name, formula in _outputs(system):
-        lines += latex_sum(write, tex(name), formula)
-    return motion, lines
+def _environment_bodies(system: System) -> list[str]:
+    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment of the text."""
+    write, tree, known = Typesetter(system), system.tree, _shown_definitions(system)
+    parts = [_latex_form(system)]
+    if tree is not None:
+        parts[0] += _latex_recursion(tree, write)
+        links = [line for k in range(len(tree.links)) for line in _latex_link(k, tree, write)]
+        parts += [
+            links[k : k + LINES_PER_ENVIRONMENT]
+            for k in range(0, len(links), LINES_PER_ENVIRONMENT)
+        ]
+    if known is not None:
+        parts.append(_latex_rest(system, known, write))
+    return [" \\\\\n".join(lines) for lines in parts if lines]
 
 
-def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
-    """Return the LaTeX lines of the equation `symbol` = `value`; `symbol` is LaTeX already."""
-    first, *more = write.latex_lines(write.terms(value))
-    return [f"  {symbol} &= {first}", *(CONTINUATION + line for line in more)]
-
-
-# --- Python ---------------------------------------------------------------------------------------
-
-
-class _Exact(StrPrinter):  # type: ignore[misc]
-    """Prints rational numbers as Rational(1, 10), since 1/10 is a float in Python.
-
-    `names` maps symbols that are named like functions to the names of their variables.
-    """
-
-    def __init__(self, names: Mapping[str, str]) -> None:
-        super().__init__()
-        self.names = names
-
-    def _print_Rational(self, value: sympy.Rational) -> str:
-        return str(value) if value.is_Integer else f"Rational({value.p}, {value.q})"
-
-    _print_Half = _print_Rational
-
-    def _print_Exp1(self, _: Expr) -> str:
-        return "exp(1)"  # a parameter may be called E
-
-    def _print_Symbol(self, one: sympy.Symbol) -> str:
-        return self.names.get(one.name, one.name)
-
-
-def python(equations: Derived) -> str:
-    """Return Python source code that defines the equations as SymPy matrices and expressions.
-
-    Numbers are written as exact fractions.
-    """
-    system = equations.system
-    symbols = [
-        *system.q,
-        *system.qd,
-        *system.qdd,
-        *system.u,
-        *equations.multipliers,
-        *(p.symbol for p in system.parameters),
-        t,
-    ]
-    values = _values(equations)
-    called = {f.func.__name__ for e in (*values.values(), *equations.right) for f in _functions(e)}
-    reserved = {"Matrix", "Eq", "Rational", "symbols", "exp", "sqrt", *called}
-    variables = {s.name: s.name for s in symbols}
-    for name in variables.keys() & reserved:
-        while variables[name] in reserved | (variables.keys() - {name}):
-            variables[name] += "_"
-    written = _Exact(variables).doprint
-    names, title = ", ".join(s.name for s in symbols), texts.docstring(title_line(system))
-    force = "tau + A^T lambda" if system.constraints else "tau"
+def _latex_form(system: System) -> list[str]:
+    """Return the lines of the equation of motion, and of D, C and g as derivatives."""
+    force = " + ".join(
+        [*([r"\tau"] * _driven(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
+    )
+    force = force or "0"
+    order = r", \; ".join(tex(c.name) for c in system.coordinates)
     lines = [
-        f'"""{title}: D qdd + C qd + g = {force}, as SymPy matrices."""',
-        "",
-        "from sympy import *",
-        "",
-        f'{", ".join(variables.values())} = symbols("{names}", real=True)',
+        rf"  & D \, \ddot{{q}} + C \, \dot{{q}} + g = {force}, \quad q = \left({order}\right){T}",
+        rf"  & \frac{{d}}{{dt}} {_slope('L', DQ)} - {_slope('L', 'q')} = {force}, \quad L = K - P",
+        rf"  D_{{ij}} &= \frac{{\partial^{{2}} K}}{{\partial {DQ}_{{i}} \, \partial {DQ}_{{j}}}}",
     ]
-    taken = {*variables.values()}
-    for name, value in values.items():
-        is_matrix = isinstance(value, MatrixBase)
-        printed = written(value.tolist() if is_matrix else value)
-        printed = f"Matrix({printed})" if is_matrix else printed
-        lines.append(f"{name + '_' if name in taken else name} = {printed}")
-    pairs = ", ".join(f"Eq({written(e.lhs)}, {written(e.rhs)})" for e in equations.scalar)
-    lines.append(f"{'scalar_' if 'scalar' in taken else 'scalar'} = [{pairs}]")
-    return "\n".join(lines)
+    if _quadratic(system):
+        slopes = (("D_{ij}", "q_{k}"), ("D_{ik}", "q_{j}"), ("D_{jk}", "q_{i}"))
+        ij, ik, jk = (_slope(e, q) for e, q in slopes)
+        lines += [
+            rf"  C_{{ij}} &= \frac{{1}}{{2}} \sum_{{k}} \left({ij} + {ik} - {jk}\right) {DQ}_{{k}}",
+            rf"  g &= {_slope('P', 'q')}",
+        ]
+    return lines
 
 
-def _functions(value: Expr | MatrixBase) -> set[Expr]:
-    return value.atoms(Application)  # type: ignore[no-any-return]
+def _driven(system: System) -> bool:
+    """True if anything acts besides potentials and constraint forces."""
+    return bool(system.applied) or any(e != 0 for e in (system.dissipation, *system.forces))
+
+
+def _quadratic(system: System) -> bool:
+    """True if K is known to be homogeneous quadratic in the velocities."""
+    tree = system.tree
+    timed = any(e.has(t) for _, e in system.definitions)
+    return tree is not None and not timed and tree.other_kinetic == 0
+
+
+def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
+    """Return `_recursion` in LaTeX, with twists (angular, linear) and wrenches (moment, force)."""
+    K, P = "K'", "P'"
+    wrench, energy = rf"S_{{k}}{T} f_{{k}}", rf"v_{{k}}{T} I_{{k}} \, v_{{k}}"
+    if any(link.armature != 0 for link in tree.links):
+        wrench = rf"\left({wrench} + \alpha_{{k}} \ddot{{s}}_{{k}}\right)"
+        energy = rf"\left({energy} + \alpha_{{k}} \dot{{s}}_{{k}}^{{2}}\right)"
+    other_terms = f" + {_slope(P, 'q')}" * (tree.other_potential != 0)
+    if tree.other_kinetic != 0:
+        other_terms += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
+    turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
+    X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
+    return [
+        r"  & \text{Joint } k \text{ on } p \text{ moves by } s_{k} \text{ along } S_{k}; "
+        r"\; r_{k}, R_{k} \text{: its frame in that of } p;",
+        rf"{CONTINUATION}v_{{k}}, a_{{k}} \text{{: its twist (angular, linear) and the rate; }} "
+        r"f_{k} \text{: its wrench;}",
+        rf"{CONTINUATION}m_{{k}}, c_{{k}}, J_{{k}} \text{{: mass, mass times its centre, inertia "
+        r"about the frame's origin.}",
+        r"  v_{k} &= X_{k} \, v_{p} + S_{k} \, \dot{s}_{k}, \quad v_{0} = 0",
+        r"  a_{k} &= X_{k} \, a_{p} + S_{k} \, \ddot{s}_{k} + v_{k} \times S_{k} \, \dot{s}_{k}, "
+        rf"\quad a_{{0}} = \left(0, -\gamma\right), \; \gamma = {_vector(tree.gravity, write)}",
+        r"  f_{k} &= I_{k} \, a_{k} + v_{k} \times^{*} I_{k} \, v_{k} + "
+        rf"\sum_{{p(c) = k}} X_{{c}}{T} f_{{c}}",
+        rf"  D \, \ddot{{q}} + C \, {DQ} + g &= \sum_{{k}} {_slope('s_{k}', 'q')} "
+        rf"{wrench}{other_terms}",
+        rf"  K &= \frac{{1}}{{2}} \sum_{{k}} {energy}"
+        + f" + {K}" * (tree.other_kinetic != 0)
+        + r", \quad "
+        rf"P = -\gamma{T} \sum_{{k}} \left(m_{{k}} \, o_{{k}} + O_{{k}} \, c_{{k}}\right)"
+        + f" + {P}"
+        * (tree.other_potential != 0),
+        r"  o_{k} &= o_{p} + O_{p} \, r_{k}, \quad O_{k} = O_{p} \, R_{k}, \quad O_{0} = 1",
+        rf"  X_{{k}} &= {_matrix(X)}, \quad I_{{k}} = {_matrix(body)}",
+    ]
+
+
+def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
+    """Return the frame of joint k, its motion, and the mass and inertia that move with it."""
+    link = tree.links[k]
+    parent = "the world" if link.parent < 0 else tree.links[link.parent].name
+    n, axis = k + 1, "xyz"[link.axis]
+    r, R = _vector(link.offset, write), _rotation(link, write)
+    turn = rf"R_{{{axis}}}(s_{{{n}}})"
+    if link.turns:
+        R = f"{R} {turn}" if R else turn
+    else:
+        r += f" + {R or ''} e_{{{axis}}} s_{{{n}}}"
+    S = f"(e_{{{axis}}}, 0)" if link.turns else f"(0, e_{{{axis}}})"
+    lines = [
+        rf"  & \text{{{_escaped(f'{link.name} on {parent}')}}}, "
+        rf"\; k = {n}, \; p = {link.parent + 1}: \quad "
+        rf"s_{{{n}}} = {_formula(link.q, write)}, \; S_{{{n}}} = {S}, \; "
+        rf"R_{{{n}}} = {R or '1'}, \; r_{{{n}}} = {r}"
+    ]
+    if any(e != 0 for e in (link.mass, *link.moment, *link.inertia)):
+        xx, yy, zz, xy, xz, yz = (_formula(e, write) for e in link.inertia)
+        J = _matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if (xy, xz, yz) == ("0", "0", "0"):
+            J = rf"\operatorname{{diag}}\left({xx}, {yy}, {zz}\right)"
+        lines.append(
+            rf"{CONTINUATION}m_{{{n}}} = {_formula(link.mass, write)}, \; c_{{{n}}} = "
+            rf"{_vector(link.moment, write)}, \; J_{{{n}}} = {J}"
+        )
+    if link.armature != 0:
+        lines.append(rf"{CONTINUATION}\alpha_{{{n}}} = {_formula(link.armature, write)}")
+    return lines
+
+
+def _latex_rest(
+    system: System, known: list[tuple[sympy.Symbol, Expr]], write: Typesetter
+) -> list[str]:
+    """Return the energies, friction, forces and constraints over their definitions."""
+    lines = [line for s, e in known for line in latex_sum(write, write.latex(s), e)]
+    for name, e in _energies(system):
+        lines += latex_sum(write, name, e)
+    friction = f" - {_slope('R', DQ)}" * (system.dissipation != 0)
+    applied_forces = "".join(
+        f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in range(1, len(system.applied) + 1)
+    )
+    if _driven(system):
+        lines.append(rf"  \tau &= Q{friction}{applied_forces}")
+    if friction:
+        lines += latex_sum(write, "R", system.dissipation)
+    for i, force in enumerate(system.forces, 1):
+        if force != 0:
+            lines += latex_sum(write, f"Q_{{{i}}}", force)
+    for k, (y, force) in enumerate(system.applied, 1):
+        lines += latex_sum(write, f"y_{{{k}}}", y) + latex_sum(write, f"F_{{{k}}}", force)
+    for c in system.constraints:
+        first, *more = write.latex_lines(write.terms(c.formula), [])
+        lines += [f"  & {first}", *(CONTINUATION + line for line in more)]
+    return lines
+
+
+def _slope(numerator: str, denominator: str) -> str:
+    return rf"\frac{{\partial {numerator}}}{{\partial {denominator}}}"
+
+
+def _formula(e: Expr, write: Typesetter) -> str:
+    return write.latex(write.ordered(readable(sympy.sympify(e))))
+
+
+def _vector(v: Vector, write: Typesetter) -> str:
+    return rf"\left({', '.join(_formula(e, write) for e in v)}\right)"
+
+
+def _rotation(link: Link, write: Typesetter) -> str:
+    """Return the rotation of the joint's frame before the joint moves; "" for the identity."""
+    if sympy.Matrix(link.rotation) == sympy.eye(3):
+        return ""
+    return _matrix([[_formula(e, write) for e in row] for row in link.rotation])
+
+
+def _matrix(rows: Sequence[Sequence[str]]) -> str:
+    body = r" \\ ".join(" & ".join(row) for row in rows)
+    return rf"\begin{{pmatrix}} {body} \end{{pmatrix}}"
+
+
+def _escaped(words: str) -> str:
+    return re.sub(r"([#$%&_{}])", r"\\\1", words)
 
 
 # --- costs ----------------------------------------------------------------------------------------

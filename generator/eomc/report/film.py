@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.report.drawing import drawing
-from eomc.report.marks import Drawing
+from eomc.report.drawing import Drawing, draw_mechanism
 from eomc.report.picture import draw_marks, frame, project_points, shapes
 from eomc.report.style import COLOURS, INK, colours
-from eomc.report.system_of_run import Source, system_of
-from eomc.report.timeline import Timeline
+from eomc.report.timeline import Source, Timeline, system_of
 from eomc.runtime.atomic_write import atomic_write
 from eomc.runtime.columns import imported
 
@@ -96,7 +94,7 @@ def render(run: Any, t: Any, scene: Source | None) -> Pixels:
     rows = np.unique(np.linspace(0, len(timeline.t) - 1, MAX_VIEW_ROWS).astype(int))
     times = np.concatenate([instants.ravel(), timeline.t[rows]])
     states = np.concatenate([q, np.asarray(run.q)[rows]]).astype(float)
-    drawn = drawing(timeline.system, times, states)
+    drawn = draw_mechanism(timeline.system, times, states)
     if drawn is None:
         raise EomcError(
             f"render: {timeline.system.name} says nothing about its shape: add [picture] to the "

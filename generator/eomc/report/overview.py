@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from markupsafe import Markup
@@ -12,12 +14,17 @@ from markupsafe import Markup
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import Coordinate, Input, Output, Parameter, System
-from eomc.report import equations, large_system, mathml
-from eomc.report.cost_of_digits import Report, variant
-from eomc.report.labels import html_name
+from eomc.report import equations, equations_text
+from eomc.report.cost_of_digits import WorkPrecisionReport, variant
+from eomc.report.equations import Equations
+from eomc.report.style import html_name
+from eomc.report.typeset import CONTINUATION
 
 MIN_ROWS = 1_000  # of a drawn motion, so that curves look smooth
+_FUNCTION = re.compile(r"<mi>(a?(?:sin|cos|tan)h?|exp|log|min|max|arg)</mi>")
+_SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
 Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
+Lines = Sequence[tuple[bool, Markup]]  # (True if the line continues the previous one, MathML)
 
 
 @dataclass(frozen=True)
@@ -44,14 +51,14 @@ class Overview:
     parameters: Sequence[Row]
     inputs: Sequence[Row]
     outputs: Sequence[Row]
-    equations: Sequence[tuple[bool, Markup]]
-    rest: Sequence[tuple[bool, Markup]]
+    equations: Lines
+    rest: Lines
     text: Markup
     motion: Markup
     caption: str
 
 
-def describe_scene(system: System, report: Report, root: Path) -> Overview:
+def describe_scene(system: System, report: WorkPrecisionReport, root: Path) -> Overview:
     """Return the overview of a scene: its tables, its equations and a figure of its motion.
 
     The figure shows the fastest run of the report that has six correct digits, or else the most
@@ -73,9 +80,6 @@ def describe_scene(system: System, report: Report, root: Path) -> Overview:
     )
 
 
-Lines = Sequence[tuple[bool, Markup]]
-
-
 def _equations(system: System) -> tuple[Lines, Lines, str]:
     """Return the equations of motion and the other formulas as MathML, or both as text.
 
@@ -84,11 +88,39 @@ def _equations(system: System) -> tuple[Lines, Lines, str]:
     try:
         derived = equations.derive(system)
     except EomcError:
-        return [], [], large_system.text(system)
+        return [], [], equations_text.describe(system)
     try:
-        return *mathml.lines(derived), ""
+        return *write_mathml(derived), ""
     except EomcError:
         return [], [], str(derived)
+
+
+def write_mathml(derived: Equations) -> tuple[Lines, Lines]:
+    """Convert equations to MathML and return them as a pair of lists of printed lines.
+
+    The first list contains the equations of motion, the second all other formulas. Each line is a
+    pair (continues, MathML), where continues is True if the line continues the equation of the
+    previous line. MathML is shown by browsers without a script; latex2mathml makes it from LaTeX.
+    Raises EomcError if latex2mathml is not installed.
+    """
+    first, second = ([_line(x) for x in lines] for lines in equations.latex_lines(derived.set_out))
+    return first, second
+
+
+def _line(text: str) -> tuple[bool, Markup]:
+    continues = text.startswith(CONTINUATION)
+    left, _, right = text.partition("&")
+    return continues, _convert((left + right.replace(r"\quad", "", int(continues))).strip())
+
+
+@cache
+def _convert(latex: str) -> Markup:
+    try:
+        from latex2mathml.converter import convert
+    except ImportError:
+        raise EomcError("equations in a page need latex2mathml: pip install latex2mathml") from None
+    converted = convert(latex).replace('display="inline"', 'displaystyle="true"')
+    return Markup(_FUNCTION.sub(_SPACED, converted))
 
 
 def _row(entry: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
@@ -97,7 +129,7 @@ def _row(entry: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
     return name, ", ".join(numbers), unit, note
 
 
-def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
+def _motion(system: System, report: WorkPrecisionReport, root: Path) -> tuple[Markup, str]:
     from eomc.report import plot
 
     if plot.without_pictures():
@@ -112,13 +144,8 @@ def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
         h, steps = best.h / finer, best.steps * finer
         run = module.simulate(h=h, steps=steps, method=best.method)
         caption = f"By {best.method}, h = {run.h:.3g} s"
-    jacobi = run.jacobi if run._model.has_jacobi else None
-    inputs = dict(zip(module.inputs, run.u.T, strict=True))
-    balance = run.balance() if run._model.has_power else None
-    figure = plot.figure(
-        system, run.t, run.q, run.qd, run.energy, " ", jacobi, run.outputs,
-        balance.words if balance else "", inputs,
-    )  # fmt: skip
+    balance = run.balance().words if run._model.has_power else ""
+    figure = plot.make_figure(system, plot.RunCurves.of_run(run, balance), " ")
     if best.adaptive or finer == 1:
         caption += f", within {best.along:.1g} of the reference solution"
     return plot.svg(figure), caption + "."

@@ -13,7 +13,13 @@ from markupsafe import Markup
 
 from eomc.base import texts
 from eomc.emit.render import environment
-from eomc.report.cost_of_digits import DIGITS, LARGE_CONDITION, USELESS_ERROR, Point, Report
+from eomc.report.cost_of_digits import (
+    DIGITS,
+    LARGE_CONDITION,
+    USELESS_ERROR,
+    WorkPrecisionPoint,
+    WorkPrecisionReport,
+)
 from eomc.report.overview import Overview
 from eomc.report.plot import svg, without_pictures
 
@@ -23,7 +29,7 @@ the linearised motion; steps up to it let no difference grow, though their error
 more than the motion. Rounding from: the h below which finer steps don't help."""
 
 
-def recommendation(report: Report, digits: float, to: float | None = None) -> str:
+def recommendation(report: WorkPrecisionReport, digits: float, to: float | None = None) -> str:
     """Return one recommendation, such as "for 6 digits up to t = 10 s: dp8 with h = 40 ms, ...".
 
     It names the fastest stepper of the report whose errors allow `digits` correct digits at all
@@ -47,25 +53,25 @@ def recommendation(report: Report, digits: float, to: float | None = None) -> st
     )
 
 
-def _stepper_text(p: Point) -> str:
+def _stepper_text(p: WorkPrecisionPoint) -> str:
     """Return "dp8 with h = 40 ms", or "adaptive steps with tol = 1e-09, 52 steps"."""
     if p.adaptive:
         return f"adaptive steps with tol = {p.tol:g}, {p.steps} steps"
     return f"{p.method} with h = {_time(p.h)}"
 
 
-def _step_text(p: Point) -> str:
+def _step_text(p: WorkPrecisionPoint) -> str:
     """Return the step size, or the tolerance of an adaptive run."""
     return f"tol {p.tol:g}" if p.adaptive else _time(p.h)
 
 
-def recommendations(report: Report) -> list[str]:
+def recommendations(report: WorkPrecisionReport) -> list[str]:
     """Return recommendations of steppers (see `recommendation`) for 3 to 15 correct digits.
 
     Numbers of digits for which the same run is the fastest share one recommendation. If no stepper
     reaches a number of digits, the text states this.
     """
-    spans: list[tuple[Point | None, list[int]]] = []
+    spans: list[tuple[WorkPrecisionPoint | None, list[int]]] = []
     for digits in DIGITS:
         best = report.best(digits)
         if not spans or spans[-1][0] is not best:
@@ -74,7 +80,7 @@ def recommendations(report: Report) -> list[str]:
     return [recommendation(report, digits[0], digits[-1]) for _, digits in spans]
 
 
-def digit_rows(report: Report) -> list[tuple[str, ...]]:
+def digit_rows(report: WorkPrecisionReport) -> list[tuple[str, ...]]:
     """Return the rows of the table of the fastest run for each number of correct digits.
 
     The cells of a row are texts: digits, stepper, step size or tolerance, number of steps, number
@@ -91,7 +97,7 @@ def digit_rows(report: Report) -> list[tuple[str, ...]]:
     return table_rows
 
 
-def remarks(report: Report) -> list[str]:
+def remarks(report: WorkPrecisionReport) -> list[str]:
     """Return sentences on chaos, the accuracy of the reference solution, the condition of D, etc.
 
     Further sentences name events, non-smooth functions and steppers that can't be used.
@@ -140,7 +146,7 @@ def remarks(report: Report) -> list[str]:
     ]
 
 
-def table(report: Report) -> str:
+def table(report: WorkPrecisionReport) -> str:
     """Return the report as text for a terminal: table of steppers, recommendations and remarks."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -160,7 +166,7 @@ def table(report: Report) -> str:
     return "\n".join([*lines, *words]).strip("\n")
 
 
-def rows(report: Report) -> list[tuple[str, ...]]:
+def rows(report: WorkPrecisionReport) -> list[tuple[str, ...]]:
     """Return the rows of the table of steppers, one for each stepper in the report.
 
     The cells of a row are texts: stepper, order, observed order, usable h, stable h, smallest
@@ -179,7 +185,7 @@ def rows(report: Report) -> list[tuple[str, ...]]:
     return table_rows
 
 
-def as_dict(report: Report) -> dict[str, Any]:
+def as_dict(report: WorkPrecisionReport) -> dict[str, Any]:
     """Return the report as a dictionary for JSON, without the energy errors over time.
 
     It also contains the best run for each number of digits, the recommendations and the remarks.
@@ -204,7 +210,7 @@ def _for_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def page(report: Report, overview: Overview | None = None) -> str:
+def page(report: WorkPrecisionReport, overview: Overview | None = None) -> str:
     """Return the report as one HTML page with embedded figures.
 
     overview: description of the scene that the page begins with. If matplotlib is not installed,
@@ -263,7 +269,7 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
         return svg(figure)
 
 
-def _styles(report: Report) -> dict[str, tuple[str, str]]:
+def _styles(report: WorkPrecisionReport) -> dict[str, tuple[str, str]]:
     from eomc.report.style import COLOURS, INK
 
     colours = (*COLOURS, INK, "#999999")
@@ -274,7 +280,7 @@ def _styles(report: Report) -> dict[str, tuple[str, str]]:
     }
 
 
-def _work(axes: Any, report: Report) -> None:
+def _work(axes: Any, report: WorkPrecisionReport) -> None:
     """Plot error against computing time; the best stepper for each number of digits is marked."""
     styles = _styles(report)
     for line in report.lines:
@@ -284,7 +290,7 @@ def _work(axes: Any, report: Report) -> None:
             [p.seconds for p in good], [p.along for p in good], color=colour, marker=mark,
             markersize=4, linewidth=1.2, label=line.method,
         )  # fmt: skip
-    marked: dict[tuple[str, int], tuple[Point, list[int]]] = {}
+    marked: dict[tuple[str, int], tuple[WorkPrecisionPoint, list[int]]] = {}
     for digits in DIGITS:
         if best := report.best(digits):
             marked.setdefault((best.method, best.steps), (best, []))[1].append(digits)
@@ -302,7 +308,7 @@ def _work(axes: Any, report: Report) -> None:
     axes.legend(frameon=False)
 
 
-def _energy(axes: Any, report: Report, shown: Point) -> None:
+def _energy(axes: Any, report: WorkPrecisionReport, shown: WorkPrecisionPoint) -> None:
     """Plot energy errors over time, for runs of each stepper with similar computing times."""
     styles = _styles(report)
     for line in report.lines:
@@ -320,7 +326,7 @@ def _energy(axes: Any, report: Report, shown: Point) -> None:
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _tolerances(axes: Any, points: Sequence[Point]) -> None:
+def _tolerances(axes: Any, points: Sequence[WorkPrecisionPoint]) -> None:
     """Plot the error of each adaptive run against its tolerance."""
     tol = [p.tol for p in points]
     axes.loglog(tol, tol, color="#999999", linewidth=1.0, linestyle="--", label="as asked")
@@ -335,7 +341,7 @@ def _tolerances(axes: Any, points: Sequence[Point]) -> None:
     axes.legend(frameon=False)
 
 
-def _growth(axes: Any, report: Report) -> None:
+def _growth(axes: Any, report: WorkPrecisionReport) -> None:
     """Plot the growth of a perturbation of the initial state."""
     g = report.growth
     axes.semilogy(g.t, g.amplification, color="#333333", linewidth=1.4)

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import System
-from eomc.report.drawing import drawing
-from eomc.report.labels import label, mathtext, with_unit
-from eomc.report.marks import TRAVEL_LIMIT, Drawing, Mark
-from eomc.report.style import COLOURS, INK, plain
-from eomc.report.system_of_run import system_of
+from eomc.report.drawing import TRAVEL_LIMIT, Drawing, Mark, draw_mechanism
+from eomc.report.style import COLOURS, INK, label, plain
+from eomc.report.timeline import system_of
+from eomc.runtime.labels import mathtext, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +30,7 @@ AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, direction from which drawings in sp
 BODY, GHOST = "#4D4D4D", 0.80  # colour of rods; lightest grey of an earlier instant
 
 
-def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve | None:
+def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | PlaneCurve | None:
     """Return a picture of a run, for the figure of its motion.
 
     t: times (n,) in s. q, qd: coordinates and velocities (n, nq). The picture shows the mechanism
@@ -40,14 +39,14 @@ def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve 
     """
     if not len(t):
         return None
-    if result := drawing(system, t, q):
+    if result := draw_mechanism(system, t, q):
         return Mechanism(t, result)
     if len(system.q) == 1:
         (c,) = system.coordinates
-        return Curve(np.hstack([q, qd]), (label(c), label(c, rate=True)), "Phase portrait")
+        return PlaneCurve(np.hstack([q, qd]), (label(c), label(c, rate=True)), "Phase portrait")
     if len(system.q) == 2:
         first, second = map(label, system.coordinates)
-        return Curve(q, (first, second), "Configuration space")
+        return PlaneCurve(q, (first, second), "Configuration space")
     return None
 
 
@@ -61,12 +60,12 @@ def of_run(run: Any) -> Mechanism | None:
     except EomcError:
         return None
     t, q = (np.asarray(x, dtype=float)[:: max(len(run) // MAX_ROWS, 1)] for x in (run.t, run.q))
-    result = drawing(system, t, q)
+    result = draw_mechanism(system, t, q)
     return Mechanism(t, result) if result else None
 
 
 @dataclass(frozen=True)
-class Curve:
+class PlaneCurve:
     """A plot of one quantity against another: a phase portrait or a path in configuration space.
 
     values: (n, 2), the horizontal and vertical quantity. labels: labels of the two axes.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,9 @@ from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
-from eomc.report.labels import mathtext, rate_unit, with_unit
 from eomc.report.style import COLOURS, INK, plain
 from eomc.runtime.atomic_write import atomic_write
+from eomc.runtime.labels import mathtext, rate_unit, with_unit
 from eomc.runtime.plot import Curve, against, grouped, wrapped
 
 if TYPE_CHECKING:
@@ -29,36 +30,86 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-Outputs = Mapping[str, Array]
-_NONE: Outputs = {}
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
 MAX_SAMPLES = 20_000  # rows of a run that are drawn
 
 
-def draw(
-    system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
-    jacobi: Array | None = None, title: str | None = None, outputs: Outputs = _NONE,
-    words: str = "", inputs: Outputs = _NONE, wrap: bool = False,
+@dataclass(frozen=True)
+class RunCurves:
+    """The quantities of a run that its figure shows, at n times.
+
+    Attributes
+    ----------
+    t : array (n,)
+        Times in s.
+    q, qd : arrays (n, nq)
+        Coordinates and velocities.
+    energy : array (n,)
+        Total energy K + P.
+    jacobi : array (n,) or None
+        Jacobi's integral, if it differs from the energy.
+    outputs, inputs : mappings from names to arrays (n,)
+        Outputs and inputs to plot.
+    balance : str
+        The energy balance in words, for the heading of the plot of the energy; "" for none.
+    """
+
+    t: Array
+    q: Array
+    qd: Array
+    energy: Array
+    jacobi: Array | None = None
+    outputs: Mapping[str, Array] = field(default_factory=dict)
+    inputs: Mapping[str, Array] = field(default_factory=dict)
+    balance: str = ""
+
+    @classmethod
+    def of_run(cls, run: Any, balance: str = "") -> RunCurves:
+        """Return the curves of a run. An adaptive run with few rows is interpolated.
+
+        balance: the energy balance of the run in words.
+        """
+        drawn, model = run._drawn, run._model
+        jacobi = drawn.jacobi if model.has_jacobi else None
+        inputs = dict(zip(model.inputs, drawn.u.T, strict=True)) if model.inputs else {}
+        return cls(drawn.t, drawn.q, drawn.qd, drawn.energy, jacobi, drawn.outputs, inputs, balance)
+
+    def thin(self, every: int) -> RunCurves:
+        """Return only the rows 0, `every`, 2 `every`, ... as numbers of double precision."""
+
+        def rows(values: Array) -> Array:
+            return np.asarray(values, dtype=float)[::every]
+
+        return replace(
+            self,
+            t=rows(self.t),
+            q=rows(self.q),
+            qd=rows(self.qd),
+            energy=rows(self.energy),
+            jacobi=None if self.jacobi is None else rows(self.jacobi),
+            outputs={name: rows(values) for name, values in self.outputs.items()},
+            inputs={name: rows(values) for name, values in self.inputs.items()},
+        )
+
+
+def write_figure(
+    system: System, run: RunCurves, path: str | Path, *, title: str | None = None,
+    wrap: bool = False,
 ) -> None:  # fmt: skip
     """Write the figure of a run to a file.
 
     Parameters
     ----------
     system : System
-    t, q, qd, energy : arrays (n,), (n, nq), (n, nq) and (n,)
-        Times in s, coordinates, velocities and total energy K + P.
+        The simulated system, with the names and units of its quantities.
+    run : RunCurves
+        The quantities of the run.
     path : path
         The suffix determines the format: .png, .svg or .pdf.
-    jacobi : array (n,), optional
-        Jacobi's integral, if it differs from the energy.
     title : str, optional
         Heading in place of the title of the system.
-    outputs, inputs : mapping from names to arrays (n,), optional
-        Outputs and inputs to plot.
-    words : str, optional
-        The energy balance in words, for the heading of the plot of the energy.
     wrap : bool, optional
         Show angles in the range from -pi to pi.
 
@@ -70,7 +121,7 @@ def draw(
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    result = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs, wrap)
+    result = make_figure(system, run, title, wrap)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -100,12 +151,10 @@ def svg(figure: Figure) -> Markup:
     return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
-def figure(
-    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None,
-    jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
-    inputs: Outputs = _NONE, wrap: bool = False,
-) -> Figure:  # fmt: skip
-    """Return the matplotlib figure of a run; the arguments are those of `draw`.
+def make_figure(
+    system: System, run: RunCurves, title: str | None = None, wrap: bool = False
+) -> Figure:
+    """Return the matplotlib figure of a run; the arguments are those of `write_figure`.
 
     Raises EomcError if matplotlib is not installed.
     """
@@ -114,30 +163,14 @@ def figure(
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
-        name = title or system.title or system.name
-        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words, inputs, wrap)
+        every = max(len(run.t) // MAX_SAMPLES, 1)
+        return _draw(system, run.thin(every), title or system.title or system.name, wrap)
 
 
-def _figure(
-    system: System,
-    t: Array,
-    q: Array,
-    qd: Array,
-    energy: Array,
-    title: str,
-    jacobi: Array | None,
-    outputs: Outputs,
-    words: str,
-    inputs: Outputs,
-    wrap: bool,
-) -> Figure:
+def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
     from matplotlib.figure import Figure
 
-    every = max(len(t) // MAX_SAMPLES, 1)
-    t, q, qd, energy = (np.asarray(a, dtype=float)[::every] for a in (t, q, qd, energy))
-    if jacobi is not None:
-        jacobi = np.asarray(jacobi, dtype=float)[::every]
-
+    t, q, qd = run.t, run.q, run.qd
     moving = [
         (
             Curve(c.name, wrapped(q[:, i]), c.unit, "angles")
@@ -153,9 +186,9 @@ def _figure(
     groups = grouped([c for c, _ in moving])
     below = grouped(
         [
-            Curve(x.name, np.asarray(values[x.name], float)[::every], x.unit, kind)
+            Curve(x.name, values[x.name], x.unit, kind)
             for kind, some, values in (
-                ("inputs", system.inputs, inputs), ("outputs", system.outputs, outputs)
+                ("inputs", system.inputs, run.inputs), ("outputs", system.outputs, run.outputs)
             )
             for x in some
             if x.name in values
@@ -182,7 +215,7 @@ def _figure(
         _curves(result.add_subplot(grid[row, :2], sharex=first), t, group)
     axes = result.add_subplot(grid[-1, :2], sharex=first)
     unit = "J" if any(c.unit for c in system.coordinates) else ""
-    _energy(axes, t, energy, jacobi, unit, words)
+    _energy(axes, run, unit)
     axes.set_xlabel("$t$ (s)")
     if len(t) > 1 and t[-1] > t[0]:
         axes.set_xlim(t[0], t[-1])  # and of all that share it
@@ -209,14 +242,13 @@ def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
                     bbox_to_anchor=(1.0, 0.5), handlelength=1.0, borderaxespad=0.2)  # fmt: skip
 
 
-def _energy(
-    axes: Axes, t: Array, energy: Array, jacobi: Array | None, unit: str, words: str
-) -> None:
+def _energy(axes: Axes, run: RunCurves, unit: str) -> None:
     """Plot E, or E - E(0) if the energy is nearly conserved and E would be a straight line.
 
     If Jacobi's integral J differs from the energy, both are plotted relative to their initial
-    values. `words` is the energy balance, shown in the title.
+    values.
     """
+    t, energy, jacobi, words = run.t, run.energy, run.jacobi, run.balance
     change = energy - energy[:1]
     drift = float(np.max(np.abs(change), initial=0.0))
     conserved = jacobi is not None or drift <= 0.01 * float(np.max(np.abs(energy), initial=0.0))

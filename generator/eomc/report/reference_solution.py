@@ -73,7 +73,7 @@ class ProgramView:
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceSolution:
     """A reference solution: coordinates `q` and velocities `qd` (n, nq) at times `t` (n,) in s.
 
     Attributes
@@ -130,7 +130,7 @@ def solve(
     duration: float | None = None,
     rows: int = 256,
     root: str | os.PathLike[str] = "build",
-) -> Reference:
+) -> ReferenceSolution:
     """Compute the reference solution of a scene from its initial state.
 
     The inputs follow their default signals.
@@ -148,7 +148,7 @@ def solve(
 
     Returns
     -------
-    Reference
+    ReferenceSolution
 
     Raises
     ------
@@ -188,22 +188,22 @@ def solve(
     return solution
 
 
-def _from_json(stored: dict[str, Any]) -> Reference:
+def _from_json(stored: dict[str, Any]) -> ReferenceSolution:
     plain = tuple(stored["plain"]) if stored["plain"] else None
     arrays = {name: np.array(stored[name]) for name in ("t", "q", "qd", "digits")}
-    return Reference(**arrays, plain=plain)
+    return ReferenceSolution(**arrays, plain=plain)
 
 
 # --- the program in __float128 ------------------------------------------------------------------
 
 
-def _compute(system: System, span: float, rows: int) -> Reference:
+def _compute(system: System, span: float, rows: int) -> ReferenceSolution:
     with tempfile.TemporaryDirectory(prefix="eomc-reference-") as folder:
         executable = _compile(system, Path(folder))
         one, other = (_run(executable, system, span, rows, *way) for way in METHODS_COMPARED)
     n = len(system.coordinates)
     digits = _agreement(one[:, : 2 * n], other[:, : 2 * n])
-    return Reference(
+    return ReferenceSolution(
         t=np.asarray(np.arange(rows + 1) * (span / rows), float),
         q=one[:, :n],
         qd=one[:, n : 2 * n],
@@ -330,7 +330,7 @@ def _agreement(one: Text, other: Text) -> Vector:
 
 
 def _compare_plain(system: System, rows: Text, spacing: float) -> tuple[float, float, float] | None:
-    """Compare the rows with the plain equations in mpmath; return `Reference.plain`.
+    """Compare the rows with the plain equations in mpmath; return `ReferenceSolution.plain`.
 
     Raises EomcError if the accelerations disagree, since then one of both is wrong.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eomc import pipeline
+from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import System
-from eomc.report.drawing import drawing, drawings
-from eomc.report.marks import Drawing
-from eomc.runtime.plot import Source
+from eomc.report.drawing import Drawing, draw_instances, draw_mechanism
+from eomc.runtime.plot import Source as Quantities
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
+Source = str | os.PathLike[str] | System  # a scene file or a system
 
 MAX_CURVES_PER_PANEL = 4  # at most, where each curve has its own panel
 MAX_PANELS = 6
@@ -25,7 +28,7 @@ MAX_KEY_PARAMETERS = 2  # that differ between the instances, in the key
 
 
 @dataclass(frozen=True)
-class Line:
+class TimeSeries:
     """A curve against time in a panel of an animation: its name and its values.
 
     The values belong to the stored times that the animation shows. stairs: True for an input that
@@ -46,7 +49,7 @@ class Panel:
     """
 
     unit: str
-    lines: tuple[Line, ...]
+    lines: tuple[TimeSeries, ...]
     name: str = ""
 
 
@@ -86,7 +89,7 @@ class Timeline:
 
         Returns None if the scene does not describe the shape of the mechanism.
         """
-        return drawing(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
+        return draw_mechanism(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
 
     def panels(self, rows: Rows) -> Iterator[Panel]:
         """Yield the panels with curves of coordinates, outputs and inputs, and one of the energy.
@@ -97,14 +100,16 @@ class Timeline:
         """
         system, run = self.system, self.run
         q = np.asarray(run.q, dtype=float)[rows]
-        lines = [(c.unit, Line(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
+        lines = [(c.unit, TimeSeries(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
         lines += [
-            (o.unit, Line(o.name, np.asarray(run.outputs[o.name], dtype=float)[rows]))
+            (o.unit, TimeSeries(o.name, np.asarray(run.outputs[o.name], dtype=float)[rows]))
             for o in system.outputs
         ]
         u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
         has_stairs = getattr(run, "_u", None) is not None
-        lines += [(i.unit, Line(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)]
+        lines += [
+            (i.unit, TimeSeries(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)
+        ]
         units = dict.fromkeys(unit for unit, _ in lines)
         separate = len(lines) <= MAX_PANELS - 1 and len(lines) <= MAX_CURVES_PER_PANEL
         for unit in units:
@@ -112,7 +117,7 @@ class Timeline:
             for group in [(line,) for line in curves] if separate else [curves]:
                 yield Panel(unit, group)
         known = "J" if any(c.unit for c in system.coordinates) else ""
-        yield Panel(known, (Line("energy", np.asarray(run.energy, dtype=float)[rows]),))
+        yield Panel(known, (TimeSeries("energy", np.asarray(run.energy, dtype=float)[rows]),))
 
 
 class BatchTimeline(Timeline):
@@ -153,17 +158,57 @@ class BatchTimeline(Timeline):
 
         An instance whose run has ended keeps its last position.
         """
-        return drawings(self.systems, self.t[rows], self.q[:, rows], self.numbers)
+        return draw_instances(self.systems, self.t[rows], self.q[:, rows], self.numbers)
 
     def panels(self, rows: Rows) -> Iterator[Panel]:
         """Yield one panel for each quantity in `names`, with a curve for each instance.
 
         rows: indices of the stored times that the curves show.
         """
-        source = Source(self.run)
+        source = Quantities(self.run)
         for curve in map(source.curve, self.names):
-            lines = (Line(n, x[rows]) for n, x in zip(self.numbers, curve.values, strict=True))
+            lines = (
+                TimeSeries(n, x[rows]) for n, x in zip(self.numbers, curve.values, strict=True)
+            )
             yield Panel(curve.unit, tuple(lines), curve.name)
+
+
+def system_of(run: Any, scene: Source | None = None) -> System:
+    """Return the system that a run simulated, with the parameter values of the run.
+
+    Parameters
+    ----------
+    run : Run or batch of runs
+        For a batch, the parameter values are those of the first instance.
+    scene : path or System, optional
+        The scene or system that the module was built from. Needed only if the module was not
+        loaded with `eomc.load`.
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    EomcError
+        If the scene is unknown, or is not the one that the module was built from.
+    """
+    model = run._model
+    source = model.source if scene is None else scene
+    if source is None:
+        raise EomcError(
+            f"{model.name}: was imported without its scene, which says what is drawn: load it "
+            "with eomc.load, or give scene=PATH"
+        )
+    system = source if isinstance(source, System) else pipeline.read(source)
+    if system.digest != model.digest:
+        where = texts.line(system.file) or system.name
+        raise EomcError(
+            f"{where}: is not the scene that {model.name} was built from, or has changed since: "
+            "load it again with eomc.load"
+        )
+    values = np.atleast_2d(run._params)[0]
+    return system.with_parameters(dict(zip(model.parameters, map(float, values), strict=True)))
 
 
 def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:

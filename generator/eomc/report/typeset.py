@@ -29,6 +29,7 @@ DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # appended to names of several le
 MAX_FRACTION_PART = 10**12  # larger numerators or denominators are shown as decimals
 ZERO_TOLERANCE = 1e-25  # a smaller factor is the rounding error of zero
 WIDE = 96  # columns of a line of text; also limits lines of LaTeX
+CONTINUATION = r"  & \quad "  # prefix of a line of LaTeX that continues the previous one
 
 Term = tuple[bool, Expr]  # (True if subtracted, the term without its sign)
 
@@ -57,13 +58,13 @@ class Typesetter:
             for s, (name, n) in dotted.items()
             if n and tex(name).startswith(r"\mathrm")
         }
-        self._text = _Text(shown, names)
+        self._text = _TextPrinter(shown, names)
         self._blocks: dict[Expr, prettyForm] = {}
-        self._line = _Line(shown, names)
+        self._line = _LinePrinter(shown, names)
         all_names = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
         words = any(tex(name).startswith(r"\mathrm") for name in all_names)
         in_latex = {s: tex(name, n) for s, (name, n) in dotted.items()}
-        self._latex = _Latex(_ambiguous_names(system.definitions) | in_latex, words)
+        self._latex = _LatexPrinter(_ambiguous_names(system.definitions) | in_latex, words)
 
     def terms(self, e: Expr) -> list[Term]:
         """Return the terms of the sum `e`, sorted for printing, each as a pair (subtracted, term).
@@ -164,7 +165,7 @@ class Typesetter:
     def _block(self, e: Expr) -> prettyForm:
         unicode = pretty_use_unicode(True)  # whatever the terminal has: what prints escapes
         try:
-            return self._text._print(e)
+            return self._text.block(e)
         finally:
             pretty_use_unicode(unicode)
 
@@ -246,6 +247,33 @@ class Typesetter:
             sign = ("- " if minus else "+ ") if k or joined else ("-" if minus else "")
             printed += (" " if k else "") + sign + self.latex(term)
         return printed
+
+
+# --- equations with a name on the left, and sections ----------------------------------------------
+
+
+def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
+    """Return the text lines of the equation `name` = `e`."""
+    return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
+
+
+def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
+    """Return the LaTeX lines of the equation `symbol` = `value`; `symbol` is LaTeX already."""
+    first, *more = write.latex_lines(write.terms(value))
+    return [f"  {symbol} &= {first}", *(CONTINUATION + line for line in more)]
+
+
+def section(head: str, lines: list[str]) -> str:
+    """Return `head` and a colon, followed by `lines` indented by four spaces, as one text."""
+    return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
+
+
+def wrap(words: str) -> str:
+    """Return text wrapped to lines of WIDE columns; all lines but the first are indented."""
+    return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
+
+
+# --- numbers and names ----------------------------------------------------------------------------
 
 
 def _ambiguous_names(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Symbol, str]:
@@ -338,7 +366,7 @@ def _set_as_name(name: str) -> str:
     return name if {" ", "_"} & {*printed} else printed
 
 
-class _Text(PrettyPrinter):  # type: ignore[misc]
+class _TextPrinter(PrettyPrinter):  # type: ignore[misc]
     """Prints blocks of Unicode text."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
@@ -346,6 +374,10 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
             {"use_unicode": True, "wrap_line": False, "order": "none", "full_prec": False}
         )
         self._names, self._plain = names, plain
+
+    def block(self, e: Expr) -> prettyForm:
+        """Return an expression as a block of text, without a conversion to lines."""
+        return self._print(e)
 
     def _print_Symbol(self, e: Symbol, bold_name: bool = False) -> prettyForm:
         return prettyForm(self._plain.get(e) or _set_as_name(self._names.get(e, e).name))
@@ -355,7 +387,7 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
         return prettyForm(*prettyForm("d/dt ").right(inside))
 
 
-class _Line(StrPrinter):  # type: ignore[misc]
+class _LinePrinter(StrPrinter):  # type: ignore[misc]
     """Prints one line of text: √(x + y), x^2."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
@@ -373,7 +405,7 @@ class _Line(StrPrinter):  # type: ignore[misc]
         return printed.replace("**", "^").replace("*", "⋅").replace("sqrt(", "√(")
 
 
-class _Latex(LatexPrinter):  # type: ignore[misc]
+class _LatexPrinter(LatexPrinter):  # type: ignore[misc]
     """Prints LaTeX: upright words, thin spaces between factors that are words, sin θ bare."""
 
     def __init__(self, names: dict[Symbol, str], words: bool) -> None:
