@@ -75,12 +75,13 @@ class _Articulated:
     """State of the algorithm: the inward pass eliminates the joints, the outward pass gives qdd."""
 
     def __init__(self, recursion: Recursion) -> None:
-        self.r = recursion
-        self.links = recursion.links
+        self.recursion, self.links = recursion, recursion.links
+        self.tree, self.vectors = recursion.tree, recursion.vectors
 
     def solve(self, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-        r, n = self.r, self.r.n
-        at_rest = r.forces(r.speed, [S.Zero] * n)
+        r, V, tree = self.recursion, self.vectors, self.tree
+        n = r.n
+        at_rest = r.forces(tree.speed, [S.Zero] * n)
         f, m = list(at_rest.force), list(at_rest.moment)
         bodies = [self._rigid_body_inertia(x) for x in r.inertia]
         size: list[Expr] = [S.Zero] * n
@@ -95,50 +96,50 @@ class _Articulated:
             else:
                 u_m, u_f = [row[a] for row in body.H], body.M[a]
             along_axis = (u_m if link.turns else u_f)[a]
-            d = r.add(along_axis, r.armature[k])
+            d = V.add(along_axis, r.armature[k])
             if d == 0:
                 raise MasslessError(k)
-            is_constant = r.tape.stage_of(d) <= Stage.PARAMETER
-            pivots.append((d, d if is_constant else r.add(d, size[k])))
-            inverse[k] = r.define(1 / d)
+            is_constant = V.tape.stage_of(d) <= Stage.PARAMETER
+            pivots.append((d, d if is_constant else V.add(d, size[k])))
+            inverse[k] = V.define(1 / d)
             columns[k] = (u_m, u_f)
-            joint_force[k] = r.add(drive[k], r.minus((m if link.turns else f)[k][a]))
+            joint_force[k] = V.add(drive[k], V.minus((m if link.turns else f)[k][a]))
             if link.parent < 0:
                 continue
             reduced = self._without_joint_motion(k, body, columns[k], inverse[k])
-            ratio = r.times(joint_force[k], inverse[k])
-            m[k] = r.plus(m[k], r.scaled(u_m, ratio))
-            f[k] = r.plus(f[k], r.scaled(u_f, ratio))
+            ratio = V.times(joint_force[k], inverse[k])
+            m[k] = V.plus(m[k], V.scaled(u_m, ratio))
+            f[k] = V.plus(f[k], V.scaled(u_f, ratio))
             p = link.parent
-            size[p] = r.add(size[p], self._unreduced_size(k, body))
+            size[p] = V.add(size[p], self._unreduced_size(k, body))
             bodies[p] = self._sum(bodies[p], self._to_parent_frame(k, reduced))
-            force, moment = r.inwards(k, f[k]), r.inwards(k, m[k])
-            f[p] = r.plus(f[p], force)
-            m[p] = r.plus(m[p], moment, r.cross(r.arm[k], force))
+            force, moment = tree.inwards(k, f[k]), tree.inwards(k, m[k])
+            f[p] = V.plus(f[p], force)
+            m[p] = V.plus(m[p], moment, V.cross(tree.arm[k], force))
         return self._outwards(columns, inverse, joint_force), tuple(pivots)
 
     def _outwards(
         self, columns: Sequence[Column], inverse: Sequence[Expr], joint_force: Sequence[Expr]
     ) -> list[Expr]:
         """Return qdd_k = (u_k - U_k . a)/d_k; a: the parent's spatial acceleration in frame k."""
-        r = self.r
+        V, tree = self.vectors, self.tree
         out: list[Expr] = []
         alphas: list[Vector] = []
         origins: list[Vector] = []
         for k, link in enumerate(self.links):
             alpha, acceleration = ZERO, ZERO
             if (p := link.parent) >= 0:
-                alpha = r.outwards(k, alphas[p])
-                acceleration = r.outwards(k, r.plus(origins[p], r.cross(alphas[p], r.arm[k])))
+                alpha = tree.outwards(k, alphas[p])
+                acceleration = tree.outwards(k, V.plus(origins[p], V.cross(alphas[p], tree.arm[k])))
             u_m, u_f = columns[k]
-            remaining = r.add(
-                joint_force[k], r.minus(r.dot(u_m, alpha)), r.minus(r.dot(u_f, acceleration))
+            remaining = V.add(
+                joint_force[k], V.minus(V.dot(u_m, alpha)), V.minus(V.dot(u_f, acceleration))
             )
-            qdd = r.times(remaining, inverse[k])
+            qdd = V.times(remaining, inverse[k])
             out.append(qdd)
-            relative = r.on_axis(k, qdd)
-            alphas.append(r.plus(alpha, relative) if link.turns else alpha)
-            origins.append(acceleration if link.turns else r.plus(acceleration, relative))
+            relative = tree.on_axis(k, qdd)
+            alphas.append(V.plus(alpha, relative) if link.turns else alpha)
+            origins.append(acceleration if link.turns else V.plus(acceleration, relative))
         return out
 
     def _unreduced_size(self, k: int, body: _Inertia) -> Expr:
@@ -146,23 +147,24 @@ class _Articulated:
 
         A parent with inertia or armature along its joint has a pivot that cannot vanish.
         """
-        r, p = self.r, self.links[k].parent
+        V, tree = self.vectors, self.tree
+        p = self.links[k].parent
         parent = self.links[p]
         along_axis = parent.inertia[parent.axis] if parent.turns else parent.mass
-        if along_axis != 0 or r.armature[p] != 0:
+        if along_axis != 0 or self.recursion.armature[p] != 0:
             return S.Zero
         mass = [body.M[i][i] for i in range(3)]
         if not parent.turns:
-            return r.add(*mass)
-        distance_squared = r.dot(r.arm[k], r.arm[k])
-        return r.add(
-            *(body.J[i][i] for i in range(3)), *(r.times(distance_squared, m) for m in mass)
+            return V.add(*mass)
+        distance_squared = V.dot(tree.arm[k], tree.arm[k])
+        return V.add(
+            *(body.J[i][i] for i in range(3)), *(V.times(distance_squared, m) for m in mass)
         )
 
     def _rigid_body_inertia(self, x: Inertia) -> _Inertia:
         """Return the articulated inertia of a single rigid body."""
         hx, hy, hz = x.moment
-        minus = self.r.minus
+        minus = self.vectors.minus
         H = [[S.Zero, minus(hz), hy], [hz, S.Zero, minus(hx)], [minus(hy), hx, S.Zero]]
         J = [[x.entry(i, j) for j in range(3)] for i in range(3)]
         M = [[x.mass if i == j else S.Zero for j in range(3)] for i in range(3)]
@@ -172,17 +174,18 @@ class _Articulated:
         self, k: int, body: _Inertia, column: Column, inverse: Expr
     ) -> _Inertia:
         """Return I - U U^T/d. Without armature, the entries along the joint are exactly zero."""
-        r, link = self.r, self.links[k]
+        V = self.vectors
+        link = self.links[k]
         u_m, u_f = column
-        w_m, w_f = r.scaled(u_m, inverse), r.scaled(u_f, inverse)
+        w_m, w_f = V.scaled(u_m, inverse), V.scaled(u_f, inverse)
 
         def minus_product(old: Expr, a: Expr, b: Expr) -> Expr:
-            return r.add(old, r.minus(r.times(a, b)))
+            return V.add(old, V.minus(V.times(a, b)))
 
         J = self._symmetric(lambda i, j: minus_product(body.J[i][j], w_m[i], u_m[j]))
         M = self._symmetric(lambda i, j: minus_product(body.M[i][j], w_f[i], u_f[j]))
         H = [[minus_product(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
-        if r.armature[k] == 0:
+        if self.recursion.armature[k] == 0:
             a = link.axis
             for i in range(3):
                 if link.turns:
@@ -200,7 +203,7 @@ class _Articulated:
 
     def _sum(self, first: _Inertia, second: _Inertia) -> _Inertia:
         """Return the sum of two inertias about the same origin in the same frame."""
-        add = self.r.add
+        add = self.vectors.add
 
         def add_matrices(a: Rows, b: Rows) -> Rows:
             return [list(map(add, p, q)) for p, q in zip(a, b, strict=True)]
@@ -213,42 +216,42 @@ class _Articulated:
 
     def _to_parent_frame(self, k: int, x: _Inertia) -> _Inertia:
         """Transform an inertia from link k's frame to its parent's frame and origin."""
-        r = self.r
+        V, tree = self.vectors, self.tree
         if self.links[k].turns:
             x = _Inertia(*(self._rotate_by_joint(k, m) for m in (x.J, x.H, x.M)))
-        R = r.rotation[k]
+        R = tree.rotation[k]
         if not all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             x = _Inertia(
                 *(self._rotate(R, m, same) for m, same in ((x.J, True), (x.H, False), (x.M, True)))
             )
-        arm = r.arm[k]
+        arm = tree.arm[k]
         if arm == ZERO:
             return x
-        columns = [r.cross(arm, column) for column in x.M]
-        H = [[r.add(x.H[i][j], columns[j][i]) for j in range(3)] for i in range(3)]
-        from_right = [r.cross(row, arm) for row in H]
-        from_left = [r.cross(arm, row) for row in x.H]
+        columns = [V.cross(arm, column) for column in x.M]
+        H = [[V.add(x.H[i][j], columns[j][i]) for j in range(3)] for i in range(3)]
+        from_right = [V.cross(row, arm) for row in H]
+        from_left = [V.cross(arm, row) for row in x.H]
         J = self._symmetric(
-            lambda i, j: r.add(x.J[i][j], r.minus(from_right[i][j]), from_left[j][i])
+            lambda i, j: V.add(x.J[i][j], V.minus(from_right[i][j]), from_left[j][i])
         )
         return _Inertia(J, H, x.M)
 
     def _rotate_by_joint(self, k: int, m: Rows) -> Rows:
         """Return R m R^T, where R is the rotation by joint k's angle."""
-        r = self.r
+        V = self.vectors
         i, j = AXES[self.links[k].axis]
         a = self.links[k].axis
         out = [list(row) for row in m]
-        across = r.add(m[i][j], m[j][i])
-        t, off = r.half_turn(k, m[i][i], m[j][j], across)
-        change = r.add(off, r.minus(across))
-        out[i][i], out[j][j] = r.add(m[i][i], r.minus(t)), r.add(m[j][j], t)
-        out[i][j], out[j][i] = r.add(m[i][j], change), r.add(m[j][i], change)
+        across = V.add(m[i][j], m[j][i])
+        t, off = self.recursion.half_turn(k, m[i][i], m[j][j], across)
+        change = V.add(off, V.minus(across))
+        out[i][i], out[j][j] = V.add(m[i][i], V.minus(t)), V.add(m[j][j], t)
+        out[i][j], out[j][i] = V.add(m[i][j], change), V.add(m[j][i], change)
 
         def rotated(x: Expr, y: Expr) -> tuple[Expr, Expr]:
             v = list(ZERO)
             v[i], v[j] = x, y
-            v = list(r.turn(k, (v[0], v[1], v[2])))
+            v = list(self.tree.turn(k, (v[0], v[1], v[2])))
             return v[i], v[j]
 
         out[a][i], out[a][j] = rotated(m[a][i], m[a][j])
@@ -257,8 +260,8 @@ class _Articulated:
 
     def _rotate(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:
         """Return R m R^T."""
-        r = self.r
-        columns = list(zip(*(r.apply(R, row) for row in m), strict=True))  # columns of m R^T
+        V = self.vectors
+        columns = list(zip(*(V.apply(R, row) for row in m), strict=True))  # columns of m R^T
         if symmetric:
-            return self._symmetric(lambda i, j: r.dot(R[i], columns[j]))
-        return [[r.dot(row, column) for column in columns] for row in R]
+            return self._symmetric(lambda i, j: V.dot(R[i], columns[j]))
+        return [[V.dot(row, column) for column in columns] for row in R]

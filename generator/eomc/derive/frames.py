@@ -21,7 +21,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import SceneError
 from eomc.base.spatial import ENTRIES
 from eomc.derive.energies import leaves
-from eomc.derive.links import AXES, ZERO, Links, Vector
+from eomc.derive.links import AXES, ZERO, LinkFrames, Vector
 from eomc.derive.tape import Stage, Tape
 from eomc.model.symbols import needed, symbol
 from eomc.model.system import System, t
@@ -134,13 +134,17 @@ class FrameKinematics:
     jacobian: Sequence[Twist]
 
 
-class Sweep(Links):
+class Sweep:
     """Kinematics of the links of a tree and of frames, computed from the base to the leaves.
 
     Components of vectors are along the world's axes.
 
     Attributes
     ----------
+    tree : LinkFrames
+        The frames of the links.
+    vectors : Vectors
+        Sums and products on the tape.
     d : int
         Number of entries of a position: 2 in the plane, 3 in space.
     width : int
@@ -155,7 +159,8 @@ class Sweep(Links):
     """
 
     def __init__(self, tape: Tape, system: System, frames: Sequence[BodyFrame]) -> None:
-        super().__init__(tape, system.tree or Tree((), (), ZERO, ZERO))
+        tree = self.tree = LinkFrames(tape, system.tree or Tree((), (), ZERO, ZERO))
+        self.vectors, self.links, self.n = tree.vectors, tree.links, tree.n
         self.system, self.plane, self.frames = system, system.plane, frames
         self.d, self.width = (2, 3) if system.plane else (3, 6)
         self.along: Mapping[Symbol, Expr] = {
@@ -163,7 +168,7 @@ class Sweep(Links):
             **dict(zip(system.qd, system.qdd, strict=True)),
             t: S.One,
         }
-        self.joint_accelerations = self.by_link(
+        self.joint_accelerations = tree.by_link(
             dict(zip(system.q, system.qdd, strict=True))
         )  # without the terms that are quadratic in velocities
         self.columns: list[Sequence[Vector]] = []  # columns of R_k
@@ -180,40 +185,40 @@ class Sweep(Links):
 
     def _append_pose(self, k: int, p: int) -> None:
         """Append R_k and the origin of link k, from those of its parent p."""
-        link, rotation = self.links[k], self.rotation[k]
+        V, tree = self.vectors, self.tree
+        link, rotation = self.links[k], tree.rotation[k]
         columns = [(rotation[0][j], rotation[1][j], rotation[2][j]) for j in range(3)]
-        step = self.arm[k]
+        step = tree.arm[k]
         if p >= 0:
             columns = [self.world(p, column) for column in columns]
             step = self.world(p, step)
         if link.turns:
-            c, s = self.cosine[k], self.sine[k]
+            c, s = tree.cosine[k], tree.sine[k]
             i, j = AXES[link.axis]
             x, y = columns[i], columns[j]
-            columns[i] = self.plus(self.scaled(x, c), self.scaled(y, s))
-            columns[j] = self.plus(self.scaled(y, c), self.scaled(x, self.minus(s)))
+            columns[i] = V.plus(V.scaled(x, c), V.scaled(y, s))
+            columns[j] = V.plus(V.scaled(y, c), V.scaled(x, V.minus(s)))
         self.columns.append(columns)
         self.step.append(step)
-        self.origin.append(self.plus(self.origin[p], step) if p >= 0 else step)
+        self.origin.append(V.plus(self.origin[p], step) if p >= 0 else step)
 
     def _append_motion(self, k: int, p: int) -> None:
         """Append velocity and acceleration of link k, from those of its parent p."""
+        V, tree = self.vectors, self.tree
         link, axis, r = self.links[k], self.axis(k), self.step[k]
-        relative = self.scaled(axis, self.speed[k])
-        relative_acceleration = self.scaled(
-            axis, self.add(self.joint_accelerations[k], self.drift[k])
-        )
+        relative = V.scaled(axis, tree.speed[k])
+        relative_acceleration = V.scaled(axis, V.add(self.joint_accelerations[k], tree.drift[k]))
         v = a = omega = alpha = ZERO
         if p >= 0:
             omega, alpha = self.spin[p], self.turning[p]
             v, a = self.propagate((self.velocity[p], omega), (self.acceleration[p], alpha), r)
-        coriolis = self.cross(omega, relative)
+        coriolis = V.cross(omega, relative)
         if link.turns:
-            alpha = self.plus(alpha, relative_acceleration, coriolis)
-            omega = self.plus(omega, relative)
+            alpha = V.plus(alpha, relative_acceleration, coriolis)
+            omega = V.plus(omega, relative)
         else:
-            v = self.plus(v, relative)
-            a = self.plus(a, relative_acceleration, self.scaled(coriolis, S(2)))
+            v = V.plus(v, relative)
+            a = V.plus(a, relative_acceleration, V.scaled(coriolis, S(2)))
         self.spin.append(omega)
         self.turning.append(alpha)
         self.velocity.append(v)
@@ -221,7 +226,8 @@ class Sweep(Links):
 
     def world(self, k: int, v: Vector) -> Vector:
         """Return the components along the world's axes of a vector given in link k's frame."""
-        return self.plus(*(self.scaled(c, x) for c, x in zip(self.columns[k], v, strict=True)))
+        V = self.vectors
+        return V.plus(*(V.scaled(c, x) for c, x in zip(self.columns[k], v, strict=True)))
 
     def axis(self, k: int) -> Vector:
         """Return the unit vector of link k's joint axis, along the world's axes."""
@@ -241,11 +247,12 @@ class Sweep(Links):
         r : Vector
             Vector from the reference point to the point.
         """
+        V = self.vectors
         (v, omega), (a, alpha) = moving, accelerating
-        rotational = self.cross(omega, r)
+        rotational = V.cross(omega, r)
         return (
-            self.plus(v, rotational),
-            self.plus(a, self.cross(alpha, r), self.cross(omega, rotational)),
+            V.plus(v, rotational),
+            V.plus(a, V.cross(alpha, r), V.cross(omega, rotational)),
         )
 
     # --- frames ----------------------------------------------------------------------------------
@@ -275,7 +282,7 @@ class Sweep(Links):
         formulas = [formula for f in self.frames for formula in self._formulas(f)]
         known: dict[Symbol, Expr] = {}
         for name, formula in needed(self.system.definitions, formulas):
-            known[name] = self.tape.named(formula.xreplace(known), name.name)
+            known[name] = self.vectors.tape.named(formula.xreplace(known), name.name)
         return known
 
     def _formulas(self, f: BodyFrame) -> Sequence[Expr]:
@@ -288,7 +295,7 @@ class Sweep(Links):
 
         The formula may contain symbols that the scene defines by other formulas.
         """
-        return self.define(e.xreplace(self.known))
+        return self.vectors.define(e.xreplace(self.known))
 
     def pose(self, frame: FrameKinematics) -> Sequence[Expr]:
         """Return the position (3 entries) and rotation matrix by rows (9 entries) of a frame.
@@ -301,14 +308,13 @@ class Sweep(Links):
 
     def frame(self, f: BodyFrame) -> FrameKinematics:
         """Return pose, velocity, acceleration and Jacobian of the frame `f`."""
+        V = self.vectors
         if f.link < 0:
             return self._frame_by_formulas(f)
         k = f.link
-        arm = self.world(k, self.vector(f.offset))
-        at = self.plus(self.origin[k], arm)
-        columns = [
-            self.world(k, self.vector([f.rotation[i][j] for i in range(3)])) for j in range(3)
-        ]
+        arm = self.world(k, V.vector(f.offset))
+        at = V.plus(self.origin[k], arm)
+        columns = [self.world(k, V.vector([f.rotation[i][j] for i in range(3)])) for j in range(3)]
         omega, alpha = self.spin[k], self.turning[k]
         moving, accelerating = (self.velocity[k], omega), (self.acceleration[k], alpha)
         v, a = self.propagate(moving, accelerating, arm)
@@ -316,14 +322,14 @@ class Sweep(Links):
         lever = arm
         while k >= 0:
             link, axis = self.links[k], self.axis(k)
-            twist = (self.cross(axis, lever), axis) if link.turns else (axis, ZERO)
-            for q, derivative in self.slopes[k].items():
-                linear, angular = (self.scaled(x, derivative) for x in twist)
+            twist = (V.cross(axis, lever), axis) if link.turns else (axis, ZERO)
+            for q, derivative in self.tree.slopes[k].items():
+                linear, angular = (V.scaled(x, derivative) for x in twist)
                 jacobian[q] = (
-                    self.plus(jacobian[q][0], linear),
-                    self.plus(jacobian[q][1], angular),
+                    V.plus(jacobian[q][0], linear),
+                    V.plus(jacobian[q][1], angular),
                 )
-            k, lever = link.parent, self.plus(lever, self.step[k])
+            k, lever = link.parent, V.plus(lever, self.step[k])
         rows = list(zip(*columns, strict=True))
         angle = self.value(f.angle) if self.plane else S.Zero
         return FrameKinematics(
@@ -332,8 +338,9 @@ class Sweep(Links):
 
     def _frame_by_formulas(self, f: BodyFrame) -> FrameKinematics:
         """Compute the kinematics of a frame that is placed by formulas, or fixed in the world."""
-        tape, (x, y, z) = self.tape, map(self.value, f.offset)
-        rows = [self.vector([self.value(e) for e in row]) for row in f.rotation]
+        V = self.vectors
+        tape, (x, y, z) = self.vectors.tape, map(self.value, f.offset)
+        rows = [V.vector([self.value(e) for e in row]) for row in f.rotation]
         angle = self.value(f.angle) if self.plane else S.Zero
         vx, vy, vz = tape.forward([x, y, z], self.along)
         if self.plane:
@@ -341,7 +348,7 @@ class Sweep(Links):
             omega = (S.Zero, S.Zero, turn)
         else:  # omega from the skew matrix dR/dt R^T
             rotation_rates = [tape.forward(row, self.along) for row in rows]
-            wx, wy, wz = (self.dot(rotation_rates[j], rows[i]) for i, j in AXES)
+            wx, wy, wz = (V.dot(rotation_rates[j], rows[i]) for i, j in AXES)
             omega = (wx, wy, wz)
         a = tape.forward([vx, vy, vz], self.along)
         alpha = tape.forward(omega, self.along)
@@ -360,26 +367,27 @@ class Sweep(Links):
         frame k and its pair w_k, the result is sum_k J_k^T w_k. For frames that are fixed to links,
         the sum is computed in one pass over the links, from the leaves to the base.
         """
+        V = self.vectors
         force, moment = [[ZERO] * self.n for _ in range(2)]
         generalized: dict[Symbol, list[Expr]] = {q: [] for q in self.system.q}
         for frame, (f, m) in zip(frames, wrenches, strict=True):
             k = frame.link
             if k >= 0:
-                force[k] = self.plus(force[k], f)
-                moment[k] = self.plus(moment[k], m, self.cross(frame.arm, f))
+                force[k] = V.plus(force[k], f)
+                moment[k] = V.plus(moment[k], m, V.cross(frame.arm, f))
             else:
                 for q, (v, omega) in zip(self.system.q, frame.jacobian, strict=True):
-                    generalized[q] += [self.dot(v, f), self.dot(omega, m)]
+                    generalized[q] += [V.dot(v, f), V.dot(omega, m)]
         joint_forces = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
-            joint_forces[k] = self.dot(self.axis(k), (moment if link.turns else force)[k])
+            joint_forces[k] = V.dot(self.axis(k), (moment if link.turns else force)[k])
             if (p := link.parent) >= 0:
-                force[p] = self.plus(force[p], force[k])
-                moment[p] = self.plus(moment[p], moment[k], self.cross(self.step[k], force[k]))
-        for q, projected in self.projected(joint_forces).items():
+                force[p] = V.plus(force[p], force[k])
+                moment[p] = V.plus(moment[p], moment[k], V.cross(self.step[k], force[k]))
+        for q, projected in self.tree.projected(joint_forces).items():
             generalized[q].append(projected)
-        return [self.add(*terms) for terms in generalized.values()]
+        return [V.add(*terms) for terms in generalized.values()]
 
 
 # --- momenta of bodies ----------------------------------------------------------------------------
@@ -400,13 +408,13 @@ def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
     """
     tape = Tape(leaves(system, *system.qdd))
     sweep = Sweep(tape, system, [f for f in system.frames if f.mass != 0])
-    parts = list(_parts(sweep))
-    mass = sweep.add(*(m for m, *_ in parts))
+    V, parts = sweep.vectors, list(_parts(sweep))
+    mass = V.add(*(m for m, *_ in parts))
     if mass is S.Zero:
         raise SceneError([system.problem("run.momentum", "no body that moves has a mass")])
-    moment, linear, angular = (sweep.plus(*(part[k] for part in parts)) for k in (1, 2, 3))
-    center = sweep.scaled(moment, tape.define(1 / mass))
-    about = sweep.plus(angular, sweep.scaled(sweep.cross(center, linear), S.NegativeOne))
+    moment, linear, angular = (V.plus(*(part[k] for part in parts)) for k in (1, 2, 3))
+    center = V.scaled(moment, tape.define(1 / mass))
+    about = V.plus(angular, V.scaled(V.cross(center, linear), S.NegativeOne))
     return tape, (mass, *center[: sweep.d], *sweep.flat(linear, about))
 
 
@@ -419,15 +427,16 @@ def _parts(sweep: Sweep) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
 
     The moments are about the world's origin.
     """
+    V = sweep.vectors
     for k, link in enumerate(sweep.links):
         motion = sweep.origin[k], sweep.columns[k], sweep.velocity[k], sweep.spin[k]
-        moment = sweep.world(k, sweep.vector(link.moment))
-        yield _part(sweep, motion, sweep.define(link.mass), moment, link.inertia)
+        moment = sweep.world(k, V.vector(link.moment))
+        yield _part(sweep, motion, V.define(link.mass), moment, link.inertia)
     for f in sweep.frames:
         frame = sweep.frame(f)
         columns = list(zip(*frame.rotation, strict=True))
         motion = frame.at, columns, *frame.velocity
-        yield _part(sweep, motion, sweep.define(f.mass), ZERO, f.inertia)
+        yield _part(sweep, motion, V.define(f.mass), ZERO, f.inertia)
 
 
 def _part(
@@ -437,12 +446,12 @@ def _part(
 
     `moment` (along the world's axes) and `inertia` refer to the position in `motion`.
     """
-    at, columns, v, omega = motion
+    V, (at, columns, v, omega) = sweep.vectors, motion
     tensor = [[S.Zero] * 3 for _ in range(3)]
     for (i, j), entry in zip(ENTRIES, inertia, strict=True):
-        tensor[i][j] = tensor[j][i] = sweep.define(entry)
-    spin_in_body = sweep.apply(tensor, sweep.apply(columns, omega))
-    spin = sweep.plus(*(sweep.scaled(c, x) for c, x in zip(columns, spin_in_body, strict=True)))
-    linear = sweep.plus(sweep.scaled(v, mass), sweep.cross(omega, moment))
-    angular = sweep.plus(spin, sweep.cross(moment, v), sweep.cross(at, linear))
-    return mass, sweep.plus(sweep.scaled(at, mass), moment), linear, angular
+        tensor[i][j] = tensor[j][i] = V.define(entry)
+    spin_in_body = V.apply(tensor, V.apply(columns, omega))
+    spin = V.plus(*(V.scaled(c, x) for c, x in zip(columns, spin_in_body, strict=True)))
+    linear = V.plus(V.scaled(v, mass), V.cross(omega, moment))
+    angular = V.plus(spin, V.cross(moment, v), V.cross(at, linear))
+    return mass, V.plus(V.scaled(at, mass), moment), linear, angular

@@ -241,7 +241,7 @@ def _by_newton_euler(
     recursion = Recursion(tape, tree)
 
     def by_coordinate(by_link: Sequence[Expr]) -> list[Expr]:
-        projected = recursion.projected(by_link)
+        projected = recursion.tree.projected(by_link)
         return [projected.get(x, S.Zero) for x in q]
 
     bias = by_coordinate(recursion.bias())
@@ -256,7 +256,7 @@ def _by_newton_euler(
     operations = recursion.count_elimination_operations()
     use_articulated = isinstance(articulated, Solution) and operations > _length(articulated)
     if use_articulated and len(q) > MAX_UNROLLED_COORDINATES:
-        direction = recursion.by_link(tangent_symbols(system))
+        direction = recursion.tree.by_link(tangent_symbols(system))
         D: Rows = (tuple(by_coordinate(recursion.mass_times(direction))),)
     else:
         columns = zip(*map(by_coordinate, recursion.mass_matrix()), strict=True)
@@ -283,7 +283,7 @@ def _by_articulated_bodies(system: System, recursion: Recursion, rest: MotionTer
     coordinate each.
     """
     q, links = system.q, recursion.links
-    if not recursion.plain:
+    if not recursion.tree.plain:
         return "joints that move together"
     if len(links) < len(q) or any(x != 0 for column in rest.D for x in column):
         return None
@@ -293,7 +293,7 @@ def _by_articulated_bodies(system: System, recursion: Recursion, rest: MotionTer
     except MasslessError:  # D is singular; `program.inertia` reports the motion without inertia
         return MASSLESS
     order = tuple(q.index(link.q) for link in reversed(links))
-    return Solution(recursion.tape, tuple(qdd[link_of[x]] for x in q), order, pivots)
+    return Solution(recursion.vectors.tape, tuple(qdd[link_of[x]] for x in q), order, pivots)
 
 
 def _by_multipliers(system: System) -> SolveResult:
@@ -561,9 +561,9 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     accelerations = dict(zip(system.qd, system.qdd, strict=True))
     terms_of = [[x] for x in _inertial_forces(system, e, accelerations)]
     if tree:
-        r = Recursion(e.tape, tree)
-        joint_accelerations = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
-        tree_forces = r.projected(r.inverse_dynamics(joint_accelerations))
+        recursion = Recursion(e.tape, tree)
+        joint_accelerations = recursion.tree.by_link(dict(zip(system.q, system.qdd, strict=True)))
+        tree_forces = recursion.tree.projected(recursion.inverse_dynamics(joint_accelerations))
         for terms, q in zip(terms_of, system.q, strict=True):
             terms.append(tree_forces.get(q, S.Zero))
     return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in terms_of]

@@ -122,14 +122,15 @@ def solution(system: System) -> Solution:
         raise UnsuitedError("a potential with velocities")
     if system.discrete:
         raise UnsuitedError("parameters that jumps set")
-    return _Links(system, energies_on_tape(system, system.kinetic, system.potential)).solution()
+    energies = energies_on_tape(system, system.kinetic, system.potential)
+    return _LinkEquations(system, energies).solution()
 
 
-class _Links(Vectors):
+class _LinkEquations:
     """Points, increments and groups of a system, and the equations of its multipliers."""
 
     def __init__(self, system: System, e: Energies) -> None:
-        super().__init__(e.tape)
+        self.tape, self.vectors = e.tape, Vectors(e.tape)
         self.system = system
         self.e = e
         self.sums: dict[Symbol, dict[Symbol, Expr]] = {}
@@ -267,7 +268,7 @@ class _Links(Vectors):
     def _perpendicular_rows(self, slopes: Sequence[Expr]) -> tuple[tuple[Expr, ...], ...]:
         """Return a basis of the rows perpendicular to the slopes."""
         if len(slopes) == 2:
-            return ((self.minus(slopes[1]), slopes[0]),)
+            return ((self.vectors.minus(slopes[1]), slopes[0]),)
         constant = [k for k, x in enumerate(slopes) if self.tape.stage_of(x) <= Stage.PARAMETER]
         if not constant:
             if len(slopes) == 1:
@@ -301,7 +302,7 @@ class _Links(Vectors):
             parts: dict[int, list[Expr]] = {k: [S.One]}
             for a, c in row.items():
                 for j, b in B.get(a, {}).items():
-                    parts.setdefault(j, []).append(self.minus(tape.times(c, b)))
+                    parts.setdefault(j, []).append(self.vectors.minus(tape.times(c, b)))
             self.divisors.append(row[unknown[0]])
             inverse = tape.define(1 / row[unknown[0]])
             coefficients = {j: tape.times(inverse, tape.total(cs)) for j, cs in parts.items()}
@@ -314,6 +315,7 @@ class _Links(Vectors):
         """Return the forces at points, and the generalized forces on coordinates that are not
         points.
         """
+        V = self.vectors
         e, tape, q, qd = self.e, self.tape, self.system.q, self.system.qd
         places, speeds = [split(p.place) for p in self.points], [p.speed for p in self.points]
         names = [name for _, name in places if name]
@@ -322,13 +324,11 @@ class _Links(Vectors):
         loads = dict(zip(q, e.forces, strict=True))
         n = len(names)
         at_points = [
-            tape.total(
-                [loads.get(name, S.Zero), self.minus(tape.define(p / factor)), self.minus(r)]
-            )
+            tape.total([loads.get(name, S.Zero), V.minus(tape.define(p / factor)), V.minus(r)])
             for (factor, _), name, p, r in zip(places, names, gradient[:n], drag[:n], strict=True)
         ]
         on_coordinates = [
-            S.Zero if x in names else tape.total([loads[x], self.minus(p), self.minus(r)])
+            S.Zero if x in names else tape.total([loads[x], V.minus(p), V.minus(r)])
             for x, p, r in zip(q, gradient[n:], drag[n:], strict=True)
         ]
         return at_points, on_coordinates
@@ -339,7 +339,8 @@ class _Links(Vectors):
         for point, force, terms in zip(self.points, forces, self.driven, strict=True):
             rates = tape.forward(tape.forward(list(terms), {t: S.One}), {t: S.One})
             drift = [
-                self.minus(tape.times(c, r)) for c, r in zip(terms.values(), rates, strict=True)
+                self.vectors.minus(tape.times(c, r))
+                for c, r in zip(terms.values(), rates, strict=True)
             ]
             free.append(tape.total([tape.define(force / point.mass), *drift]))
         return [tape.total([tape.times(b, free[k]) for k, b in row.items()]) for row in self.B]
@@ -366,24 +367,26 @@ class _Links(Vectors):
 
     def _product(self, g: int, x: Vector, h: int, y: Vector) -> Expr:
         """Return x . T y/unit for a row x of group g and a row y of group h."""
+        V = self.vectors
         rows, columns = self.groups[g].members, self.groups[h].members
         T = [[self.T.get((a, b), S.Zero) for b in columns] for a in rows]
         if len(rows) == len(columns):  # most masses are the same in all directions
             first, size = T[0][0], range(len(rows))
             if all(T[i][j] == (first if i == j else 0) for i, j in product(size, size)):
-                return self.tape.times(first, self.dot(x, y))
-        return self.dot(x, [self.dot(row, y) for row in T])
+                return self.tape.times(first, V.dot(x, y))
+        return V.dot(x, [V.dot(row, y) for row in T])
 
     # --- the multipliers -------------------------------------------------------------------------
 
     def solution(self) -> Solution:
         """Return qdd. Its pivots are those of S and all quantities that were divided by."""
+        V = self.vectors
         tape, groups, near = self.tape, self.groups, self.near
         forces, loads = self._forces()
         free = self._accelerations_without_multipliers(forces)
         coordinates_of = self._coordinates_of_angles()
         slopes = [g.slopes for g in groups]
-        squares = [self.dot(u, u) for u in slopes]
+        squares = [V.dot(u, u) for u in slopes]
         angle_forces = [
             tape.define(self.unit * load / square)
             for load, square in zip(self._on_angles(coordinates_of, loads), squares, strict=True)
@@ -400,15 +403,14 @@ class _Links(Vectors):
                 for h, force in enumerate(angle_forces)
                 if force != 0 and (g, h) in near
             ]
-            return [self.dot(x, [free[a] for a in groups[g].members]), *force_terms]
+            return [V.dot(x, [free[a] for a in groups[g].members]), *force_terms]
 
         matrix = tuple(
             tuple(self._product(g, x, h, y) if (g, h) in near else S.Zero for h, y in rows)
             for g, x in rows
         )
         rhs = [
-            tape.total([self.dot(x, groups[g].beta), *map(self.minus, known_part(g, x))])
-            for g, x in rows
+            tape.total([V.dot(x, groups[g].beta), *map(V.minus, known_part(g, x))]) for g, x in rows
         ]
         solved = solve(
             tape, matrix, rhs, opaque=tape.opaque, short_chains=prefer_short_chains(self.system)
@@ -420,7 +422,7 @@ class _Links(Vectors):
                 for (h, y), multiplier in zip(rows, solved.acceleration, strict=True)
                 if (g, h) in near
             ]
-            terms = [*multiplier_terms, *known_part(g, u), self.minus(self.dot(u, groups[g].beta))]
+            terms = [*multiplier_terms, *known_part(g, u), V.minus(V.dot(u, groups[g].beta))]
             angle_accelerations.append(tape.define(tape.total(terms) / square))
         acceleration = tuple(
             tape.total([tape.scaled(c, x) for c, x in zip(row, angle_accelerations, strict=True)])

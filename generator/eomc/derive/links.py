@@ -79,8 +79,8 @@ class Vectors:
         return (a, b, c)
 
 
-class Links(Vectors):
-    """The links of a kinematic tree, parents before children, with symbolic expressions.
+class LinkFrames:
+    """Frames of the links of a kinematic tree, parents before children, as symbolic expressions.
 
     Expressions are defined on a tape, a list of elementary operations with named results. Link k
     moves relative to its parent by the displacement s_k(q) of its joint. This is an angle (rad)
@@ -88,6 +88,8 @@ class Links(Vectors):
 
     Attributes
     ----------
+    vectors : Vectors
+        Sums and products on the tape.
     moved, speed, drift
         For each link, s_k, its time derivative, and its second time derivative at qdd = 0.
     slopes
@@ -101,12 +103,12 @@ class Links(Vectors):
     """
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
-        super().__init__(tape)
+        V = self.vectors = Vectors(tape)
         self.links = tree.links
         self.n = len(tree.links)
         # joint displacement s_k(q), its rate, its second derivative at qdd = 0, and ds_k/dq
         rates = dict(tree.rates)
-        self.moved = [self.define(x.q) for x in self.links]
+        self.moved = [V.define(x.q) for x in self.links]
         self.speed = tape.forward(self.moved, rates)
         self.drift = tape.forward(self.speed, rates)
         self.slopes = [
@@ -114,10 +116,10 @@ class Links(Vectors):
             for x, moved in zip(self.links, self.moved, strict=True)
         ]
         pairs = [*zip(self.links, self.moved, strict=True)]
-        self.cosine = [self.define(sympy.cos(s)) if x.turns else S.One for x, s in pairs]
-        self.sine = [self.define(sympy.sin(s)) if x.turns else S.Zero for x, s in pairs]
+        self.cosine = [V.define(sympy.cos(s)) if x.turns else S.One for x, s in pairs]
+        self.sine = [V.define(sympy.sin(s)) if x.turns else S.Zero for x, s in pairs]
         self.rotation: list[Matrix] = [
-            tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
+            tuple(V.vector(row) for row in x.rotation)  # type: ignore[misc]
             for x in self.links
         ]
         self.arm = [self._arm(k) for k in range(self.n)]
@@ -136,11 +138,12 @@ class Links(Vectors):
         `by_link` contains the force f_k (N) or moment (N m) along the joint of each link k. With
         the joint's displacement s_k, the generalized force on q is sum_k ds_k/dq f_k.
         """
+        V = self.vectors
         terms: dict[Symbol, list[Expr]] = {}
         for slopes, force in zip(self.slopes, by_link, strict=True):
             for q, slope in slopes.items():
-                terms.setdefault(q, []).append(self.times(slope, force))
-        return {q: self.add(*forces) for q, forces in terms.items()}
+                terms.setdefault(q, []).append(V.times(slope, force))
+        return {q: V.add(*forces) for q, forces in terms.items()}
 
     def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
         """Return the rate of each joint's displacement, from the rate of each coordinate.
@@ -148,8 +151,9 @@ class Links(Vectors):
         `direction` maps each coordinate q to its rate v_q. With the displacement s_k of the joint
         of link k, the result for link k is sum_q ds_k/dq v_q.
         """
+        V = self.vectors
         return [
-            self.add(*(self.times(slope, direction[q]) for q, slope in slopes.items()))
+            V.add(*(V.times(slope, direction[q]) for q, slope in slopes.items()))
             for slopes in self.slopes
         ]
 
@@ -161,32 +165,34 @@ class Links(Vectors):
         With `back`, the vector is rotated by the negative angle. If the joint is prismatic, the
         vector is returned unchanged.
         """
+        V = self.vectors
         if not self.links[k].turns:
             return v
         c, s = self.cosine[k], self.sine[k]
         i, j = AXES[self.links[k].axis]
         out = list(v)
-        up, down = self.times(s, v[i]), self.times(s, v[j])
-        out[i] = self.add(self.times(c, v[i]), down if back else self.minus(down))
-        out[j] = self.add(self.minus(up) if back else up, self.times(c, v[j]))
+        up, down = V.times(s, v[i]), V.times(s, v[j])
+        out[i] = V.add(V.times(c, v[i]), down if back else V.minus(down))
+        out[j] = V.add(V.minus(up) if back else up, V.times(c, v[j]))
         return (out[0], out[1], out[2])
 
     def inwards(self, k: int, v: Vector) -> Vector:
         """Return the components in the parent's frame of a vector given in link k's frame."""
-        return self.apply(self.rotation[k], self.turn(k, v))
+        return self.vectors.apply(self.rotation[k], self.turn(k, v))
 
     def outwards(self, k: int, v: Vector) -> Vector:
         """Return the components in link k's frame of a vector given in its parent's frame."""
-        return self.turn(k, self.apply(transposed(self.rotation[k]), v), back=True)
+        return self.turn(k, self.vectors.apply(transposed(self.rotation[k]), v), back=True)
 
     def _arm(self, k: int) -> Vector:
         """Return the vector from the parent's origin to link k's, in the parent's frame."""
+        V = self.vectors
         link = self.links[k]
-        offset = self.vector(link.offset)
+        offset = V.vector(link.offset)
         if link.turns:
             return offset
-        slide = tuple(self.times(row[link.axis], self.moved[k]) for row in self.rotation[k])
-        return self.plus(offset, slide)
+        slide = tuple(V.times(row[link.axis], self.moved[k]) for row in self.rotation[k])
+        return V.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
         """Return the vector x e in link k's frame, where e is the unit vector of its joint axis."""
@@ -202,7 +208,7 @@ class Links(Vectors):
         out: list[Vector] = []
         for k, link in enumerate(self.links):
             w = self.outwards(k, out[link.parent]) if link.parent >= 0 else ZERO
-            out.append(self.plus(w, self.on_axis(k, rates[k])) if link.turns else w)
+            out.append(self.vectors.plus(w, self.on_axis(k, rates[k])) if link.turns else w)
         return out
 
     def velocities(self, rates: Sequence[Expr], spin: Sequence[Vector]) -> list[Vector]:
@@ -211,11 +217,12 @@ class Links(Vectors):
         `rates` are the rates of the joints' displacements; `spin` are the angular velocities of the
         links, as `angular_velocities` returns them.
         """
+        V = self.vectors
         out: list[Vector] = []
         for k, link in enumerate(self.links):
             v = ZERO
             if (p := link.parent) >= 0:
-                v = self.plus(out[p], self.cross(spin[p], self.arm[k]))
+                v = V.plus(out[p], V.cross(spin[p], self.arm[k]))
             v = self.outwards(k, v)
-            out.append(v if link.turns else self.plus(v, self.on_axis(k, rates[k])))
+            out.append(v if link.turns else V.plus(v, self.on_axis(k, rates[k])))
         return out

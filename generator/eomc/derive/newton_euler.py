@@ -21,7 +21,7 @@ from itertools import combinations_with_replacement
 from sympy import Expr, S
 
 from eomc.base.spatial import ENTRIES
-from eomc.derive.links import AXES, ZERO, Links, Vector
+from eomc.derive.links import AXES, ZERO, LinkFrames, Vector
 from eomc.derive.tape import Tape
 from eomc.model.rational import Matrix
 from eomc.model.tree import Link, Tree
@@ -70,7 +70,7 @@ class _Forces:
     moment: list[Vector]
 
 
-class Recursion(Links):
+class Recursion:
     """A kinematic tree of links, with methods that return its dynamics as symbolic expressions.
 
     Expressions are defined on a tape, a list of elementary operations with named results. The
@@ -80,6 +80,10 @@ class Recursion(Links):
 
     Attributes
     ----------
+    tree : LinkFrames
+        The frames of the links.
+    vectors : Vectors
+        Sums and products on the tape.
     gravity : Vector
         Acceleration of gravity in the world's axes (m/s^2).
     armature
@@ -91,30 +95,32 @@ class Recursion(Links):
     """
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
-        super().__init__(tape, tree)
-        self.gravity = self.vector(tree.gravity)
-        self.fixed_moment = self.vector(
-            tree.fixed_moment
-        )  # first moment of mass fixed in the world
-        self.armature = [self.define(x.armature) for x in self.links]
+        self.tree = LinkFrames(tape, tree)
+        self.vectors, self.links, self.n = self.tree.vectors, self.tree.links, self.tree.n
+        V = self.vectors
+        self.gravity = V.vector(tree.gravity)
+        self.fixed_moment = V.vector(tree.fixed_moment)  # first moment of mass fixed in the world
+        self.armature = [V.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
 
     # --- inertial parameters ---------------------------------------------------------------------
 
     def _link_inertia(self, link: Link) -> Inertia:
         """Return a link's inertia as given in the scene."""
-        inertia = dict(zip(ENTRIES, map(self.define, link.inertia), strict=True))
-        return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
+        V = self.vectors
+        inertia = dict(zip(ENTRIES, map(V.define, link.inertia), strict=True))
+        return Inertia(V.define(link.mass), V.vector(link.moment), inertia)
 
     def _sum(self, a: Inertia, b: Inertia) -> Inertia:
         """Return the sum of two inertias about the same origin in the same frame."""
+        V = self.vectors
         if a.is_zero() or b.is_zero():
             return a if b.is_zero() else b
         keys = sorted({*a.inertia, *b.inertia})
         return Inertia(
-            self.add(a.mass, b.mass),
-            self.plus(a.moment, b.moment),
-            {k: self.add(a.inertia.get(k, S.Zero), b.inertia.get(k, S.Zero)) for k in keys},
+            V.add(a.mass, b.mass),
+            V.plus(a.moment, b.moment),
+            {k: V.add(a.inertia.get(k, S.Zero), b.inertia.get(k, S.Zero)) for k in keys},
         )
 
     def _grouped(self) -> list[Inertia]:
@@ -125,6 +131,7 @@ class Recursion(Links):
         about it, acts as if it belonged to the parent; so does the whole inertia tensor of a
         prismatic link. Gautier & Khalil, IEEE Trans. Robotics and Automation 6(3), 1990.
         """
+        V, tree = self.vectors, self.tree
         inertias = [self._link_inertia(link) for link in self.links]
         for k in reversed(range(self.n)):
             link, own = self.links[k], inertias[k]
@@ -133,54 +140,57 @@ class Recursion(Links):
             if link.turns:
                 across = own.entry(j, j)
                 moved = Inertia(
-                    own.mass, self.on_axis(k, own.moment[a]), {(i, i): across, (j, j): across}
+                    own.mass, tree.on_axis(k, own.moment[a]), {(i, i): across, (j, j): across}
                 )
                 moment = list(own.moment)
                 moment[a] = S.Zero
                 remaining = dict(own.inertia)
-                remaining[i, i] = self.add(own.entry(i, i), self.minus(across))
+                remaining[i, i] = V.add(own.entry(i, i), V.minus(across))
                 remaining[j, j] = S.Zero
                 inertias[k] = Inertia(S.Zero, (moment[0], moment[1], moment[2]), remaining)
                 at_parent = self._to_parent_frame(k, moved, rotated=False)
             else:
                 inertias[k] = Inertia(own.mass, own.moment, {})
                 moved = Inertia(S.Zero, ZERO, own.inertia)
-                at_parent = self._rotate(self.rotation[k], moved)
+                at_parent = self._rotate(tree.rotation[k], moved)
             if link.parent >= 0:
                 inertias[link.parent] = self._sum(inertias[link.parent], at_parent)
             else:
-                self.fixed_moment = self.plus(self.fixed_moment, at_parent.moment)
+                self.fixed_moment = V.plus(self.fixed_moment, at_parent.moment)
         return inertias
 
     def _rotate(self, R: Matrix, x: Inertia) -> Inertia:
         """Return the inertia in a frame rotated by R: R I R^T and R h."""
+        V = self.vectors
         if all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             return x
-        half = [self.apply(R, row) for row in x.tensor]  # (R I)^T, I symmetric
+        half = [V.apply(R, row) for row in x.tensor]  # (R I)^T, I symmetric
         columns = list(zip(*half, strict=True))
         pairs = combinations_with_replacement(range(3), 2)
-        inertia = {(i, j): self.dot(R[j], columns[i]) for i, j in pairs}
-        return Inertia(x.mass, self.apply(R, x.moment), inertia)
+        inertia = {(i, j): V.dot(R[j], columns[i]) for i, j in pairs}
+        return Inertia(x.mass, V.apply(R, x.moment), inertia)
 
     def _to_parent_frame(self, k: int, x: Inertia, rotated: bool = True) -> Inertia:
         """Transform an inertia from link k's frame to its parent's frame and origin."""
+        V, tree = self.vectors, self.tree
         if rotated and self.links[k].turns:
             x = self._rotate_by_joint(k, x)
-        x = self._rotate(self.rotation[k], x)
-        r = self.arm[k]
+        x = self._rotate(tree.rotation[k], x)
+        r = tree.arm[k]
         if r == ZERO:
             return x
-        shift = self.scaled(r, x.mass)
-        g = self.plus(x.moment, self.scaled(shift, S.Half))
-        twice = self._double(self.dot(g, r))
+        shift = V.scaled(r, x.mass)
+        g = V.plus(x.moment, V.scaled(shift, S.Half))
+        twice = self._double(V.dot(g, r))
         inertia = {}
         for i, j in combinations_with_replacement(range(3), 2):
-            change = self.minus(self.add(self.times(g[i], r[j]), self.times(r[i], g[j])))
-            inertia[i, j] = self.add(x.entry(i, j), change, twice if i == j else S.Zero)
-        return Inertia(x.mass, self.plus(x.moment, shift), inertia)
+            change = V.minus(V.add(V.times(g[i], r[j]), V.times(r[i], g[j])))
+            inertia[i, j] = V.add(x.entry(i, j), change, twice if i == j else S.Zero)
+        return Inertia(x.mass, V.plus(x.moment, shift), inertia)
 
     def _rotate_by_joint(self, k: int, x: Inertia) -> Inertia:
         """Rotate an inertia by joint k's angle."""
+        V, tree = self.vectors, self.tree
         i, j = AXES[self.links[k].axis]
         a = self.links[k].axis
         inertia = dict(x.inertia)
@@ -189,19 +199,19 @@ class Recursion(Links):
             inertia[min(p, q), max(p, q)] = e
 
         t, off = self.half_turn(k, x.entry(i, i), x.entry(j, j), self._double(x.entry(i, j)))
-        put(i, i, self.add(x.entry(i, i), self.minus(t)))
-        put(j, j, self.add(x.entry(j, j), t))
-        put(i, j, self.add(off, self.minus(x.entry(i, j))))
+        put(i, i, V.add(x.entry(i, i), V.minus(t)))
+        put(j, j, V.add(x.entry(j, j), t))
+        put(i, j, V.add(off, V.minus(x.entry(i, j))))
         mixed = [S.Zero] * 3
         mixed[i], mixed[j] = x.entry(i, a), x.entry(j, a)
-        mixed = list(self.turn(k, (mixed[0], mixed[1], mixed[2])))
+        mixed = list(tree.turn(k, (mixed[0], mixed[1], mixed[2])))
         put(i, a, mixed[i])
         put(j, a, mixed[j])
-        return Inertia(x.mass, self.turn(k, x.moment), inertia)
+        return Inertia(x.mass, tree.turn(k, x.moment), inertia)
 
     def _double(self, x: Expr) -> Expr:
         """Return 2 x."""
-        return self.tape.scaled(S(2), x)
+        return self.vectors.tape.scaled(S(2), x)
 
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
         """Return the two terms by which a rotation about joint k's axis changes a 2 x 2 matrix.
@@ -216,9 +226,10 @@ class Recursion(Links):
         t, c e : Expr
             The two terms, as atoms of the tape.
         """
-        c, s = self.cosine[k], self.sine[k]
-        e = self.add(self.times(s, self.add(first, self.minus(second))), self.times(c, across))
-        return self.times(s, e), self.times(c, e)
+        V, tree = self.vectors, self.tree
+        c, s = tree.cosine[k], tree.sine[k]
+        e = V.add(V.times(s, V.add(first, V.minus(second))), V.times(c, across))
+        return V.times(s, e), V.times(c, e)
 
     # --- outwards: velocities, accelerations, forces ---------------------------------------------
 
@@ -231,32 +242,33 @@ class Recursion(Links):
         `rates` and `joint_accelerations` are the first and second time derivatives of the joint
         displacements. With `gravity`, the forces also support the weight of the links.
         """
+        V, tree = self.vectors, self.tree
         out = _Forces([], [])
-        spin = self.angular_velocities(rates)
+        spin = tree.angular_velocities(rates)
         alphas: list[Vector] = []
         origins: list[Vector] = []
         matrices: list[list[list[Expr]]] = []
-        fall: Vector = self.scaled(self.gravity, S.NegativeOne) if gravity else ZERO
+        fall: Vector = V.scaled(self.gravity, S.NegativeOne) if gravity else ZERO
         for k, link in enumerate(self.links):
-            p, r = link.parent, self.arm[k]
+            p, r = link.parent, tree.arm[k]
             alpha, acceleration = (alphas[p], origins[p]) if p >= 0 else (ZERO, fall)
             if p >= 0 and r != ZERO:
-                acceleration = self.plus(acceleration, self.apply(matrices[p], r))
-            alpha, acceleration = self.outwards(k, alpha), self.outwards(k, acceleration)
-            parent_spin = self.outwards(k, spin[p]) if p >= 0 else ZERO
-            relative = self.on_axis(k, rates[k])
+                acceleration = V.plus(acceleration, V.apply(matrices[p], r))
+            alpha, acceleration = tree.outwards(k, alpha), tree.outwards(k, acceleration)
+            parent_spin = tree.outwards(k, spin[p]) if p >= 0 else ZERO
+            relative = tree.on_axis(k, rates[k])
             if link.turns:
-                alpha = self.plus(
+                alpha = V.plus(
                     alpha,
-                    self.cross(parent_spin, relative),
-                    self.on_axis(k, joint_accelerations[k]),
+                    V.cross(parent_spin, relative),
+                    tree.on_axis(k, joint_accelerations[k]),
                 )
             else:
-                coriolis = self.cross(parent_spin, relative)
-                acceleration = self.plus(
+                coriolis = V.cross(parent_spin, relative)
+                acceleration = V.plus(
                     acceleration,
-                    self.scaled(coriolis, S(2)),
-                    self.on_axis(k, joint_accelerations[k]),
+                    V.scaled(coriolis, S(2)),
+                    tree.on_axis(k, joint_accelerations[k]),
                 )
             alphas.append(alpha)
             origins.append(acceleration)
@@ -264,43 +276,45 @@ class Recursion(Links):
             U = self._acceleration_matrix(alpha, squares)
             matrices.append(U)
             x = self.inertia[k]
-            out.force.append(self.plus(self.scaled(acceleration, x.mass), self.apply(U, x.moment)))
+            out.force.append(V.plus(V.scaled(acceleration, x.mass), V.apply(U, x.moment)))
             out.moment.append(self._moment(x, spin[k], alpha, acceleration, U))
         return out
 
     def _squares(self, w: Vector) -> dict[tuple[int, int], Expr]:
         """Return the products w_i w_j, i <= j."""
         pairs = combinations_with_replacement(range(3), 2)
-        return {(i, j): self.times(w[i], w[j]) for i, j in pairs}
+        return {(i, j): self.vectors.times(w[i], w[j]) for i, j in pairs}
 
     def _acceleration_matrix(
         self, alpha: Vector, ww: Mapping[tuple[int, int], Expr]
     ) -> list[list[Expr]]:
         """Return U = [alpha] + [omega][omega]: a point at r has the acceleration a + U r."""
+        V = self.vectors
         U = [[S.Zero] * 3 for _ in range(3)]
         for a, (i, j) in enumerate(AXES):
-            U[a][a] = self.minus(self.add(ww[i, i], ww[j, j]))
+            U[a][a] = V.minus(V.add(ww[i, i], ww[j, j]))
             product = ww[min(i, j), max(i, j)]
-            U[i][j] = self.add(product, self.minus(alpha[a]))
-            U[j][i] = self.add(product, alpha[a])
+            U[i][j] = V.add(product, V.minus(alpha[a]))
+            U[j][i] = V.add(product, alpha[a])
         return U
 
     def _moment(
         self, x: Inertia, w: Vector, alpha: Vector, acceleration: Vector, U: list[list[Expr]]
     ) -> Vector:
         """Return h x a + I alpha + omega x I omega, expressed by the entries of U."""
-        moment_of_force = self.cross(x.moment, acceleration)
+        V = self.vectors
+        moment_of_force = V.cross(x.moment, acceleration)
         out = []
         for a, (i, j) in enumerate(AXES):
-            ww = self.times(w[i], w[j])
+            ww = V.times(w[i], w[j])
             out.append(
-                self.add(
+                V.add(
                     moment_of_force[a],
-                    self.times(x.entry(a, a), alpha[a]),
-                    self.times(self.add(x.entry(j, j), self.minus(x.entry(i, i))), ww),
-                    self.minus(self.times(x.entry(a, i), U[j][a])),
-                    self.times(x.entry(a, j), U[i][a]),
-                    self.times(x.entry(i, j), self.add(U[i][i], self.minus(U[j][j]))),
+                    V.times(x.entry(a, a), alpha[a]),
+                    V.times(V.add(x.entry(j, j), V.minus(x.entry(i, i))), ww),
+                    V.minus(V.times(x.entry(a, i), U[j][a])),
+                    V.times(x.entry(a, j), U[i][a]),
+                    V.times(x.entry(i, j), V.add(U[i][i], V.minus(U[j][j]))),
                 )
             )
         return (out[0], out[1], out[2])
@@ -313,30 +327,30 @@ class Recursion(Links):
         It is the sum of the `forces` on all links beyond the joint, projected onto the joint's
         axis.
         """
+        V, tree = self.vectors, self.tree
         f, n = list(forces.force), list(forces.moment)
         out: list[Expr] = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
             out[k] = (n if link.turns else f)[k][link.axis]
             if link.parent >= 0:
-                force, moment = self.inwards(k, f[k]), self.inwards(k, n[k])
-                f[link.parent] = self.plus(f[link.parent], force)
-                n[link.parent] = self.plus(n[link.parent], moment, self.cross(self.arm[k], force))
+                force, moment = tree.inwards(k, f[k]), tree.inwards(k, n[k])
+                f[link.parent] = V.plus(f[link.parent], force)
+                n[link.parent] = V.plus(n[link.parent], moment, V.cross(tree.arm[k], force))
         return out
 
     def bias(self) -> list[Expr]:
         """Return the bias C qd + g (Coriolis, centrifugal and gravity forces) along each joint."""
-        return self._forces_for(self.drift)
+        return self._forces_for(self.tree.drift)
 
     def inverse_dynamics(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
         """Return D qdd + C qd + g as the force along each joint.
 
         `joint_accelerations` is the second time derivative of each joint's displacement, without
-        the part that depends on velocities alone; `by_link` computes it from qdd.
+        the part that depends on velocities alone; `LinkFrames.by_link` computes it from qdd.
         """
-        return self._forces_for(
-            [self.add(*pair) for pair in zip(joint_accelerations, self.drift, strict=True)]
-        )
+        pairs = zip(joint_accelerations, self.tree.drift, strict=True)
+        return self._forces_for([self.vectors.add(*pair) for pair in pairs])
 
     def gravity_forces(self) -> list[Expr]:
         """Return g, the forces along the joints that hold the tree at rest against gravity."""
@@ -346,19 +360,22 @@ class Recursion(Links):
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
         """Return the product D v as the force along each joint, without forming the mass matrix D.
 
-        `direction` contains v by joint; `by_link` computes it from one entry for each coordinate.
+        `direction` contains v by joint; `LinkFrames.by_link` computes it from one entry for each
+        coordinate.
         """
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
 
     def _forces_for(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
         """Return the joint forces at the current rates for given total joint accelerations."""
-        return self._with_rotors(self.forces(self.speed, joint_accelerations), joint_accelerations)
+        forces = self.forces(self.tree.speed, joint_accelerations)
+        return self._with_rotors(forces, joint_accelerations)
 
     def _with_rotors(self, forces: _Forces, joint_accelerations: Sequence[Expr]) -> list[Expr]:
         """Return the joint forces, including those that the armatures need."""
+        V = self.vectors
         terms = zip(self.joint_forces(forces), self.armature, joint_accelerations, strict=True)
-        return [self.add(x, self.times(a, v)) for x, a, v in terms]
+        return [V.add(x, V.times(a, v)) for x, a, v in terms]
 
     # --- D by composite bodies -------------------------------------------------------------------
 
@@ -368,6 +385,7 @@ class Recursion(Links):
         Its coordinates are the displacements of the joints. An entry of two links on different
         branches of the tree is 0.
         """
+        V, tree = self.vectors, self.tree
         beyond = list(self.inertia)
         for k in reversed(range(self.n)):
             if (p := self.links[k].parent) >= 0:
@@ -377,15 +395,15 @@ class Recursion(Links):
             x, a = beyond[k], link.axis
             if link.turns:
                 moment = (x.entry(0, a), x.entry(1, a), x.entry(2, a))
-                force = self.cross(self.on_axis(k, S.One), x.moment)
+                force = V.cross(tree.on_axis(k, S.One), x.moment)
             else:
-                force = self.on_axis(k, x.mass)
-                moment = self.cross(x.moment, self.on_axis(k, S.One))
-            D[k][k] = self.add((moment if link.turns else force)[a], self.armature[k])
+                force = tree.on_axis(k, x.mass)
+                moment = V.cross(x.moment, tree.on_axis(k, S.One))
+            D[k][k] = V.add((moment if link.turns else force)[a], self.armature[k])
             i = k
             while (p := self.links[i].parent) >= 0:
-                force, moment = self.inwards(i, force), self.inwards(i, moment)
-                moment = self.plus(moment, self.cross(self.arm[i], force))
+                force, moment = tree.inwards(i, force), tree.inwards(i, moment)
+                moment = V.plus(moment, V.cross(tree.arm[i], force))
                 i = p
                 projected = (moment if self.links[i].turns else force)[self.links[i].axis]
                 D[k][i] = D[i][k] = projected
@@ -405,32 +423,32 @@ class Recursion(Links):
 
     def kinetic_energy(self) -> Expr:
         """Return the kinetic energy of the tree, including that of its armatures (J)."""
-        rates = self.speed
-        spin = self.angular_velocities(rates)
+        V, tree = self.vectors, self.tree
+        rates = tree.speed
+        spin = tree.angular_velocities(rates)
         terms: list[Expr] = []
-        for k, v in enumerate(self.velocities(rates, spin)):
+        for k, v in enumerate(tree.velocities(rates, spin)):
             x, w = self.inertia[k], spin[k]
-            momentum = self.apply(x.tensor, w)
+            momentum = V.apply(x.tensor, w)
             terms += [
-                self.times(self.define(x.mass / 2), self.dot(v, v)),
-                self.dot(v, self.cross(w, x.moment)),
-                self.define(self.dot(w, momentum) / 2),
-                self.define(self.armature[k] * rates[k] ** 2 / 2),
+                V.times(V.define(x.mass / 2), V.dot(v, v)),
+                V.dot(v, V.cross(w, x.moment)),
+                V.define(V.dot(w, momentum) / 2),
+                V.define(self.armature[k] * rates[k] ** 2 / 2),
             ]
-        return self.add(*terms)
+        return V.add(*terms)
 
     def potential_energy(self) -> Expr:
         """Return the potential energy of the tree in gravity (J): -g . sum(mass times position)."""
+        V, tree = self.vectors, self.tree
         mass = [x.mass for x in self.inertia]
         moment = [x.moment for x in self.inertia]
         total = self.fixed_moment
         for k in reversed(range(self.n)):
-            moment_at_parent = self.plus(
-                self.inwards(k, moment[k]), self.scaled(self.arm[k], mass[k])
-            )
+            moment_at_parent = V.plus(tree.inwards(k, moment[k]), V.scaled(tree.arm[k], mass[k]))
             if (p := self.links[k].parent) >= 0:
-                mass[p] = self.add(mass[p], mass[k])
-                moment[p] = self.plus(moment[p], moment_at_parent)
+                mass[p] = V.add(mass[p], mass[k])
+                moment[p] = V.plus(moment[p], moment_at_parent)
             else:
-                total = self.plus(total, moment_at_parent)
-        return self.minus(self.dot(self.gravity, total))
+                total = V.plus(total, moment_at_parent)
+        return V.minus(V.dot(self.gravity, total))

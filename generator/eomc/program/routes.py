@@ -63,7 +63,7 @@ class RouteInputs:
 
 @dataclass(frozen=True)
 class RouteFunctions:
-    """RouteFunctions of the equations of motion by one route, as atoms of `tape`.
+    """Functions of the equations of motion by one route, as atoms of `tape`.
 
     A tape is a list of elementary operations, each with a named result. An atom is a number, a name
     on the tape, or a number times a name.
