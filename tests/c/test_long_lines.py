@@ -52,7 +52,7 @@ static double x[3], y[3]; /* %s */
 def test_a_long_comment_is_broken_and_goes_above_its_code() -> None:
     words = " ".join(["word"] * 25)
     first, rest = " ".join(["word"] * 19), " ".join(["word"] * 6)
-    lines = c_function.narrowed(COMMENTS % ((words,) * 5)).split("\n")
+    lines = c_function.break_comments(COMMENTS % ((words,) * 5)).split("\n")
     assert lines[:5] == [
         f"/* {first}", f" * {rest} */",
         f"/* {first}", f" * {rest} */", "static double x[3], y[3];",

@@ -487,7 +487,7 @@ def test_a_function_prints_itself() -> None:
 
 def test_long_lines_are_broken() -> None:
     call = "    *status = " + "long_name(" + ", ".join(f"argument_{k}" for k in range(12)) + ");"
-    text = c_function.laid_out(f"/* {'word ' * 30}*/\n{call}")
+    text = c_function.break_long_lines(f"/* {'word ' * 30}*/\n{call}")
     first, second, *rest = text.split("\n")
     assert len(rest) == 2 and all(len(line) <= 100 for line in text.split("\n"))
     assert f"{first} {second.removeprefix(' * ')}" == f"/* {'word ' * 30}*/"

@@ -67,7 +67,7 @@ def test_the_compiler_has_told_its_macros() -> None:
 def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
     accepted = {m for m in macros() if not names.fault(m)}
     assert len(accepted) > 1000
-    used = {m: c_names.in_c(m, "scene") for m in accepted}
+    used = {m: c_names.name_in_c(m, "scene") for m in accepted}
     assert {m for m, c in used.items() if c in macros()} == set()
     # and what is made of names
     made = ("sin_{}", "cos_{}", "{}_dot", "{}_ddot", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")

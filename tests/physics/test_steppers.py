@@ -71,7 +71,7 @@ def test_stability_ends_at_the_limits(method: Method) -> None:
 @pytest.mark.parametrize("method", METHODS.values(), ids=lambda m: m.name)
 def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> None:
     """Each a number of C's type, off by no more than all of them are if rounded one by one."""
-    found = coefficients.rounded(method.b, real)
+    found = coefficients.round_weights(method.b, real)
     kind = np.dtype(real.dtype).type
     assert [Fraction(float(kind(float(x)))) for x in found] == list(found)
     assert sum(found) == 1

@@ -13,7 +13,7 @@ from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target
-from eomc.emit.coefficients import matrix, numbers, rounded
+from eomc.emit.coefficients import literals, matrix_rows, round_weights
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import GAUSS16, Row
@@ -293,7 +293,7 @@ class AdaptiveBatchView:
     events: bool
 
 
-def memory(functions: SceneFunctions) -> str:
+def workspace_type(functions: SceneFunctions) -> str:
     """Return the name of the C struct for the workspace of a run with adaptive step-size control.
 
     The workspace keeps data between the calls that continue a run.
@@ -377,7 +377,7 @@ class AdaptiveFunctions:
     @property
     def workspace(self) -> CArgument:
         """The C argument for the workspace of a run, which keeps data between calls."""
-        return c.output_array(memory(self.functions), "memory")
+        return c.output_array(workspace_type(self.functions), "memory")
 
     @property
     def state(self) -> CArgument:
@@ -399,7 +399,9 @@ class AdaptiveFunctions:
         arguments = (*self.form.around, *self.functions.moves_stages, *limits, newton)
         results = (*measures, c.output_array("int", "sweeps"))
         cap = [c.input_array(real, "cap")] if self.may_rest else []
-        return c.static(f"{self.method}_solve_stages", "int", out, *arguments, *cap, *results)
+        return c.static_prototype(
+            f"{self.method}_solve_stages", "int", out, *arguments, *cap, *results
+        )
 
     @property
     def may_rest(self) -> bool:
@@ -422,14 +424,14 @@ class AdaptiveFunctions:
         values = (c.input_array(f"{self.method}_stages", "a"), c.input_array(real, "scale"))
         others = (*self.form.around, *self.functions.moves_stages)
         arguments = (c.output_array(real, "cap"), *values, *others, self.number("tol"))
-        return c.static(f"{self.method}_cap_scales", "int", *arguments)
+        return c.static_prototype(f"{self.method}_cap_scales", "int", *arguments)
 
     @cached_property
     def forces(self) -> CFunction:
         """The prototype of the function that computes the accelerations at a state."""
         out = c.output_array(self.functions.real, "f")
         arguments = (a for a in self.form.around if a.name != "h")
-        return c.static(f"{self.method}_forces", "int", out, *arguments)
+        return c.static_prototype(f"{self.method}_forces", "int", out, *arguments)
 
     @cached_property
     def slopes(self) -> CFunction:
@@ -438,7 +440,7 @@ class AdaptiveFunctions:
         They are derivatives of the accelerations with respect to q and qd.
         """
         out = c.output_array(f"{self.method}_newton", "m")
-        return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
+        return c.static_prototype(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
@@ -448,7 +450,7 @@ class AdaptiveFunctions:
         """
         arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
         status = self.functions.status
-        return c.static(
+        return c.static_prototype(
             f"{self.method}_adaptive_step", status, self.state, *arguments, self.workspace
         )
 
@@ -461,7 +463,9 @@ class AdaptiveFunctions:
         out = tuple(c.output_array(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.input_array(f"{self.method}_adaptive_state", "x")
         arguments = (state, self.number("z"), self.number("tol"), *self.constant_arguments)
-        return c.static(f"{self.method}_interpolate", "void", *out, *arguments, self.workspace)
+        return c.static_prototype(
+            f"{self.method}_interpolate", "void", *out, *arguments, self.workspace
+        )
 
     @property
     def step_arguments(self) -> Sequence[CArgument]:
@@ -479,7 +483,7 @@ class AdaptiveFunctions:
         Only scenes with events use it.
         """
         limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
-        return c.static(
+        return c.static_prototype(
             f"{self.method}_fixed",
             status,
             self.state,
@@ -498,10 +502,12 @@ class AdaptiveFunctions:
         if not self.functions.target.system.events:
             return self.interpolate
         own = self.interpolate.arguments[: -len(self.constant_arguments) - 1]
-        return c.static(f"{self.method}_at", "void", *own, *self.step_arguments, self.workspace)
+        return c.static_prototype(
+            f"{self.method}_at", "void", *own, *self.step_arguments, self.workspace
+        )
 
 
-def tableau(stepping: AdaptiveFunctions) -> dict[str, Any]:
+def adaptive_fields(stepping: AdaptiveFunctions) -> dict[str, Any]:
     """Return the variables, by name, that all templates of adaptive steps share.
 
     These are the coefficients of the integration method, tolerances and C names.
@@ -520,14 +526,14 @@ def tableau(stepping: AdaptiveFunctions) -> dict[str, Any]:
         "of_most": target.literal(SCALE_FLOOR if real.epsilon < 1e-10 else COARSE_SCALE_FLOOR),
         "of_most_coarse": target.literal(COARSE_SCALE_FLOOR),
         "most": MAX_ITERATIONS,
-        "c": numbers(m.c, real),
-        "powers": matrix(list(zip(*m.powers, strict=True)), real),
+        "c": literals(m.c, real),
+        "powers": matrix_rows(list(zip(*m.powers, strict=True)), real),
         "retry_after": RETRY_AFTER,
         "unscaled": len(target.system.modes) + len(target.system.discrete),
     }
 
 
-def steps(stepping: AdaptiveFunctions) -> AdaptiveStepView:
+def step_view(stepping: AdaptiveFunctions) -> AdaptiveStepView:
     """Return the data for the template of the C code that makes one adaptive step.
 
     The template also has the code that interpolates the state within the step.
@@ -537,15 +543,15 @@ def steps(stepping: AdaptiveFunctions) -> AdaptiveStepView:
     references = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
     references["m"] = "newton ? &m : 0"
     eigenvalues, to_parts, from_parts = m.eigen
-    last, b = [m.legendre(n) for n in range(m.stages - 4, m.stages)], rounded(m.b, real)
+    last, b = [m.legendre(n) for n in range(m.stages - 4, m.stages)], round_weights(m.b, real)
     return AdaptiveStepView(
-        **tableau(stepping),
+        **adaptive_fields(stepping),
         title=TITLE,
         fabs=f"fabs{real.function_suffix}",
         lanes=form.lanes and f"{form.lanes} ",
-        total=_total([f"half[{i}]" for i in range(m.stages // 2)]),
-        top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),
-        weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
+        total=_balanced_sum([f"half[{i}]" for i in range(m.stages // 2)]),
+        top=c.initialiser_rows(literals(row, real) for row in zip(*last, strict=True)),
+        weights=c.initialiser_rows(zip(literals(m.b_a, real), literals(b, real), strict=True)),
         timed=target.driven,
         may_rest=stepping.may_rest,
         capped=stepping.rounding_cap,
@@ -566,22 +572,22 @@ def steps(stepping: AdaptiveFunctions) -> AdaptiveStepView:
         longest=target.literal(MAX_TIME_SCALES),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(KINK_SHARE),
-        ends=c.in_braces(numbers(row, real) for row in _ends()),
+        ends=c.initialiser_rows(literals(row, real) for row in _end_weights()),
         forces=stepping.forces,
         forces_here=stepping.forces.call(f="here", q="at_q", qd="at_qd"),
         forces_near=stepping.forces.call(f="near", q="at_q", qd="at_qd"),
         slopes=stepping.slopes,
         slopes_now=stepping.slopes.call(m="&m"),
         nudge=target.literal(math.sqrt(real.epsilon)),
-        eigenvalues=c.in_braces(numbers(row, real) for row in eigenvalues),
-        to_parts=c.in_braces(numbers(row, real) for row in to_parts),
-        from_parts=c.in_braces(numbers(row, real) for row in from_parts),
+        eigenvalues=c.initialiser_rows(literals(row, real) for row in eigenvalues),
+        to_parts=c.initialiser_rows(literals(row, real) for row in to_parts),
+        from_parts=c.initialiser_rows(literals(row, real) for row in from_parts),
         forces_there=stepping.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
         solve_within=stepping.solve_stages.call(most=target.literal(1e30), cap="0", **references),
     )
 
 
-def fixed(stepping: AdaptiveFunctions) -> FixedStepsView:
+def fixed_steps_view(stepping: AdaptiveFunctions) -> FixedStepsView:
     """Return the data for the template of steps of fixed size in which events are detected."""
     functions = stepping.functions
     target, real = functions.target, functions.target.real
@@ -613,18 +619,18 @@ def max_events_per_step(system: System) -> int:
     return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
-def row_storage(stepping: AdaptiveFunctions) -> CFunction:
+def store_row_prototype(stepping: AdaptiveFunctions) -> CFunction:
     """Return the prototype of the C function that stores a state in a run's output arrays."""
     arguments = (c.output_array(stepping.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
     return CFunction(f"{stepping.method}_store_row", "void", tuple(arguments))
 
 
-def tightest(real: Real) -> float:
+def min_tolerance(real: Real) -> float:
     """Return the smallest error tolerance of adaptive steps that the type `real` permits."""
     return 1e-15 if real.epsilon < 1e-10 else 5e-7
 
 
-def run(
+def run_view(
     stepping: AdaptiveFunctions, happen: str = "", restart: str = "", initial_events: str = "",
     changed: str = "", values: str = "",
 ) -> AdaptiveRunView:  # fmt: skip
@@ -642,7 +648,7 @@ def run(
     functions, form = stepping.functions, stepping.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
-    store_row = row_storage(stepping)
+    store_row = store_row_prototype(stepping)
     row_arguments = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
     takes_p = "p" in {a.name for a in stepping.constant_arguments} or bool(
         form.compute_constants or happen or form.project
@@ -658,7 +664,7 @@ def run(
         unread_p=target.needs_p and not takes_p,
         compute_constants=form.compute_constants,
         loosest=target.literal(MAX_TOLERANCE),
-        tightest=target.literal(tightest(target.real)),
+        tightest=target.literal(min_tolerance(target.real)),
         events=bool(happen),
         f=target.real.suffix,
         eps=target.literal(target.real.epsilon),
@@ -698,7 +704,7 @@ def steps_in_parallel(target: Target) -> bool:
     )
 
 
-def call_for_instance(functions: SceneFunctions) -> str:
+def instance_call(functions: SceneFunctions) -> str:
     """Return the C call that continues the adaptive run of one instance of a batch.
 
     A batch is a number of instances of the system. The call is in a loop in which k is the index of
@@ -716,7 +722,7 @@ def call_for_instance(functions: SceneFunctions) -> str:
     )  # fmt: skip
 
 
-def batch(functions: SceneFunctions) -> AdaptiveBatchView:
+def batch_view(functions: SceneFunctions) -> AdaptiveBatchView:
     """Return the data for the template of the C function that makes a batch of adaptive runs.
 
     A batch is a number of instances of the system. The C code steps one instance after the other.
@@ -724,12 +730,12 @@ def batch(functions: SceneFunctions) -> AdaptiveBatchView:
     return AdaptiveBatchView(
         prefix=functions.prefix,
         batch=functions.public.adaptive_batch(METHOD.name),
-        alone=call_for_instance(functions),
+        alone=instance_call(functions),
         events=bool(functions.target.system.events),
     )
 
 
-def _ends() -> tuple[Row, Row]:
+def _end_weights() -> tuple[Row, Row]:
     """Return weights that extrapolate from the stages to the start and to the end of a step.
 
     They give the values there of the polynomial through the values at the stages.
@@ -740,10 +746,10 @@ def _ends() -> tuple[Row, Row]:
     return start, tuple(sum(column, Fraction(0)) for column in columns)
 
 
-def _total(terms: list[str]) -> str:
+def _balanced_sum(terms: list[str]) -> str:
     """Return the sum of terms as a balanced tree, which shortens the dependency chain."""
     half = len(terms) // 2
     if not half:
         return terms[0]
-    parts = (_total(terms[:half]), _total(terms[half:]))
+    parts = (_balanced_sum(terms[:half]), _balanced_sum(terms[half:]))
     return " + ".join(f"({part})" if " " in part else part for part in parts)

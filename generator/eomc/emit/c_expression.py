@@ -226,7 +226,7 @@ class Printer:
             c_name = f"{self.prefix}_{c_name}_{self.real.lane}"
         elif ours:
             c_name = f"{self.prefix}_{c_name}"
-        args = [self.in_lane(a) for a in value.args]
+        args = [self.vector_operand(a) for a in value.args]
         text = f"{c_name}({args[0]})" if len(args) == 1 else ""
         if ours:
             text = f"{c_name}({', '.join(args)})"
@@ -239,11 +239,11 @@ class Printer:
     def _sign(self, argument: Operand) -> str:
         """Return the text of the sign of an operand."""
         if self.real.lane:
-            return f"{self.prefix}_sign_{self.real.lane}({self.in_lane(argument)})"
+            return f"{self.prefix}_sign_{self.real.lane}({self.vector_operand(argument)})"
         x = self.operand(argument, 4)
         return f"({self.real.name})(({x} > 0) - ({x} < 0))"
 
-    def in_lane(self, o: Operand) -> str:
+    def vector_operand(self, o: Operand) -> str:
         """Return the C expression of an operand as a vector, if values are vectors.
 
         A number is then broadcast to a vector. Otherwise the text is that of `operand`.
@@ -377,7 +377,7 @@ def body(
     return CBody(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
-        results=tuple(printer.in_lane(o) for o in function.outputs),
+        results=tuple(printer.vector_operand(o) for o in function.outputs),
         failures=_failures(printer, function.checks, tolerance),
         sincos=sincos,
     )
@@ -527,11 +527,11 @@ def indent(lines: Iterable[str], width: int = 4) -> str:
 
     Long lines are broken after operators.
     """
-    all_lines = [line for text in lines for line in broken(text, 100 - width)]
+    all_lines = [line for text in lines for line in break_line(text, 100 - width)]
     return "\n".join((" " * width + line).rstrip() for line in all_lines)
 
 
-def broken(text: str, width: int = 100) -> Sequence[str]:
+def break_line(text: str, width: int = 100) -> Sequence[str]:
     """Return a C statement or prototype, broken into lines of at most `width` characters.
 
     A line is longer where it cannot be broken.

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from eomc.emit.c_expression import Block, broken
+from eomc.emit.c_expression import Block, break_line
 
 WIDTH = 100  # of a line
 
@@ -120,7 +120,7 @@ class CFunction:
         return f"{self.name}({', '.join(passed.get(a.name, a.name) for a in self.arguments)})"
 
 
-def static(name: str, result: str, *arguments: CArgument) -> CFunction:
+def static_prototype(name: str, result: str, *arguments: CArgument) -> CFunction:
     """Return the prototype of a static C function; a template contains its body.
 
     result: C type of the result.
@@ -172,12 +172,12 @@ def block_text(block: Block) -> str:
 # --- statements -----------------------------------------------------------------------------------
 
 
-def constant(type: str, name: str, value: str) -> str:
+def define_constant(type: str, name: str, value: str) -> str:
     """Return the C definition of a constant local variable: `const type name = value;`."""
     return f"const {type} {name} = {value};"
 
 
-def local(type: str, name: str) -> str:
+def declare(type: str, name: str) -> str:
     """Return the C declaration of a local variable: `type name;`."""
     return f"{type} {name};"
 
@@ -187,17 +187,17 @@ def assign(place: str, value: str) -> str:
     return f"{place} = {value};"
 
 
-def do(call: str) -> str:
+def call_statement(call: str) -> str:
     """Return a C call as a statement, with its semicolon."""
     return f"{call};"
 
 
-def result(value: str) -> str:
+def return_statement(value: str) -> str:
     """Return a C return statement."""
     return f"return {value};"
 
 
-def note(conditions: Iterable[str]) -> tuple[str, ...]:
+def record_failures(conditions: Iterable[str]) -> tuple[str, ...]:
     """Return C statements that record failures in the variable `failed`, a bit mask.
 
     Each statement combines `failed` with one of the conditions by "or".
@@ -205,7 +205,7 @@ def note(conditions: Iterable[str]) -> tuple[str, ...]:
     return tuple(f"failed |= {text};" for text in conditions)
 
 
-def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
+def return_if(conditions: Iterable[str], value: str) -> tuple[str, ...]:
     """Return the lines of a C statement that returns `value` if one of the conditions holds.
 
     Returns no lines if there are no conditions.
@@ -214,7 +214,7 @@ def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
     return (f"if ({text})", f"    return {value};") if text else ()
 
 
-def otherwise_signal(array: str, call: str) -> tuple[str, ...]:
+def signal_if_null(array: str, call: str) -> tuple[str, ...]:
     """Return the lines of a C statement that computes the inputs u if u is NULL.
 
     The scene's signals (functions of time and state) define the inputs. `call` is a C call that
@@ -223,7 +223,7 @@ def otherwise_signal(array: str, call: str) -> tuple[str, ...]:
     return ("if (!u) {", f"    {call};", f"    u = {array};", "}")
 
 
-def listed(type: str, name: str, extent: str, values: Sequence[str]) -> str:
+def define_array(type: str, name: str, extent: str, values: Sequence[str]) -> str:
     """Return the C definition of a constant array with the given elements.
 
     type: C type of an element. extent: size of the array as C text.
@@ -241,7 +241,7 @@ def cast(type: str, name: str) -> str:
     return f"(const {type} *){name}"
 
 
-def struct(type: str, real: str, members: Sequence[str]) -> str:
+def define_struct(type: str, real: str, members: Sequence[str]) -> str:
     """Return the C definition of a struct called `type`.
 
     real: C type of all members. members: their declarators, such as "x" or "x[3]".
@@ -249,7 +249,7 @@ def struct(type: str, real: str, members: Sequence[str]) -> str:
     return f"typedef struct {{\n    {real} {', '.join(members)};\n}} {type};"
 
 
-def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
+def copy_loop(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
     """Return the lines of a C loop that copies `count` elements of `array` to the array `to`.
 
     The first copied element is `array[first]`; it becomes `to[0]`.
@@ -258,12 +258,12 @@ def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
     return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{index}];")
 
 
-def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:
+def initialiser_rows(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:
     """Return the rows of a matrix as lines of a C initialiser, such as "{ 1.0, 2.0 },"."""
     return tuple("{ " + ", ".join(row) + " }," for row in rows)
 
 
-def narrowed(text: str) -> str:
+def break_comments(text: str) -> str:
     """Return the text of a C file with its comments broken to lines of at most WIDTH characters.
 
     A long comment behind code is moved above the code if possible.
@@ -309,13 +309,13 @@ def _split_comment(line: str) -> tuple[str, str]:
     )
 
 
-def laid_out(text: str) -> str:
+def break_long_lines(text: str) -> str:
     """Return the text of a C file with long lines broken to at most WIDTH characters.
 
     Comments and statements are broken; preprocessor directives are not.
     """
     result_lines: list[str] = []
-    for line in narrowed(text).split("\n"):
+    for line in break_comments(text).split("\n"):
         inside = line.lstrip(" ")
         if len(line) <= WIDTH or inside.startswith(("* ", "/*", "#")) or line.endswith("*/"):
             result_lines.append(line)
@@ -324,8 +324,8 @@ def laid_out(text: str) -> str:
         head, parenthesis, rest = inside.partition("(")
         if parenthesis and ", " not in inside[: WIDTH - width] and len(head) < WIDTH - width:
             result_lines.append(" " * width + head + parenthesis)
-            parts = [" " * 4 + part.lstrip() for part in broken(rest, WIDTH - width - 4)]
+            parts = [" " * 4 + part.lstrip() for part in break_line(rest, WIDTH - width - 4)]
         else:
-            parts = list(broken(inside, WIDTH - width))
+            parts = list(break_line(inside, WIDTH - width))
         result_lines += [" " * width + part.rstrip() for part in parts]
     return "\n".join(result_lines)

@@ -33,7 +33,7 @@ RESERVED_NAMES = frozenset(
 )
 # Macros and enumerators of the templates and csrc, without the scene's prefix. A coordinate or
 # input with such a name is renamed in C.
-OWN = frozenset(
+OWN_MACROS = frozenset(
     "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NE_ROOM NF "
     "NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS "
     "TOO_LONG TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
@@ -53,7 +53,7 @@ class Target:
     real: Real
     written: Mapping[str, str] = field(default_factory=dict)
 
-    def as_written(self, name: str) -> str:
+    def scene_name(self, name: str) -> str:
         """Return the scene's name for a coordinate, parameter or input.
 
         `name` is its C name, which may have "_" appended.
@@ -82,7 +82,7 @@ class Target:
         The keys are names of coordinates and inputs, and `OUT_`, `EVENT_`, `CONSTRAINT_` or
         `FRAME_` with the name of another item.
         """
-        reserved = {f"{self.PREFIX}_{w}" for w in OWN}
+        reserved = {f"{self.PREFIX}_{w}" for w in OWN_MACROS}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
         outputs += [f"EVENT_{e.name}" for e in self.system.events]
@@ -183,7 +183,7 @@ class Target:
         s = self.system
         expressions = {x.name: c_function.member("p", x.name) for x in s.parameters}
         locals_ = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.reads_qdd else ()), *s.u)]
-        return expressions | {n: local(n) for n in locals_}
+        return expressions | {n: local_name(n) for n in locals_}
 
     def body(
         self,
@@ -225,7 +225,7 @@ class Target:
         read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
         read += [(name + ALONG, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
         return [
-            c_function.constant(real, local(name), element)
+            c_function.define_constant(real, local_name(name), element)
             for name, element in read
             if name in uses
         ]
@@ -268,12 +268,12 @@ def rename_reserved(function: Function) -> Function:
     return rename(function, clash) if clash else function
 
 
-def local(name: str) -> str:
+def local_name(name: str) -> str:
     """Return the C name of the local variable for a coordinate, velocity or input `name`."""
     return name + "_" if name in RESERVED_NAMES else name
 
 
-def sentence(function: Function) -> str:
+def cost_sentence(function: Function) -> str:
     """Return a sentence for comments that states the operation counts of a call of a function."""
     cost = str(function.cost)
     return cost[0].upper() + cost[1:] + "."
@@ -298,15 +298,15 @@ def _unique(preferred: Iterable[str], reserved: set[str]) -> list[str]:
 
 
 # Most macros have three capitals and no small letter. The others of glibc and Python follow.
-_SHOUTED = re.compile(r"[^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*")
-_OTHERS = re.compile(
+_UPPER_CASE = re.compile(r"[^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*")
+_OTHER_MACROS = re.compile(
     r"M_(\d_)?(E|PI|SQRT|LN|LOG)\w*|Py\w*|(PRI|SCN)[bdioux]\w*|L_(ctermid|cuserid|tmpnam)|P_tmpdir|"
     r"errno|math_errhandling|std(in|out|err)|st_[acm]time|sched_priority|static_assert|complex|"
     r"imaginary|I|noreturn|true|false|s[ai]_\w+|linux|unix|near|far|small|interface|"
     r"B(0|[1-9]\d{1,6})|(BS|FF|NL|VT)[01]|CR[0-3]|CS[5-8]"  # <termios.h>
 )
 # Prefixes of macros, with which an enumerator of a scene could coincide
-_FAMILY = re.compile(
+_MACRO_FAMILIES = re.compile(
     "(?:ADJ|AIO|ALIGNOF|ATOMIC|BC|CHAR|CHARCLASS|CLOCKS?|CLONE|CLOSE|COLL|CPU|DBL|DELAYTIMER|ENABLE|"
     "EXIT|EXPR|FD|FE|FILENAME|FLT|FOPEN|FP|FV[CS]|HAVE|HUGE|IOV|ITIMER|LC|LDBL|MATH|MAX|MB|METH|MOD|"
     r"MQ|NGROUPS|NL|PIPE|PTHREAD|PY\w*|RAND|RE|RENAME|RTSIG|SCHED|SEEK|SEM|SIG|SIZEOF|STA|STATX|"
@@ -317,12 +317,12 @@ _FAMILY = re.compile(
     r"[FRWX]_OK|F_T?LOCK|F_TEST|F_ULOCK|L_(?:SET|INCR|XTND)|S_I[A-Z]{3,}|S_BLKSIZE|"
     r"M_(?:\d_)?(?:E|PI|SQRT|LN|LOG)\w*"
 )
-_CALLED = frozenset(name + suffix for name in MATHEMATICS for suffix in ("f", "l", "q"))
+_MATH_FUNCTIONS = frozenset(name + suffix for name in MATHEMATICS for suffix in ("f", "l", "q"))
 
 
 def may_be_macro(name: str) -> bool:
     """Return True if a header of the C library or of Python may define a macro with this name."""
-    return bool(_SHOUTED.fullmatch(name) or _OTHERS.fullmatch(name))
+    return bool(_UPPER_CASE.fullmatch(name) or _OTHER_MACROS.fullmatch(name))
 
 
 def may_be_enumerator_of_others(name: str) -> bool:
@@ -331,17 +331,17 @@ def may_be_enumerator_of_others(name: str) -> bool:
     The headers are those of the C library and of Python. name: the enumerator, which begins with
     the scene's name.
     """
-    return not name.endswith("_") and bool(_FAMILY.fullmatch(name))
+    return not name.endswith("_") and bool(_MACRO_FAMILIES.fullmatch(name))
 
 
-def in_c(name: str, prefix: str) -> str:
+def name_in_c(name: str, prefix: str) -> str:
     """Return the C name for the name of a coordinate, parameter or input of the scene.
 
     It is the same name, with "_" appended if C cannot use it. prefix: the scene's name, with which
     other C names begin.
     """
     ours = name.lower().startswith(prefix.lower() + "_")
-    return name + "_" if ours or may_be_macro(name) or name in _CALLED else name
+    return name + "_" if ours or may_be_macro(name) or name in _MATH_FUNCTIONS else name
 
 
 def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
@@ -353,12 +353,12 @@ def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
     system = program.system
     declared = [c.name for c in system.coordinates]
     declared += [p.name for p in system.parameters] + [i.name for i in system.inputs]
-    c_names = {name: in_c(name, system.name) for name in declared}
+    c_names = {name: name_in_c(name, system.name) for name in declared}
     renamed_to = {name: c_name for name, c_name in c_names.items() if c_name != name}
     new = dict(_derived(renamed_to))
     for function in program.functions.values():
         for a in (*function.early, *function.body):
-            if (c_name := in_c(a.name, system.name)) != a.name:
+            if (c_name := name_in_c(a.name, system.name)) != a.name:
                 new.setdefault(a.name, c_name)
     if not new:
         return program, {}

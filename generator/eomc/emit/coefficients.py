@@ -41,7 +41,7 @@ def _nearest(x: Fraction, real: Real) -> Fraction:
     return Fraction(*struct.unpack(form, struct.pack(form, float(x))))
 
 
-def rounded(weights: Row, real: Real) -> Row:
+def round_weights(weights: Row, real: Real) -> Row:
     """Return the weights of a method rounded to the type `real` such that their sum stays exact.
 
     An error of the sum would accumulate over steps. It is therefore corrected in the smallest
@@ -60,18 +60,18 @@ def rounded(weights: Row, real: Real) -> Row:
     return tuple(values)
 
 
-def numbers(row: Row, real: Real) -> tuple[str, ...]:
+def literals(row: Row, real: Real) -> tuple[str, ...]:
     """Return each coefficient of a row as a C literal of the type `real`."""
     return tuple(literal(x, real) for x in row)
 
 
-def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
+def matrix_rows(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
     """Return the lines of a C initialiser for a square matrix, one line for each row.
 
     Rows shorter than the matrix are padded with zeros.
     """
     padded = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
-    return c_function.in_braces(numbers(row, real) for row in padded)
+    return c_function.initialiser_rows(literals(row, real) for row in padded)
 
 
 def tableau(m: Method, real: Real) -> dict[str, Any]:
@@ -80,9 +80,9 @@ def tableau(m: Method, real: Real) -> dict[str, Any]:
     real: the C type of the literals.
     """
     return {
-        "c": numbers(m.c, real),
-        "A": matrix(m.a, real),
-        "AA": matrix(m.a_squared, real),
-        "b": numbers(rounded(m.b, real), real),
-        "bA": numbers(m.b_a, real),
+        "c": literals(m.c, real),
+        "A": matrix_rows(m.a, real),
+        "AA": matrix_rows(m.a_squared, real),
+        "b": literals(round_weights(m.b, real), real),
+        "bA": literals(m.b_a, real),
     }

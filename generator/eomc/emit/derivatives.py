@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction, GeneratedFunction
-from eomc.emit.c_names import sentence
+from eomc.emit.c_names import cost_sentence
 from eomc.emit.coefficients import TableauFields, tableau
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.projection import ZERO_SQUARE, near
@@ -130,7 +130,7 @@ def linearization(plain: SceneFunctions) -> LinearizationView | None:
         return None
     NQ, inputs = plain.NQ, bool(target.system.inputs)
     width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
-    cost, doc = sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
+    cost, doc = cost_sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
     if "linearization" in target.program:
         slopes = plain.static(function, "slopes", "slopes", doc, fails=True)
     else:
@@ -175,7 +175,7 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
     inputs, suffix = bool(target.system.inputs), real.function_suffix
     state = plain.arguments("q", "qd", *plain.state[2:], "u", "p")
     J = c.output_array(plain.real, "J")
-    rates = c.static(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
+    rates = c.static_prototype(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
     feedback = ""
     if "signal_slopes" in target.program:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
@@ -227,4 +227,6 @@ def _moved(plain: SceneFunctions) -> CFunction:
         plain.argument("q"),
         *plain.arguments(*(n for n in ("t", "p") if n in arguments_read)),
     )
-    return c.static(f"{plain.prefix}_derivative_projected", plain.status, *state, *other_arguments)
+    return c.static_prototype(
+        f"{plain.prefix}_derivative_projected", plain.status, *state, *other_arguments
+    )

@@ -16,8 +16,8 @@ from eomc.emit.views import stamp
 from eomc.integrators.tableaux import METHODS
 from eomc.program.ir import Cost
 
-ROWS = 200  # approximate number of rows that main.c prints
-LINE = 88  # width of the column names there
+MAIN_ROWS = 200  # approximate number of rows that main.c prints
+COLUMNS_WIDTH = 88  # width of the column names there
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def main(target: Target) -> MainView:
     """
     s, public = target.system, Public(target)
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
-    names = [target.as_written(c.name) for c in s.coordinates]
+    names = [target.scene_name(c.name) for c in s.coordinates]
     method, output_names = s.run.methods[0], [o.name for o in s.outputs]
     columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *output_names, "energy"))
     outputs = public.evaluation("outputs").call(u="NULL") if output_names else ""
@@ -167,14 +167,14 @@ def main(target: Target) -> MainView:
         has_p=target.needs_p,
         method=method,
         adaptive=s.run.tolerance is not None,
-        rows=ROWS,
+        rows=MAIN_ROWS,
         t_end=target.literal(s.run.duration),
         tolerance=target.literal(s.run.tolerance or 0.0),
         events=bool(s.events),
         h=target.literal(s.run.h),
         steps=steps,
-        every=max(1, steps // ROWS),
-        columns=tuple(line.replace(" ", "") for line in textwrap.wrap(columns, LINE)),
+        every=max(1, steps // MAIN_ROWS),
+        columns=tuple(line.replace(" ", "") for line in textwrap.wrap(columns, COLUMNS_WIDTH)),
         run=run,
         energy=public.evaluation("energy").call(),
         outputs=outputs,
@@ -203,12 +203,14 @@ def costs(target: Target) -> CostsView:
     functions = tuple(
         FunctionCost(f.name, f.cost) for name in names if (f := program_function(target, name))
     )
-    steps = tuple(StepCost(f"{name}_step", _step(name)) for name in target.system.run.methods)
+    steps = tuple(
+        StepCost(f"{name}_step", _cost_of_step(name)) for name in target.system.run.methods
+    )
     width = max(map(len, [*(f.name for f in functions), *(m.name for m in steps)]))
     return CostsView(tuple(stamp(target)), target.prefix, width, functions, steps)
 
 
-def _step(name: str) -> str:
+def _cost_of_step(name: str) -> str:
     """Return a text that tells how many accelerations one step of the method `name` computes."""
     m = METHODS[name]
     if m.implicit:

@@ -18,13 +18,13 @@ from eomc.emit.adaptive import (
     AdaptiveStepView,
     FixedStepsView,
     SweepInterface,
-    fixed,
+    fixed_steps_view,
     max_events_per_step,
-    run,
-    steps,
+    run_view,
+    step_view,
 )
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.coefficients import matrix, numbers
+from eomc.emit.coefficients import literals, matrix_rows
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import Row
@@ -175,7 +175,7 @@ class InitialEventsView(NameFields):
     method: str
 
 
-def views(
+def adaptive_views(
     functions: SceneFunctions, form: SweepInterface
 ) -> Iterator[AdaptiveStepView | FixedStepsView | EventsView | InitialEventsView | AdaptiveRunView]:
     """Yield the data for the templates of adaptive steps, events and runs, in their order in the C
@@ -185,17 +185,17 @@ def views(
     templates of adaptive steps and runs.
     """
     stepping = AdaptiveFunctions(functions, form)
-    yield steps(stepping)
+    yield step_view(stepping)
     if not functions.target.system.events:
-        yield run(stepping)
+        yield run_view(stepping)
         return
-    yield fixed(stepping)
-    event_view = _events(stepping)
+    yield fixed_steps_view(stepping)
+    event_view = _event_view(stepping)
     yield event_view
     arguments = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
     again = arguments | {"reached": "reached"}
     start_view = (
-        _start_events(stepping, event_view.restart)
+        _initial_event_view(stepping, event_view.restart)
         if "begins" in functions.target.program
         else None
     )
@@ -205,7 +205,7 @@ def views(
     end_state = {"events": "x.last_values", "t": "x.t", "q": "x.q", "qd": "x.qd"}
     values = functions.public.evaluation("events").call(**end_state)
     changed = event_view.changed.call(x="&x")
-    yield run(
+    yield run_view(
         stepping,
         event_view.event_step.call(**arguments),
         event_view.restart.call(**again),
@@ -215,7 +215,7 @@ def views(
     )
 
 
-def _start_events(stepping: AdaptiveFunctions, restart: CFunction) -> InitialEventsView:
+def _initial_event_view(stepping: AdaptiveFunctions, restart: CFunction) -> InitialEventsView:
     """Return the data for the template of events that trigger at the start of a motion.
 
     restart: the C function that continues the run after an event.
@@ -231,14 +231,16 @@ def _start_events(stepping: AdaptiveFunctions, restart: CFunction) -> InitialEve
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
     return InitialEventsView(
         **functions.names,
-        function=c.static(f"{stepping.method}_initial_events", functions.status, *arguments),
+        function=c.static_prototype(
+            f"{stepping.method}_initial_events", functions.status, *arguments
+        ),
         values=values.call(begins="value", **state),
         method=stepping.method,
         restart=restart.call(reached=state["t"]),
     )  # fmt: skip
 
 
-def _events(stepping: AdaptiveFunctions) -> EventsView:
+def _event_view(stepping: AdaptiveFunctions) -> EventsView:
     """Return the data for the template of event detection."""
     functions, method = stepping.functions, stepping.method
     target, real, public = functions.target, functions.real, functions.public
@@ -252,23 +254,23 @@ def _events(stepping: AdaptiveFunctions) -> EventsView:
     extra = [a for a in functions.arguments("u", "p") if a.name in argument_names]
 
     values_at = (c.output_array(real, "g"), read, number("z"), *extra)
-    evaluate_events = c.static(f"{method}_evaluate_events", "void", *values_at)
+    evaluate_events = c.static_prototype(f"{method}_evaluate_events", "void", *values_at)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
-    refine_root = c.static(f"{method}_refine_root", real, read, k, *ends, *extra)
+    refine_root = c.static_prototype(f"{method}_refine_root", real, read, k, *ends, *extra)
     above = tuple(int(e.above) for e in system.events if "begins" in target.program)
-    find_root = c.static(
+    find_root = c.static_prototype(
         f"{method}_find_root", real, stepping.state, k, number("from"), c.input_array(real, "g"),
         *([number("noise")] if above else []), *extra,
     )  # fmt: skip
     outputs = [c.output_array(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
     rest = (number("tol"), *stepping.step_arguments, *record, stepping.workspace)
-    event_step = c.static(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
-    changed = c.static(f"{method}_events_changed", "int", stepping.state, *extra)
+    event_step = c.static_prototype(f"{method}_event_step", "int", stepping.state, *outputs, *rest)
+    changed = c.static_prototype(f"{method}_events_changed", "int", stepping.state, *extra)
     calls = [*evaluated, *([public.project] if stepping.form.project else ())]
     taken_by_calls = {a.name for f in calls for a in f.arguments}
     after_event = [a for a in functions.arguments("u", "p") if a.name in taken_by_calls]
-    restart = c.static(
+    restart = c.static_prototype(
         f"{method}_restart", functions.status, stepping.state, number("reached"), *outputs[1:],
         *(after_event if jumps else ()), *([stepping.workspace] if jumps else []),
     )  # fmt: skip
@@ -314,8 +316,8 @@ def _events(stepping: AdaptiveFunctions) -> EventsView:
         jump=evaluated[-1].call(**reached) if jumps else "",
         project=public.project.call(fixed="set[k]", **reached) if stepping.form.project else "",
         project_all=public.project.call(fixed="0", **reached) if stepping.form.project else "",
-        set=_set(system) if stepping.form.project and jumps else (),
-        modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
+        set=_jump_flags(system) if stepping.form.project and jumps else (),
+        modes=c.initialiser_rows([str(m.at), str(m.of)] for m in system.modes),
         own=len(system.own_events),
         values_after=values.call(events="value", **reached),
     )
@@ -329,44 +331,50 @@ def _rounding(stepping: AdaptiveFunctions, extra: Sequence[CArgument]) -> dict[s
     arguments besides the state.
     """
     read, k = c.input_array(f"{stepping.method}_adaptive_state", "x"), CArgument("int", "k")
-    function = c.static(f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra)
+    function = c.static_prototype(
+        f"{stepping.method}_rounding", stepping.functions.real, read, k, *extra
+    )
     state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
     values = stepping.functions.public.evaluation("events").call(events="value", **state)
     return {"rounding": function, "rounded": function.call(), "values_near": values}
 
 
-def _set(system: System) -> tuple[str, ...]:
+def _jump_flags(system: System) -> tuple[str, ...]:
     """Return, for each event of the scene, flags in braces: which entries of [q, qd] its jump
     sets.
     """
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
     rows = ({name for name, _ in e.jump} for e in system.own_events)
-    return c.in_braces([str(int(name in names)) for name in states] for names in rows)
+    return c.initialiser_rows([str(int(name in names)) for name in states] for names in rows)
 
 
 def _tables(functions: SceneFunctions) -> dict[str, Any]:
     """Return template variables: nodes for event functions, and weights for their values there."""
     target = functions.target
-    x, real = nodes(), target.real
+    x, real = chebyshev_nodes(), target.real
     return {
         **functions.names,
         "eps": target.literal(real.epsilon),
         "tiny": target.literal(1e-30),
         "samples": SAMPLES,
-        "nodes": numbers(x, real),
-        "slopes": matrix(slopes(x), real),
+        "nodes": literals(x, real),
+        "slopes": matrix_rows(differentiation_matrix(x), real),
         "huge": target.literal(1e30),
         "halvings": MAX_EVENT_HALVINGS,
         "recent_steps": RECENT_STEPS,
         "max_tail": target.literal(MAX_TAIL),
-        "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
+        "last": c.initialiser_rows(literals(row, real) for row in chebyshev_tail_weights(SAMPLES)),
         "stages": METHOD.stages,
-        "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),
-        "twice": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 2)),
+        "once": c.initialiser_rows(
+            literals(row, real) for row in power_integrals(x, METHOD.stages, 1)
+        ),
+        "twice": c.initialiser_rows(
+            literals(row, real) for row in power_integrals(x, METHOD.stages, 2)
+        ),
     }
 
 
-def nodes() -> Row:
+def chebyshev_nodes() -> Row:
     """Return the fractions of a step, from 0 to 1, at which event functions are evaluated.
 
     They are the extrema of a Chebyshev polynomial and include both ends.
@@ -376,7 +384,7 @@ def nodes() -> Row:
                  for j in range(SAMPLES))  # fmt: skip
 
 
-def slopes(x: Row) -> Sequence[Row]:
+def differentiation_matrix(x: Row) -> Sequence[Row]:
     """Return the differentiation matrix of polynomial interpolation at the points x.
 
     The matrix maps a function's values at these points to the derivatives of the interpolating
@@ -392,7 +400,7 @@ def slopes(x: Row) -> Sequence[Row]:
     return tuple(map(tuple, rows))
 
 
-def last(count: int) -> Sequence[Row]:
+def chebyshev_tail_weights(count: int) -> Sequence[Row]:
     """Return two rows of weights that yield the last two Chebyshev coefficients of a function.
 
     Each coefficient is the weighted sum of the function's values at `count` points, the extrema of
@@ -410,7 +418,7 @@ def last(count: int) -> Sequence[Row]:
     )  # fmt: skip
 
 
-def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
+def power_integrals(x: Row, count: int, times: int) -> Sequence[Row]:
     """Return the integrals of the powers (2 c - 1)^n over c, from 0 to each x.
 
     The result has a row for each x and a column for each power n < `count`. With `times` = 2, it

@@ -13,7 +13,7 @@ from typing import Any
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import REALS, Block, CBody, Real, group_angles
 from eomc.emit.c_function import CArgument, CFunction, GeneratedFunction
-from eomc.emit.c_names import Target, rename_reserved, sentence
+from eomc.emit.c_names import Target, cost_sentence, rename_reserved
 from eomc.emit.public import KINDS, Public, c_array_size, doc, program_function, refuses
 from eomc.integrators.tableaux import METHODS
 from eomc.program import outline
@@ -181,8 +181,8 @@ class SceneFunctions:
         """
         if self.signal is None or not self.reads_u(function):
             return ()
-        lines = c.otherwise_signal("now", self.signal.call(u="now"))
-        return (Block("", (c.local(self.real, f"now[{self.NU}]"),)), Block("", lines))
+        lines = c.signal_if_null("now", self.signal.call(u="now"))
+        return (Block("", (c.declare(self.real, f"now[{self.NU}]"),)), Block("", lines))
 
     def reads_u(self, function: Function) -> bool:
         """Return True if a function of the program reads inputs (elements of u)."""
@@ -219,7 +219,7 @@ class SceneFunctions:
         """
         body = self.target.body(function, together=self.groups_angles(function))
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
-        last = Block("", ends if out else (c.result(body.results[0]),))
+        last = Block("", ends if out else (c.return_statement(body.results[0]),))
         return (*self.statements(function, body), last), body
 
     def statements(self, function: Function, body: CBody) -> tuple[Block, ...]:
@@ -255,10 +255,10 @@ class SceneFunctions:
                 f, {n: shared[n] for n in part.reads}, stored={n: shared[n] for n in part.keeps},
                 pivots=len(function.checks), together=self.groups_angles(function),
             )  # fmt: skip
-            failures = c.unless(body.failures, self.singular)
+            failures = c.return_if(body.failures, self.singular)
             results = zip(part.outputs, body.results, strict=True)
             ends = (*(c.assign(f"{out}[{place}]", x) for place, x in results), *failures)
-            ends += (c.result(self.ok),) if failures else ()
+            ends += (c.return_statement(self.ok),) if failures else ()
             piece = CFunction(
                 P,
                 self.status if failures else "void",
@@ -274,9 +274,9 @@ class SceneFunctions:
             )
             pieces.append(piece)
             call = piece.call(s="&s")
-            calls += c.unless([call], self.singular) if failures else [c.do(call)]
-        values = c.struct(type, self.real, list(shared)) if shared else ""
-        locals_ = Block("", (c.local(type, "s"),) if shared else ())
+            calls += c.return_if([call], self.singular) if failures else [c.call_statement(call)]
+        values = c.define_struct(type, self.real, list(shared)) if shared else ""
+        locals_ = Block("", (c.declare(type, "s"),) if shared else ())
         return values, tuple(pieces), (locals_, Block("", tuple(calls)))
 
     # functions
@@ -296,7 +296,7 @@ class SceneFunctions:
         kind, target = KINDS[name], self.target
         function = program_function(target, name)
         assert function is not None
-        cost = sentence(function)
+        cost = cost_sentence(function)
         by_columns = name not in target.program
         paragraphs = [doc(target, name)]
         if kind.takes_u and target.system.inputs:
@@ -313,19 +313,21 @@ class SceneFunctions:
             return summed
         if outline.is_large(function):
             out = kind.out or ("power" if name == "power" else "energy")
-            size, last = "1", Block("", (c.result(f"{out}[0]"),))
+            size, last = "1", Block("", (c.return_statement(f"{out}[0]"),))
             if refuses(target, name):
                 out, size, last = "a", c_array_size(target, kind.shape), self._status_block(name)
             values, parts, calls = self.outlined(function, name, out, READ)
             if out != kind.out:
-                declarations = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
+                declarations = Block("", (c.declare(self.real, f"{out}[{size}]"), *calls[0].lines))
                 calls = (declarations, calls[1], last)
             body = (*self.signals(function), *calls)
             return GeneratedFunction(replace(public, body=body), parts, values)
         (*blocks, last), statements_ = self.straight_line_body(function, kind.out)
         if refuses(target, name):
-            array = c.listed(self.real, "a", c_array_size(target, kind.shape), statements_.results)
-            blocks.append(Block("", (array, *c.unless(statements_.failures, self.singular))))
+            array = c.define_array(
+                self.real, "a", c_array_size(target, kind.shape), statements_.results
+            )
+            blocks.append(Block("", (array, *c.return_if(statements_.failures, self.singular))))
             last = self._status_block(name)
         return GeneratedFunction(replace(public, body=(*self.signals(function), *blocks, last)))
 
@@ -336,9 +338,14 @@ class SceneFunctions:
         """
         size = c_array_size(self.target, KINDS[name].shape)
         unfinite = [f"!{self.prefix}_finite(a, {size})"] if KINDS[name].refuses else []
-        finite_check = c.unless(unfinite, f"{self.PREFIX}_NOT_FINITE")
+        finite_check = c.return_if(unfinite, f"{self.PREFIX}_NOT_FINITE")
         return Block(
-            "", (*finite_check, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok))
+            "",
+            (
+                *finite_check,
+                *c.copy_loop(KINDS[name].out, "a", 0, size),
+                c.return_statement(self.ok),
+            ),
         )
 
     def _sum_of_energies(self, energy: CFunction) -> GeneratedFunction | None:
@@ -351,7 +358,7 @@ class SceneFunctions:
         read = frozenset(a.name for part in parts for a in part.arguments)
         if not read <= {a.name for a in energy.arguments}:
             return None
-        body = (Block("", (c.result(" + ".join(part.call() for part in parts)),)),)
+        body = (Block("", (c.return_statement(" + ".join(part.call() for part in parts)),)),)
         return GeneratedFunction(replace(energy, body=body, reads=read, doc=energy.doc[:1]))
 
     def _by_columns(self, public: CFunction, function: Function, name: str) -> GeneratedFunction:
@@ -361,7 +368,7 @@ class SceneFunctions:
         computes.
         """
         kind = KINDS[name]
-        doc = f"{kind.out} times along. {sentence(function)}"
+        doc = f"{kind.out} times along. {cost_sentence(function)}"
         column = self.static(function, f"{name}_column", "column", doc)
         parts, call = (*column.parts, column.function), column.function.call()
         return GeneratedFunction(public, parts, column.values, call, kind.out, kind.symmetric)
@@ -381,9 +388,9 @@ class SceneFunctions:
             values, parts, blocks = self.outlined(function, name, out, ("along", *READ))
         else:
             blocks, body = self.straight_line_body(function, out)
-            failures = c.unless(body.failures, self.singular)
+            failures = c.return_if(body.failures, self.singular)
         if fails:
-            blocks += (Block("", (*failures, c.result(self.ok))),)
+            blocks += (Block("", (*failures, c.return_statement(self.ok))),)
         along = (c.input_array(self.real, "along"),) if out == "column" else ()
         function_ = CFunction(
             f"{self.prefix}_{name}",
@@ -405,7 +412,7 @@ class SceneFunctions:
         function = self.target.program.functions.get("projection")
         if function is None:
             return None
-        return self.static(function, "projection", "d", sentence(function), fails=True)
+        return self.static(function, "projection", "d", cost_sentence(function), fails=True)
 
     @cached_property
     def rotation_errors(self) -> GeneratedFunction | None:
@@ -431,7 +438,7 @@ class SceneFunctions:
             return None
         read = [a for a in self.rotation_errors.function.arguments if a.name != "errors"]
         out = (c.output_array(self.real, "residual"), c.output_array(self.real, "A"))
-        return c.static(f"{self.prefix}_rotated", "void", *out, *read)
+        return c.static_prototype(f"{self.prefix}_rotated", "void", *out, *read)
 
     @cached_property
     def rate_terms(self) -> GeneratedFunction | None:
@@ -456,7 +463,7 @@ class SceneFunctions:
         function = self.target.program.functions.get("projection_along")
         if function is None:
             return None
-        doc = f"The same, and its derivatives along `along`. {sentence(function)}"
+        doc = f"The same, and its derivatives along `along`. {cost_sentence(function)}"
         return self.static(function, "projection_along", "column", doc, fails=True)
 
     @cached_property
@@ -467,7 +474,7 @@ class SceneFunctions:
         """
         moved, more = self._projection_arguments
         q, far = self.argument("q"), CArgument("int *", "singular")
-        return c.static(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
+        return c.static_prototype(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
 
     @cached_property
     def project_stage(self) -> CFunction:
@@ -477,7 +484,7 @@ class SceneFunctions:
         template.
         """
         moved, more = self._projection_arguments
-        return c.static(f"{self.prefix}_onto", "int", *moved, *more)
+        return c.static_prototype(f"{self.prefix}_onto", "int", *moved, *more)
 
     @property
     def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
@@ -499,15 +506,17 @@ class SceneFunctions:
         if self.target.system.inputs:
             doc.append("u: the inputs; NULL for the scene's signals.")
         values, parts = "", tuple[CFunction, ...]()
-        unfinite = c.unless([f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE")
+        unfinite = c.return_if(
+            [f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE"
+        )
         if outline.is_large(function):
             values, parts, blocks = self.outlined(function, "acceleration", "a", READ)
-            first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
+            first = Block("", (c.declare(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
             body = self.target.body(function, together=self.groups_angles(function))
-            array = c.listed(self.real, "a", self.NQ, body.results)
-            failures = c.unless(body.failures, self.singular)
+            array = c.define_array(self.real, "a", self.NQ, body.results)
+            failures = c.return_if(body.failures, self.singular)
             *leading, last = self.statements(function, body)
             last = Block(last.comment, (*last.lines, array))
             blocks = (*leading, last, Block("", failures))
@@ -517,7 +526,7 @@ class SceneFunctions:
             self.public.acceleration,
             body=(*self.signals(function), *blocks[:-1], last),
             reads=reads,
-            doc=(*doc, sentence(function)),
+            doc=(*doc, cost_sentence(function)),
         )
         return GeneratedFunction(result, parts, values)
 

@@ -444,7 +444,7 @@ def face(target: Target, extension: str) -> FaceView:
 
     extension: name of the compiled extension module, which it imports.
     """
-    s, written = target.system, target.as_written
+    s, written = target.system, target.scene_name
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
     return FaceView(
@@ -496,7 +496,7 @@ def start_formulas(target: Target) -> dict[str, str]:
     They are given by the name of a coordinate (`theta`) or velocity (`theta_dot`) in the scene.
     Parameters that state jumps change are replaced by their values.
     """
-    s, written = target.system, target.as_written
+    s, written = target.system, target.scene_name
     set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
     return {
         f"{written(c.name)}{end}": fold_values(parse(text), set_by_jumps)

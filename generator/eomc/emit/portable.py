@@ -255,7 +255,9 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
             )
         ),
     )
-    return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
+    return {
+        f"{name}.{end}": c.break_long_lines(text) for end, text in zip("hc", texts, strict=True)
+    }
 
 
 def handshake(plain: SceneFunctions) -> str:
@@ -331,7 +333,9 @@ def _advance(plain: SceneFunctions, m: Method) -> tuple[CFunction, str]:
     if not plain.projection:
         return step, ""
     singular_flag = plain.project_end.arguments[-1]
-    inner = c.static(f"{plain.prefix}_{m.name}", plain.status, *step.arguments, singular_flag)
+    inner = c.static_prototype(
+        f"{plain.prefix}_{m.name}", plain.status, *step.arguments, singular_flag
+    )
     return inner, plain.project_end.call(t="t + h")
 
 
@@ -352,7 +356,7 @@ def implicit(plain: SceneFunctions, methods: Sequence[Method]) -> PortableImplic
         corrections=any(m.implicit for m in methods),
         factors=newton or plain.target.system.run.tolerance is not None,
         newton=newton,
-        slopes=c.static(
+        slopes=c.static_prototype(
             f"{plain.prefix}_differences",
             plain.status,
             c.output_array(plain.real, "slopes"),
@@ -372,13 +376,17 @@ def _gauss(plain: SceneFunctions, m: Method) -> PortableGaussView:
     onto = plain.moves_stages if m.sweeps else ()
     out = (c.output_array(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
     a = c.input_array(plain.real, "a")
-    stages = c.static(f"{method}_evaluated", plain.status, *out, a, *state_arguments, *onto)
+    stages = c.static_prototype(
+        f"{method}_evaluated", plain.status, *out, a, *state_arguments, *onto
+    )
     matrix_out = (c.output_array(plain.real, "M"), c.output_array("int", "row"))
-    matrix_function = c.static(f"{method}_matrix", plain.status, *matrix_out, *state_arguments)
+    matrix_function = c.static_prototype(
+        f"{method}_matrix", plain.status, *matrix_out, *state_arguments
+    )
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
     singular_flag = plain.project_end.arguments[-1:] if plain.projection else ()
-    solve = c.static(method, plain.status, *one.arguments, count, *singular_flag)
+    solve = c.static_prototype(method, plain.status, *one.arguments, count, *singular_flag)
     return PortableGaussView(
         **plain.names,
         title=m.title,
@@ -414,7 +422,9 @@ def _adaptive(plain: SceneFunctions) -> list[View]:
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
     state_arguments = plain.arguments(*plain.state, "h", "u", "p")
     values = (c.output_array(f"{method}_stages", "b"), c.input_array(f"{method}_stages", "a"))
-    sweep = c.static(f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages)
+    sweep = c.static_prototype(
+        f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages
+    )
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = PortableStagesView(
         **plain.names,
@@ -434,8 +444,8 @@ def _adaptive(plain: SceneFunctions) -> list[View]:
         state_arguments, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
         project=projection_call if plain.projection else "", whole=True,
     )  # fmt: skip
-    batch_views = [adaptive.batch(plain)] if plain.target.system.run.batch else []
-    return [nodes, *events.views(plain, form), *batch_views]
+    batch_views = [adaptive.batch_view(plain)] if plain.target.system.run.batch else []
+    return [nodes, *events.adaptive_views(plain, form), *batch_views]
 
 
 def loop(plain: SceneFunctions, m: Method) -> PortableRunsView:

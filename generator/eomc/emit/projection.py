@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, ClassVar
 
-from eomc.emit.c_function import CFunction, GeneratedFunction, in_braces
+from eomc.emit.c_function import CFunction, GeneratedFunction, initialiser_rows
 from eomc.emit.c_names import Target
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
@@ -282,7 +282,7 @@ def project(functions: SceneFunctions) -> ProjectView:
         tolerance=target.literal(4096 * eps),
         rounded=target.literal(4 * eps),
         weights="{ " + ", ".join(map(target.literal, weights)) + " }" if weights else "",
-        sums=in_braces([*map(target.literal, row)] for row in sums),
+        sums=initialiser_rows([*map(target.literal, row)] for row in sums),
         sum_places=tuple(summed[: len(sums)]),
         redundant=tuple(
             k for k, row in enumerate(rows) if row.redundant or k in summed[len(sums) :]

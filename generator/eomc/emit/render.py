@@ -20,7 +20,7 @@ from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
 from eomc.emit import embedding, package, portable, selftest
 from eomc.emit.c_expression import REALS, indent
-from eomc.emit.c_function import narrowed
+from eomc.emit.c_function import break_comments
 from eomc.emit.c_names import Target, rename_for_c
 from eomc.emit.fmu.unit import Unit, render_unit
 from eomc.emit.optimised import files as optimised
@@ -129,8 +129,8 @@ def render(program: Program, extension: str) -> Sources:
         files={
             **portable.files(program, show),
             **{f"{FAST}/{file}": text for file, text in optimised.files(methods, show).items()},
-            "main.c": narrowed(show(embedding.main(target))),
-            "selftest.c": narrowed(show(selftest.view(target))),
+            "main.c": break_comments(show(embedding.main(target))),
+            "selftest.c": break_comments(show(selftest.view(target))),
             "CMakeLists.txt": show(embedding.cmake(target)),
             f"{name}.pc.in": show(embedding.pkg_config(target)),
             "costs.txt": show(embedding.costs(target)),

@@ -244,7 +244,7 @@ def header(
             for m, room in zip(methods, fixed_rooms, strict=True)
         ),
         adaptive=AdaptiveDeclarations(
-            adaptive.TITLE, adaptive.memory(plain), adaptive_room,
+            adaptive.TITLE, adaptive.workspace_type(plain), adaptive_room,
             plain.public.adaptive(adaptive.METHOD.name),
             plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.steps_in_parallel(target),

@@ -123,7 +123,7 @@ def model_description(
         (v, frozenset({x.name})) for v, x in zip((*known.q, *known.qd), (*s.q, *s.qd), strict=True)
     ]
     computed = [*zip(known.outputs, dependencies.outputs, strict=True)]
-    names = {target.as_written(p.name): p.name for p in s.parameters}
+    names = {target.scene_name(p.name): p.name for p in s.parameters}
     formulas = start_formulas(target)
     starts = [
         (v, frozenset(names[n.id] for n in parse(formulas[v.name]).names()))

@@ -193,7 +193,7 @@ def render_unit(program: Program, version: int, show: Show) -> Unit:
             "modelDescription.xml": show(
                 description.model_description(target, version, token, sources)
             ),
-            "sources/fmi/scene.h": c_function.laid_out(show(scene_header(target, token))),
+            "sources/fmi/scene.h": c_function.break_long_lines(show(scene_header(target, token))),
         }
         if version == 3:
             files["sources/buildDescription.xml"] = show(BuildDescriptionView(name, sources))
@@ -282,12 +282,12 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
 def _starts(target: Target) -> tuple[tuple[str, ...], tuple[StartFormula, ...]]:
     """Return C statements and the states whose start is a formula of parameters."""
     s, formulas = target.system, start_formulas(target)
-    symbols = {target.as_written(p.name): p.symbol for p in s.parameters}
+    symbols = {target.scene_name(p.name): p.symbol for p in s.parameters}
     tape = Tape({p.symbol: Stage.PARAMETER for p in s.parameters})
     values = [tape.define(expression(parse(text), symbols)) for text in formulas.values()]
     body = target.body(lower("starts", tape, values, s.names))
     states = [(array, c.name) for array in ("q", "qd") for c in s.coordinates]
-    names = [target.as_written(n) + ("_dot" if array == "qd" else "") for array, n in states]
+    names = [target.scene_name(n) + ("_dot" if array == "qd" else "") for array, n in states]
     places = [names.index(name) for name in formulas]
     return body.lines, tuple(
         StartFormula(k, target.element(*states[k]), value)

@@ -131,7 +131,7 @@ def numeric_limits(one: Input) -> tuple[float | None, float | None]:
 
 def variables(target: Target) -> Variables:
     """Return all variables of the FMU of a scene, with their value references."""
-    s, written, next_reference = target.system, target.as_written, count().__next__
+    s, written, next_reference = target.system, target.scene_name, count().__next__
     of_parameters = start_formulas(target)
 
     def new_variable(name: str, causality: str, **more: str | int | bool) -> Variable:

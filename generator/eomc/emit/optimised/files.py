@@ -264,7 +264,7 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
         )
     )
     name = target.prefix
-    return {f"{name}.h": c.laid_out(header), f"{name}.c": c.laid_out(source)}
+    return {f"{name}.h": c.break_long_lines(header), f"{name}.c": c.break_long_lines(source)}
 
 
 def _wide(steppers: Steppers) -> bool:
@@ -366,7 +366,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
     """Return the accelerations over one lane."""
     s, target = steppers.accelerations, lane.target
     signal = lane.signal
-    constants = c.struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
+    constants = c.define_struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(steppers)).rstrip("\n")
     computed = (
@@ -443,7 +443,7 @@ def _two_points(steppers: Steppers) -> TwoPointsView:
         real=one.real.name,
         extent=one.c_width,
         inline=one.qualifiers[INLINE],
-        members=c.struct(f"{one.prefix}_configuration", two.real.name, s.parts.handed),
+        members=c.define_struct(f"{one.prefix}_configuration", two.real.name, s.parts.handed),
         angles=one.angle_count,
         configuration=configuration,
         constants=bool(s.constants),
@@ -480,13 +480,13 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
     if run.tolerance is not None:
         if adaptive.METHOD not in steppers.methods:
             yield show(steppers.stages(adaptive.METHOD))
-        yield from map(show, events.views(steppers.functions, _adaptive(steppers)))
+        yield from map(show, events.adaptive_views(steppers.functions, _adaptive(steppers)))
         if run.batch:
             side_by_side = adaptive.steps_in_parallel(steppers.accelerations.target)
             batch_view = (
                 runs.adaptive_lanes(steppers, _adaptive(steppers)) if side_by_side else None
             )
-            yield show(batch_view or adaptive.batch(steppers.functions))
+            yield show(batch_view or adaptive.batch_view(steppers.functions))
     yield from map(show, step_derivatives(steppers.functions))
 
 

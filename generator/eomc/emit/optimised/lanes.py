@@ -17,7 +17,7 @@ from eomc.emit import c_function as c
 from eomc.emit import projection
 from eomc.emit.c_expression import FOUR, Block, CBody, Printer, Real
 from eomc.emit.c_function import CArgument, CFunction, GeneratedFunction
-from eomc.emit.c_names import Target, rename_reserved, sentence
+from eomc.emit.c_names import Target, cost_sentence, rename_reserved
 from eomc.emit.functions import RATE_TERMS, SceneFunctions
 from eomc.emit.optimised.accelerations import Accelerations
 from eomc.emit.projection import ProjectionView
@@ -375,14 +375,18 @@ class Lane:
                 (f"{name}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
             pieces.append(piece)
-            calls += c.note([piece.call(v="&v")]) if fails else [c.do(piece.call(v="&v"))]
+            calls += (
+                c.record_failures([piece.call(v="&v")])
+                if fails
+                else [c.call_statement(piece.call(v="&v"))]
+            )
         if self.padded and out == self.out:
             calls += [c.assign(f"a[{k}]", self.target.zero) for k in range(len(places), self.width)]
-        locals_ = [c.local(self.mask, f"failed = {self.clear}")]
-        locals_ += [c.local(values, "v")] if shared else []
-        blocks = (locals_, calls, [c.result("failed")])
+        locals_ = [c.declare(self.mask, f"failed = {self.clear}")]
+        locals_ += [c.declare(values, "v")] if shared else []
+        blocks = (locals_, calls, [c.return_statement("failed")])
         reads = frozenset(a.name for f in pieces for a in f.arguments)
-        struct = c.struct(values, self.real.name, list(shared)) if shared else ""
+        struct = c.define_struct(values, self.real.name, list(shared)) if shared else ""
         body_ = tuple(Block("", tuple(lines)) for lines in blocks)
         return GeneratedFunction(replace(outer, body=body_, reads=reads), tuple(pieces), struct)
 
@@ -406,11 +410,11 @@ class Lane:
             sets = self._stored("a", body.results, self.width)
         else:
             sets = tuple(c.assign(to, x) for to, x in zip(places, body.results, strict=True))
-        failure_statements = c.note(body.failures)
+        failure_statements = c.record_failures(body.failures)
         if not fails:
             return (self._loads(function), *body.early, *body.blocks, Block("", sets))
-        head = Block("", (c.local(self.mask, f"failed = {self.clear}"),))
-        end = Block("", (*sets, *failure_statements, c.result("failed")))
+        head = Block("", (c.declare(self.mask, f"failed = {self.clear}"),))
+        end = Block("", (*sets, *failure_statements, c.return_statement("failed")))
         return (head, self._loads(function), *body.early, *body.blocks, end)
 
     def _stored(self, array: str, values: Sequence[str], width: int) -> tuple[str, ...]:
@@ -421,7 +425,7 @@ class Lane:
             return tuple(c.assign(f"{array}[{k}]", x) for k, x in enumerate(values))
         padded = [*values, *[self.target.zero] * (width - len(values))]
         return tuple(
-            c.do(f"{self.prefix}_put({array} + {k}, {', '.join(padded[k : k + FOUR])})")
+            c.call_statement(f"{self.prefix}_put({array} + {k}, {', '.join(padded[k : k + FOUR])})")
             for k in range(0, width, FOUR)
         )
 
@@ -440,7 +444,7 @@ class Lane:
     @cached_property
     def rates(self) -> GeneratedFunction:
         """The C function for the accelerations from the state, its sines and the inputs."""
-        doc = sentence(self.accelerations.function)
+        doc = cost_sentence(self.accelerations.function)
         signature = Signature("rates", self.out, self.places)
         return self.generate_function(self.accelerations.rotated[1], signature, doc)
 
@@ -492,7 +496,7 @@ class Lane:
         angles = self.accelerations.angles
         values = [self.angle_text(a, vector, a.offset if offset else S.Zero) for a in angles]
         if self.padded and self.contiguous_angles is not None:
-            sums = c.copied("x", vector, self.contiguous_angles, self.angle_count)
+            sums = c.copy_loop("x", vector, self.contiguous_angles, self.angle_count)
         else:
             sums = self._stored("x", values, four(len(values)))
         return CFunction(
@@ -637,7 +641,7 @@ class Lane:
         places = [f"d[{k}]" for k in range(len(function.outputs))]
         out, takes = c.output_array(self.real.name, "d"), self._constraint_arguments()
         signature = Signature("projection", out, places, takes)
-        return self.generate_function(function, signature, sentence(function))
+        return self.generate_function(function, signature, cost_sentence(function))
 
     @cached_property
     def rate_terms(self) -> GeneratedFunction | None:

@@ -342,12 +342,12 @@ def adaptive_lanes(steppers: Steppers, form: SweepInterface) -> AdaptiveLanesVie
     stepping, computed = AdaptiveFunctions(steppers.functions, form), constants_call(steppers)
     here = {"q": "at[i]", "qd": "moving[i]", "t": f"{c.member('x', 't')} + h*c_[i]"}
     return AdaptiveLanesView(
-        **adaptive.tableau(stepping),
+        **adaptive.adaptive_fields(stepping),
         inline=wide.qualifiers[INLINE],
         noinline=wide.qualifiers[NOINLINE],
         max_roughness=s.target.literal(adaptive.REJECT_AFTER_TWO),
         loosest=s.target.literal(MAX_TOLERANCE),
-        tightest=s.target.literal(adaptive.tightest(s.target.real)),
+        tightest=s.target.literal(adaptive.min_tolerance(s.target.real)),
         inputs=bool(s.target.system.inputs),
         constants=bool(s.constants),
         members=s.constants,
@@ -357,8 +357,8 @@ def adaptive_lanes(steppers: Steppers, form: SweepInterface) -> AdaptiveLanesVie
         accelerate=steppers.accelerate(wide, a="f", **here, u="input", c=f"&{c.member('x', 'c')}"),
         forces=stepping.forces.call(f="f", q="s.q", qd="s.qd", t="s.t", u="input"),
         batch=steppers.functions.public.adaptive_batch(m.name),
-        alone=adaptive.call_for_instance(steppers.functions),
-        store_row=adaptive.row_storage(stepping).call(q="s.q", qd="s.qd"),
+        alone=adaptive.instance_call(steppers.functions),
+        store_row=adaptive.store_row_prototype(stepping).call(q="s.q", qd="s.qd"),
         look=stepping.interpolate.call(
             q_at="q_row", qd_at="qd_row", x="&s", u="input", memory="memory + k",
             z="(times[row_counts[k]] - s.from - s.from_rest)/s.size",

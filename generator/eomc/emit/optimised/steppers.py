@@ -12,7 +12,14 @@ from typing import Any, ClassVar
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.coefficients import TableauFields, literal, matrix, numbers, rounded, tableau
+from eomc.emit.coefficients import (
+    TableauFields,
+    literal,
+    literals,
+    matrix_rows,
+    round_weights,
+    tableau,
+)
 from eomc.emit.derivatives import LinearizationView
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.optimised.accelerations import Accelerations
@@ -648,7 +655,7 @@ class Steppers:
             stability=stability(m),
             stages=tuple(stage(k, *rest) for k, rest in enumerate(rows)),
             position=total(m.b_a),
-            velocity=total(rounded(m.b, real)),
+            velocity=total(round_weights(m.b, real)),
         )
 
     def implicit(self, m: Method) -> CFunction:
@@ -657,7 +664,7 @@ class Steppers:
         state = c.output_array(f"{lane.prefix}_{m.name}_state", "m")
         extra = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
         prototype = self.advanced(lane, m.name, *extra, state)
-        return c.static(prototype.name, f"{lane.prefix}_status", *prototype.arguments)
+        return c.static_prototype(prototype.name, f"{lane.prefix}_status", *prototype.arguments)
 
     @property
     def newton_p(self) -> bool:
@@ -684,7 +691,7 @@ class Steppers:
         signal = f.signal if slopes.signal_call or self.follows else None
         state = lane.argument
         time_and_inputs = [n for n in ("t", "u") if n in lane.argument_names]
-        factor = c.static(
+        factor = c.static_prototype(
             f"{lane.prefix}_{m.name}_factor", "void",
             c.output_array(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
             *map(state, ("q", "qd")), *map(state, time_and_inputs),
@@ -702,7 +709,7 @@ class Steppers:
             notes=m.notes,
             stages=m.stages,
             **tableau(m, real),
-            extrapolation=matrix(m.extrapolation, real),
+            extrapolation=matrix_rows(m.extrapolation, real),
             width=slopes.width,
             factor=factor,
             factor_unread=tuple(
@@ -743,7 +750,7 @@ class Steppers:
         out = c.output_array(f"{P}_stages", "b")
         arguments = (c.input_array(f"{P}_stages", "a"), c.input_array(f"{P}_sums", "w"))
         others = (*self.stepping(self.one), *self.functions.moves_stages)
-        return c.static(f"{P}_sweep", "int", out, *arguments, *others)
+        return c.static_prototype(f"{P}_sweep", "int", out, *arguments, *others)
 
     def stages(self, m: Method) -> StagesView:
         """Return the template data of the C function whose prototype `sweep` returns.
@@ -754,7 +761,7 @@ class Steppers:
         fixed = m.name in lane.target.system.run.methods
 
         def by_stage(rows: Sequence[Row]) -> tuple[str, ...]:
-            return c.in_braces(numbers(column, real) for column in zip(*rows, strict=True))
+            return c.initialiser_rows(literals(column, real) for column in zip(*rows, strict=True))
 
         before = (by_stage(m.a_extrapolated), by_stage(m.a_squared_extrapolated)) if fixed else None
         return StagesView(
@@ -765,7 +772,7 @@ class Steppers:
             name=m.name,
             stages=m.stages,
             padded=f"{max(m.stages, 64 // (8 if real is DOUBLE else 4))}",
-            c=numbers(m.c, real),
+            c=literals(m.c, real),
             within=(by_stage(m.a), by_stage(m.a_squared)),
             extrapolated=before,
             sweep=self.sweep(m),
@@ -788,7 +795,7 @@ class Steppers:
         state = c.output_array(f"{P}_state", "m")
         values = c.output_array(f"{P}_stages", "a")
         arguments = (values, CArgument("int", "fresh"), *self.stepping(lane), state)
-        settle = c.static(f"{P}_settle", f"{lane.prefix}_status", *arguments)
+        settle = c.static_prototype(f"{P}_settle", f"{lane.prefix}_status", *arguments)
         sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"
         return SweepsView(
             **self.extended(lane),
@@ -804,8 +811,8 @@ class Steppers:
             stability=stability(m),
             stages=m.stages,
             sweeps=m.sweeps,
-            b=numbers(rounded(m.b, real), real),
-            bA=numbers(m.b_a, real),
+            b=literals(round_weights(m.b, real), real),
+            bA=literals(m.b_a, real),
             settle=settle,
             settle_call=settle.call(a="&a", fresh="!smooth"),
             constrained=bool(self.functions.projection),
