@@ -47,7 +47,7 @@ Change = Callable[[], Any]
 
 
 def without_prediction() -> Any:
-    return patch.object(Steppers, "predicted", new_callable=PropertyMock, return_value=False)
+    return patch.object(Steppers, "predicts_angles", new_callable=PropertyMock, return_value=False)
 
 
 def without_two_points() -> Any:

@@ -15,7 +15,7 @@ from conftest import ROOT, tiers
 from lane_source import BUILDS, EXPONENTIALS, LANES, MOST, VECTORS, built, call, of_lane
 from sincos_bench import LARGEST_ERROR, bench, nearest_multiples
 
-from eomc.emit.optimised.lanes import interleaved
+from eomc.emit.optimised.lanes import interleaved_index
 
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
 
@@ -304,5 +304,5 @@ def test_four_numbers_are_put_anywhere(library: ctypes.CDLL, of: Any) -> None:
         both = np.zeros((4, 2), of.dtype)
         from_x, from_y = x[at : at + 4], y[9 - at : 13 - at]
         library.interleave(*map(bench.pointer, (from_x, from_y, both)))
-        places = [interleaved(k) for k in range(4)]
+        places = [interleaved_index(k) for k in range(4)]
         assert [tuple(both[k]) for k in places] == list(zip(from_x, from_y, strict=True))

@@ -396,7 +396,7 @@ class AdaptiveFunctions:
         measures = (c.output_array(real, name) for name in ("scale", "coarse", "rough", "beyond"))
         newton = c.input_array(f"{self.method}_newton", "m")
         limits = (self.number("tol"), self.number("most"))
-        arguments = (*self.form.around, *self.functions.moves_stages, *limits, newton)
+        arguments = (*self.form.around, *self.functions.onto_argument, *limits, newton)
         results = (*measures, c.output_array("int", "sweeps"))
         cap = [c.input_array(real, "cap")] if self.may_rest else []
         return c.static_prototype(
@@ -422,7 +422,7 @@ class AdaptiveFunctions:
         """
         real = self.functions.real
         values = (c.input_array(f"{self.method}_stages", "a"), c.input_array(real, "scale"))
-        others = (*self.form.around, *self.functions.moves_stages)
+        others = (*self.form.around, *self.functions.onto_argument)
         arguments = (c.output_array(real, "cap"), *values, *others, self.number("tol"))
         return c.static_prototype(f"{self.method}_cap_scales", "int", *arguments)
 

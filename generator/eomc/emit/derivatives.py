@@ -11,7 +11,7 @@ from eomc.emit.c_function import CFunction, GeneratedFunction
 from eomc.emit.c_names import cost_sentence
 from eomc.emit.coefficients import TableauFields, tableau
 from eomc.emit.functions import SceneFunctions
-from eomc.emit.projection import ZERO_SQUARE, near
+from eomc.emit.projection import ZERO_SQUARE, large_correction_limit
 from eomc.emit.public import program_function
 from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import METHODS
@@ -147,7 +147,7 @@ def linearization(plain: SceneFunctions) -> LinearizationView | None:
         )
         cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"
     arguments = plain.arguments(*plain.state, "u", "p")
-    arguments_read = plain.read(function)
+    arguments_read = plain.arguments_read(function)
     reads_u = plain.reads_u(function) and plain.signal is not None
     return LinearizationView(
         **plain.names,
@@ -181,7 +181,7 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
     accelerate = plain.acceleration.function.call
     projection = plain.projection_along
-    projected = _moved(plain) if projection else None
+    projected = _project_derivatives(plain) if projection else None
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
@@ -197,7 +197,7 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
             moved=projected,
             projection_call=projection.function.call(q="r", qd="v") if projection else "",
             move=projected.call(X="ends", t="t + h") if projected else "",
-            near=target.literal(near(target)),
+            near=target.literal(large_correction_limit(target)),
             scale_floor=target.literal(ZERO_SQUARE),
             function=plain.public.derivative(m.name),
             implicit=m.implicit,
@@ -217,12 +217,12 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
         )
 
 
-def _moved(plain: SceneFunctions) -> CFunction:
+def _project_derivatives(plain: SceneFunctions) -> CFunction:
     """Return the static function that projects a step's end and its derivatives onto the
     constraints.
     """
     state = (c.output_array(plain.real, "X"), *(c.output_array(plain.real, n) for n in "rv"))
-    arguments_read = plain.read(plain.target.program["projection_along"])
+    arguments_read = plain.arguments_read(plain.target.program["projection_along"])
     other_arguments = (
         plain.argument("q"),
         *plain.arguments(*(n for n in ("t", "p") if n in arguments_read)),

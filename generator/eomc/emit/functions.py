@@ -21,7 +21,7 @@ from eomc.program.ir import Function
 from eomc.program.program import Program
 
 STATE = ("q", "qd")
-READ = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
+ARGUMENT_NAMES = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
 ROTATION_ERRORS = (
     "2 tan(a/2) n along axes of loops, whose second frames are out by angles a about n, then "
     "cos(a/2)^2 of each, then the derivatives of the first along q, by rows."
@@ -127,13 +127,13 @@ class SceneFunctions:
         return tuple(self.argument(n) for n in names if there.get(n, True))
 
     @property
-    def swept(self) -> bool:
+    def iterates_stages(self) -> bool:
         """Whether some integration method solves for its stages by fixed-point iteration."""
         run = self.target.system.run
         return run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
 
     @property
-    def moves_stages(self) -> tuple[CArgument, ...]:
+    def onto_argument(self) -> tuple[CArgument, ...]:
         """The C argument `onto` in a tuple; the tuple is empty without constraints.
 
         It is a flag: whether the stages of a Runge-Kutta step are projected onto the constraints.
@@ -145,7 +145,7 @@ class SceneFunctions:
         """Names of the C arguments for the state: q, qd and, if the motion depends on time, t."""
         return (*STATE, "t") if self.target.driven else STATE
 
-    def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
+    def pointer_arguments(self, function: Function, *names: str) -> tuple[CArgument, ...]:
         """Return those C arguments among `names` that a function of the program reads.
 
         Arrays are declared as pointers, without their size.
@@ -173,7 +173,7 @@ class SceneFunctions:
         arguments = (out, *map(self.argument, names), *self.arguments("p"))
         return CFunction(f"{self.prefix}_signal", "void", arguments)
 
-    def signals(self, function: Function) -> tuple[Block, ...]:
+    def signal_blocks(self, function: Function) -> tuple[Block, ...]:
         """Return C statements that compute the inputs u if the caller passes NULL for u.
 
         They call the C function of the scene's signals, the functions of time and state that define
@@ -188,7 +188,7 @@ class SceneFunctions:
         """Return True if a function of the program reads inputs (elements of u)."""
         return bool(self.supplied_names["u"] and function.uses & self.supplied_names["u"])
 
-    def read(self, function: Function, follows: bool = True) -> frozenset[str]:
+    def arguments_read(self, function: Function, follows: bool = True) -> frozenset[str]:
         """Return the names of the C arguments (q, qd, u, p, ...) that a function reads.
 
         If the caller of a C function passes no inputs, the scene's signals compute them. These are
@@ -232,7 +232,7 @@ class SceneFunctions:
         lines = tuple(line for b in blocks for line in b.lines)
         return blocks if len(lines) > MAX_UNCOMMENTED_LINES else (Block("", lines),)
 
-    def outlined(
+    def outline(
         self, function: Function, name: str, out: str, arguments: Sequence[str]
     ) -> tuple[str, tuple[CFunction, ...], tuple[Block, ...]]:
         """Divide a long function into several C functions (pieces) that are called in sequence.
@@ -265,10 +265,10 @@ class SceneFunctions:
                 (
                     *([c.output_array(type, "s")] if part.reads or part.keeps else []),
                     *([c.output_array(self.real, out)] if part.outputs else []),
-                    *self.pointers(f, *arguments),
+                    *self.pointer_arguments(f, *arguments),
                 ),
                 (self.loads(f), *body.early, *body.blocks, Block("", ends)),
-                self.read(f, follows=False) | {"s", out},
+                self.arguments_read(f, follows=False) | {"s", out},
                 "static",
                 (f"{name}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
@@ -305,7 +305,7 @@ class SceneFunctions:
             paragraphs.append(f"Where the status is not OK, {kind.out} is untouched.")
         if by_columns:
             cost = f"By {len(target.names)} columns, each: {cost[0].lower()}{cost[1:]}"
-        reads = self.read(function) | {kind.out}
+        reads = self.arguments_read(function) | {kind.out}
         public = replace(self.public.evaluation(name), reads=reads, doc=(*paragraphs, cost))
         if by_columns:
             return self._by_columns(public, function, name)
@@ -316,11 +316,11 @@ class SceneFunctions:
             size, last = "1", Block("", (c.return_statement(f"{out}[0]"),))
             if refuses(target, name):
                 out, size, last = "a", c_array_size(target, kind.shape), self._status_block(name)
-            values, parts, calls = self.outlined(function, name, out, READ)
+            values, parts, calls = self.outline(function, name, out, ARGUMENT_NAMES)
             if out != kind.out:
                 declarations = Block("", (c.declare(self.real, f"{out}[{size}]"), *calls[0].lines))
                 calls = (declarations, calls[1], last)
-            body = (*self.signals(function), *calls)
+            body = (*self.signal_blocks(function), *calls)
             return GeneratedFunction(replace(public, body=body), parts, values)
         (*blocks, last), statements_ = self.straight_line_body(function, kind.out)
         if refuses(target, name):
@@ -329,7 +329,9 @@ class SceneFunctions:
             )
             blocks.append(Block("", (array, *c.return_if(statements_.failures, self.singular))))
             last = self._status_block(name)
-        return GeneratedFunction(replace(public, body=(*self.signals(function), *blocks, last)))
+        return GeneratedFunction(
+            replace(public, body=(*self.signal_blocks(function), *blocks, last))
+        )
 
     def _status_block(self, name: str) -> Block:
         """Return the end of a C function with a status: copy the results `a` to the output.
@@ -385,7 +387,7 @@ class SceneFunctions:
         values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
         if outline.is_large(function):
-            values, parts, blocks = self.outlined(function, name, out, ("along", *READ))
+            values, parts, blocks = self.outline(function, name, out, ("along", *ARGUMENT_NAMES))
         else:
             blocks, body = self.straight_line_body(function, out)
             failures = c.return_if(body.failures, self.singular)
@@ -395,9 +397,13 @@ class SceneFunctions:
         function_ = CFunction(
             f"{self.prefix}_{name}",
             self.status if fails else "void",
-            (c.output_array(self.real, out), *along, *self.pointers(function, *READ)),
+            (
+                c.output_array(self.real, out),
+                *along,
+                *self.pointer_arguments(function, *ARGUMENT_NAMES),
+            ),
             blocks,
-            self.read(function, follows=False) | {out},
+            self.arguments_read(function, follows=False) | {out},
             "static",
             (doc,),
         )
@@ -427,7 +433,7 @@ class SceneFunctions:
         return self.static(function, "rotation_errors", "errors", ROTATION_ERRORS)
 
     @cached_property
-    def rotated(self) -> CFunction | None:
+    def replace_rotation_rows(self) -> CFunction | None:
         """The static C function that replaces residuals of axis equations by rotation vectors.
 
         Axis equations are the constraint equations of a closed loop for its orientation. The
@@ -491,7 +497,11 @@ class SceneFunctions:
         """The C arguments of a projection: the state to be changed (r, v), and t and p if
         needed.
         """
-        arguments = self.read(self.target.program["projection"]) if self.projection else frozenset()
+        arguments = (
+            self.arguments_read(self.target.program["projection"])
+            if self.projection
+            else frozenset()
+        )
         state = tuple(c.output_array(self.real, n) for n in "rv")
         return state, self.arguments(*(n for n in ("t", "p") if n in arguments))
 
@@ -510,7 +520,7 @@ class SceneFunctions:
             [f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE"
         )
         if outline.is_large(function):
-            values, parts, blocks = self.outlined(function, "acceleration", "a", READ)
+            values, parts, blocks = self.outline(function, "acceleration", "a", ARGUMENT_NAMES)
             first = Block("", (c.declare(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
@@ -521,10 +531,10 @@ class SceneFunctions:
             last = Block(last.comment, (*last.lines, array))
             blocks = (*leading, last, Block("", failures))
         last = Block("", (*blocks[-1].lines, *unfinite))
-        reads = self.read(function) | {"qdd"}
+        reads = self.arguments_read(function) | {"qdd"}
         result = replace(
             self.public.acceleration,
-            body=(*self.signals(function), *blocks[:-1], last),
+            body=(*self.signal_blocks(function), *blocks[:-1], last),
             reads=reads,
             doc=(*doc, cost_sentence(function)),
         )

@@ -12,7 +12,7 @@ from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
 from eomc.emit.public import KINDS, Public, refuses, takes_qdd
-from eomc.emit.views import stamp, words
+from eomc.emit.views import stamp, unit_and_note
 from eomc.integrators.tableaux import METHODS, Method
 from eomc.runtime.package import CONSTRAINED
 from eomc.scene.formulas import fold_values, parse
@@ -455,13 +455,14 @@ def face(target: Target, extension: str) -> FaceView:
         digest=s.digest,
         dtype=target.real.dtype,
         coordinates=tuple(
-            ListedItem(written(c.name), words(c.unit, c.note)) for c in s.coordinates
+            ListedItem(written(c.name), unit_and_note(c.unit, c.note)) for c in s.coordinates
         ),
         parameters=tuple(
-            ListedItem(written(p.name), words(p.unit, p.note), repr(p.value)) for p in s.parameters
+            ListedItem(written(p.name), unit_and_note(p.unit, p.note), repr(p.value))
+            for p in s.parameters
         ),
-        inputs=tuple(ListedItem(written(i.name), words(i.unit, i.note)) for i in s.inputs),
-        outputs=tuple(ListedItem(o.name, words(o.unit, o.note)) for o in s.outputs),
+        inputs=tuple(ListedItem(written(i.name), unit_and_note(i.unit, i.note)) for i in s.inputs),
+        outputs=tuple(ListedItem(o.name, unit_and_note(o.unit, o.note)) for o in s.outputs),
         coordinate_units=FreeText({written(c.name): c.unit for c in s.coordinates}),
         parameter_values={written(p.name): p.value for p in s.parameters},
         input_units=FreeText({written(i.name): i.unit for i in s.inputs}),

@@ -234,15 +234,15 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     plain = portable_functions(program, real)
     name = plain.prefix
     methods = [METHODS[m] for m in plain.target.system.run.methods]
-    loops = [loop(plain, m) for m in methods]
+    loops = [runs_view(plain, m) for m in methods]
     swept = plain.target.system.run.tolerance is not None or any(m.implicit for m in methods)
-    views: list[View] = [implicit(plain, methods)] if swept else []
+    views: list[View] = [implicit_view(plain, methods)] if swept else []
     views += [
-        view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
+        view for m, run in zip(methods, loops, strict=True) for view in (step_view(plain, m), run)
     ]
     views += [*step_derivatives(plain), *_adaptive(plain)]
     if onto := projection.portable_view(plain):
-        views[:0] = [onto, projection.project(plain)]
+        views[:0] = [onto, projection.project_view(plain)]
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
@@ -286,7 +286,7 @@ def _about(m: Method) -> tuple[str, ...]:
     )
 
 
-def stepper(
+def step_view(
     plain: SceneFunctions, m: Method
 ) -> PortableRK4View | PortableExplicitView | PortableGaussView:
     """Return the template data for the C function that makes one step of the method `m`.
@@ -339,7 +339,7 @@ def _advance(plain: SceneFunctions, m: Method) -> tuple[CFunction, str]:
     return inner, plain.project_end.call(t="t + h")
 
 
-def implicit(plain: SceneFunctions, methods: Sequence[Method]) -> PortableImplicitView:
+def implicit_view(plain: SceneFunctions, methods: Sequence[Method]) -> PortableImplicitView:
     """Return the template data for the C functions that implicit methods share.
 
     methods: the integration methods of the scene, of which some may be implicit. plain: the C
@@ -372,8 +372,8 @@ def _gauss(plain: SceneFunctions, m: Method) -> PortableGaussView:
     accelerate = plain.acceleration.function.call
     method = f"{plain.prefix}_{m.name}"
     state_arguments = plain.arguments(*plain.state, "h", "u", "p")
-    shared = implicit(plain, [m])
-    onto = plain.moves_stages if m.sweeps else ()
+    shared = implicit_view(plain, [m])
+    onto = plain.onto_argument if m.sweeps else ()
     out = (c.output_array(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
     a = c.input_array(plain.real, "a")
     stages = c.static_prototype(
@@ -423,7 +423,7 @@ def _adaptive(plain: SceneFunctions) -> list[View]:
     state_arguments = plain.arguments(*plain.state, "h", "u", "p")
     values = (c.output_array(f"{method}_stages", "b"), c.input_array(f"{method}_stages", "a"))
     sweep = c.static_prototype(
-        f"{method}_sweep", "int", *values, *state_arguments, *plain.moves_stages
+        f"{method}_sweep", "int", *values, *state_arguments, *plain.onto_argument
     )
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = PortableStagesView(
@@ -448,7 +448,7 @@ def _adaptive(plain: SceneFunctions) -> list[View]:
     return [nodes, *events.adaptive_views(plain, form), *batch_views]
 
 
-def loop(plain: SceneFunctions, m: Method) -> PortableRunsView:
+def runs_view(plain: SceneFunctions, m: Method) -> PortableRunsView:
     """Return the template data for the C functions that make many steps by the method `m`.
 
     One function is for a run of one instance, the other for a batch of many instances. plain: the C
@@ -456,7 +456,7 @@ def loop(plain: SceneFunctions, m: Method) -> PortableRunsView:
     """
     NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)
-    one = stepper(plain, m)
+    one = step_view(plain, m)
     advance = one.solve if isinstance(one, PortableGaussView) else one.advance
     return PortableRunsView(
         **plain.names,

@@ -12,16 +12,16 @@ from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
 
 # Near singular configurations: square of the largest relative correction; factor on rounding errors
-SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
+SINGULAR_LIMITS = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 # Largest rate of a dropped constraint near singular configurations, relative to its own terms
 # (about 3 times the root of its pivot tolerance), and to the largest terms of all constraints
-LEFT_OUT = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
+DROPPED_ROW_LIMITS = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
 COUPLING_ROUNDINGS = 30  # error of the rates, in units of rounding, after correcting q and qd
 ZERO_SQUARE = 1e-12  # a coordinate counts as 0 if its square is below this part of the sum of all
 NEAREST_TOLERANCE = (
     1e-14  # of the squared distance to the nearest state: the square of the last change
 )
-STARTS = 16  # random starts, if the search from a state does not converge
+RANDOM_STARTS = 16  # random starts, if the search from a state does not converge
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class ProjectView(NameFields):
     half_turn: str
 
 
-def near(target: Target) -> float:
+def large_correction_limit(target: Target) -> float:
     """Return the threshold above which a correction by the projection onto constraints is large.
 
     It applies to the square of the relative change of a coordinate. It is a few times the rounding
@@ -186,7 +186,7 @@ def near(target: Target) -> float:
     return 8 * target.real.epsilon
 
 
-def width(target: Target) -> int:
+def result_count(target: Target) -> int:
     """Return the number of results of the C function that computes corrections for constraints.
 
     The results are the corrections that move q and qd onto the constraints, and one inverse pivot
@@ -201,14 +201,14 @@ def shared_fields(functions: SceneFunctions) -> dict[str, Any]:
     These are C names, numbers of equations, and tolerances.
     """
     target = functions.target
-    little, noise = SINGULAR[target.system.run.real]
-    row_fraction, largest_fraction = LEFT_OUT[target.system.run.real]
-    large = near(target)
+    little, noise = SINGULAR_LIMITS[target.system.run.real]
+    row_fraction, largest_fraction = DROPPED_ROW_LIMITS[target.system.run.real]
+    large = large_correction_limit(target)
     return {
         "PREFIX": functions.PREFIX,
         "real": functions.real,
-        "size": width(target),
-        "rows": width(target) - 2 * len(target.names),
+        "size": result_count(target),
+        "rows": result_count(target) - 2 * len(target.names),
         "tolerance": target.literal(largest_fraction),
         "part": target.literal(row_fraction),
         "fabs": f"fabs{target.real.function_suffix}",
@@ -239,7 +239,7 @@ def portable_view(functions: SceneFunctions) -> ProjectionView | None:
         increments=False,
         sines="",
         sines_call="",
-        onto=functions.project_stage if functions.swept else None,
+        onto=functions.project_stage if functions.iterates_stages else None,
         projection=projection,
         function=functions.project_end,
         call=projection.function.call(**state),
@@ -248,7 +248,7 @@ def portable_view(functions: SceneFunctions) -> ProjectionView | None:
     )
 
 
-def project(functions: SceneFunctions) -> ProjectView:
+def project_view(functions: SceneFunctions) -> ProjectView:
     """Return the data for the public C function `project`, which projects a state onto the
     constraints.
     """
@@ -263,7 +263,7 @@ def project(functions: SceneFunctions) -> ProjectView:
     rows = target.system.constraints
     sums = closure.sums if closure else ()
     summed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
-    errors, rotated = functions.rotation_errors, functions.rotated
+    errors, rotated = functions.rotation_errors, functions.replace_rotation_rows
     rotations = target.system.rotations if errors else ()
     return ProjectView(
         **functions.names,
@@ -297,7 +297,7 @@ def project(functions: SceneFunctions) -> ProjectView:
         call_turn=rotated.call(q="at", A="0") if rotated else "",
         atan=f"atan{end}",
         searched=any(row.holonomic and row.loop for row in rows),
-        starts=STARTS,
+        starts=RANDOM_STARTS,
         converged=target.literal(NEAREST_TOLERANCE),
         half_turn=target.literal(float(f"{eps**0.5:.0e}")),
     )

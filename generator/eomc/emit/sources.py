@@ -218,7 +218,7 @@ def header(
     return HeaderView(
         title=FreeText(s.title),
         stamp=tuple(views.stamp(target)),
-        notes=tuple(views.notes(target)),
+        notes=tuple(views.energy_notes(target)),
         description=tuple(views.description(target)),
         **plain.names,
         handshake=stamp,
@@ -273,7 +273,7 @@ def source_fields(
         "qd0": tuple(target.literal(x.rate) for x in s.coordinates),
         "evaluations": functions.evaluations,
         "acceleration": functions.acceleration,
-        "solved": tuple(views.solved(target)),
+        "solved": tuple(views.solution_method(target)),
         "constrained": bool(s.constraints),
         "slopes": show(slopes).rstrip("\n") if slopes else "",
     }
@@ -290,13 +290,15 @@ def indexed(
     "CONSTRAINT_", which `Target.enum` adds to the names of such items.
     """
     enum = plain.target.enum
-    return tuple(Enumerator(enum[prefix + x.name], views.words(x.unit, x.note)) for x in items)
+    return tuple(
+        Enumerator(enum[prefix + x.name], views.unit_and_note(x.unit, x.note)) for x in items
+    )
 
 
 def parameters(plain: SceneFunctions) -> tuple[ParameterMember, ...]:
     """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
     return tuple(
-        ParameterMember(p.name, plain.target.literal(p.value), views.words(p.unit, p.note))
+        ParameterMember(p.name, plain.target.literal(p.value), views.unit_and_note(p.unit, p.note))
         for p in plain.target.system.parameters
     )
 

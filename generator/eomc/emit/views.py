@@ -69,7 +69,7 @@ def stamp(target: Target) -> list[FreeText]:
     ]
 
 
-def notes(target: Target) -> list[str]:
+def energy_notes(target: Target) -> list[str]:
     """Return comment lines about terms of the kinetic energy K that are unusual.
 
     Such terms are not quadratic in the velocities; the lines state in which functions they appear.
@@ -92,12 +92,12 @@ def description(target: Target) -> list[FreeText]:
     return list(map(FreeText, lines))
 
 
-def words(unit: str, note: str) -> FreeText:
+def unit_and_note(unit: str, note: str) -> FreeText:
     """Return a comment with the unit and the note of a coordinate, input or parameter."""
     return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
 
 
-def solved(target: Target) -> list[str]:
+def solution_method(target: Target) -> list[str]:
     """Return comment lines that state how the equations of motion are solved.
 
     The equations D qdd = tau - bias are solved for the accelerations qdd.

@@ -138,13 +138,13 @@ def model_description(
         "prefix": target.prefix,
         "token": token,
         "tool": f"eomc {__version__}",
-        "about": _free(about),
+        "about": _attributes(about),
         "exchange": not s.constraints,
         "derivatives": "true" if s.run.needs_derivatives else "false",
-        "experiment": _free(experiment),
-        "units": _units(known),
+        "experiment": _attributes(experiment),
+        "units": _unit_elements(known),
         # FMI 2 needs no variable for the time, and some importers take it for an error
-        "variables": tuple(_described(v, version) for v in known if v.reference or version == 3),
+        "variables": tuple(_xml_element(v, version) for v in known if v.reference or version == 3),
         "outputs": structure.unknowns([*outputs, *computed]),
         "rates": structure.unknowns(rates),
         "initial": structure.unknowns([*starts, *rates, *computed], initial=True),
@@ -185,24 +185,24 @@ class _Structure:
         )
 
 
-def _free(pairs: Iterable[tuple[str, str]]) -> Attributes:
+def _attributes(pairs: Iterable[tuple[str, str]]) -> Attributes:
     return tuple((key, FreeText(text)) for key, text in pairs if text)
 
 
-def _units(known: Variables) -> tuple[XmlElement, ...]:
+def _unit_elements(known: Variables) -> tuple[XmlElement, ...]:
     """Return the units that are used and that FMI can express."""
     meanings = {v.unit: meaning for v in known if (meaning := parse_unit(v.unit)) is not None}
     return tuple(
-        XmlElement("Unit", _free([("name", text)]), _free(meaning.attributes))
+        XmlElement("Unit", _attributes([("name", text)]), _attributes(meaning.attributes))
         for text, meaning in meanings.items()
     )
 
 
-def _described(v: Variable, version: int) -> XmlElement:
+def _xml_element(v: Variable, version: int) -> XmlElement:
     unit = v.unit if parse_unit(v.unit) is not None else ""
     # the start of an input is always exact, and FMI 2 forbids the attribute
     initial = "" if v.causality == "input" else v.initial
-    outer = _free(
+    outer = _attributes(
         [
             ("name", v.name),
             ("valueReference", str(v.reference)),
@@ -214,7 +214,7 @@ def _described(v: Variable, version: int) -> XmlElement:
     )
     derivative = "" if v.derivative is None else str(v.derivative)
     limits = [("min", v.minimum), ("max", v.maximum)]
-    inner = _free([("unit", unit), *limits, ("start", v.start), ("derivative", derivative)])
+    inner = _attributes([("unit", unit), *limits, ("start", v.start), ("derivative", derivative)])
     if version == 2:
         return XmlElement("Boolean" if v.boolean else "Real", outer, inner)
     return XmlElement("Boolean" if v.boolean else "Float64", outer, inner)
@@ -268,13 +268,17 @@ class Dependencies:
         names = [x.name for x in self.program.system.u]
         if not self.signals or "signal" not in self.program:
             return {}
-        return dict(zip(names, read(self.program["signal"]), strict=True))
+        return dict(zip(names, dependencies_of_results(self.program["signal"]), strict=True))
 
     def _results_of(self, name: str) -> Sequence[Names]:
         """Return the dependencies of each result of a function; [] where the program does not have
         it.
         """
-        return [self._resolved(x) for x in read(self.program[name])] if name in self.program else []
+        return (
+            [self._resolved(x) for x in dependencies_of_results(self.program[name])]
+            if name in self.program
+            else []
+        )
 
     def _resolved(self, names: Names) -> Names:
         """Return names with accelerations and signals replaced by their dependencies."""
@@ -289,7 +293,7 @@ class Dependencies:
         return frozenset(result) & self.known
 
 
-def read(function: Function) -> list[Names]:
+def dependencies_of_results(function: Function) -> list[Names]:
     """Return the names of the arguments that each result of a function depends on.
 
     function: a function of the program, a list of elementary operations.

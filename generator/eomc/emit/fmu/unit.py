@@ -222,8 +222,8 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
     s, public = target.system, Public(target)
     by_tolerance = s.run.tolerance is not None
     method, rows = s.run.methods[0], s.coordinates if s.constraints else ()
-    calls = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
-    start_lines, starts = _starts(target)
+    calls = {name: _call_of(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
+    start_lines, starts = _start_formulas(target)
     workspace = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
     return SceneHeaderView(
         title=FreeText(s.title),
@@ -244,7 +244,7 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
         feedback=target.signal_state,
         solved=bool(calls["outputs"]) and takes_qdd(target, "outputs"),
         acceleration=public.acceleration.call(),
-        signal=_called(target, "signal"),
+        signal=_call_of(target, "signal"),
         outputs=calls["outputs"],
         energies=tuple(calls[name] for name in ENERGIES),
         values=calls["events"],
@@ -264,11 +264,11 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
         ) if by_tolerance else "",
         start_lines=start_lines,
         starts=starts,
-        sensitivity=_called(target, "sensitivity"),
-        output_sensitivity=_called(target, "output_sensitivity"),
+        sensitivity=_call_of(target, "sensitivity"),
+        output_sensitivity=_call_of(target, "output_sensitivity"),
         signals_of_parameters=_signals_read_parameters(target),
         linearization=public.linearization.call() if s.run.needs_derivatives else "",
-        output_slopes=_called(target, "output_slopes"),
+        output_slopes=_call_of(target, "output_slopes"),
         refuses=refuses(target, "outputs"),
         slopes_refuse=refuses(target, "output_slopes"),
         slopes_solved=any(
@@ -279,7 +279,7 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
     )  # fmt: skip
 
 
-def _starts(target: Target) -> tuple[tuple[str, ...], tuple[StartFormula, ...]]:
+def _start_formulas(target: Target) -> tuple[tuple[str, ...], tuple[StartFormula, ...]]:
     """Return C statements and the states whose start is a formula of parameters."""
     s, formulas = target.system, start_formulas(target)
     symbols = {target.scene_name(p.name): p.symbol for p in s.parameters}
@@ -301,7 +301,7 @@ def _signals_read_parameters(target: Target) -> bool:
     return "signal" in target.program and bool(target.program["signal"].uses & parameters)
 
 
-def _called(target: Target, name: str) -> str:
+def _call_of(target: Target, name: str) -> str:
     """Return the C call of an evaluation function; "" if the scene does not have it."""
     return (
         Public(target).evaluation(name).call() if program_function(target, name) is not None else ""

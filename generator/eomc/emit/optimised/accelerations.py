@@ -46,7 +46,7 @@ class Accelerations:
         return tuple(p.name for p in self.target.system.parameters)
 
     @cached_property
-    def staged(self) -> tuple[Function, Function]:
+    def precomputed_and_remaining(self) -> tuple[Function, Function]:
         """The accelerations as two functions of the program.
 
         The first computes all expressions that depend on the parameters only, once for a run; the
@@ -100,10 +100,10 @@ class Accelerations:
     @property
     def constants(self) -> tuple[str, ...]:
         """Names of the precomputed expressions, which depend on the parameters only."""
-        return tuple(o.name for o in self.staged[0].outputs)
+        return tuple(o.name for o in self.precomputed_and_remaining[0].outputs)
 
     @cached_property
-    def rotated(self) -> tuple[tuple[Angle, ...], Function]:
+    def angles_and_function(self) -> tuple[tuple[Angle, ...], Function]:
         """The angles in the accelerations, and the function for the accelerations without sines.
 
         The function takes the sines and cosines of the angles as arguments, so that a step can
@@ -111,13 +111,13 @@ class Accelerations:
         cosine of its own for the type of numbers.
         """
         if not self.target.real.reach:
-            return (), self.staged[1]
-        return two_point.separate_angles(self.staged[1], self.target.names)
+            return (), self.precomputed_and_remaining[1]
+        return two_point.separate_angles(self.precomputed_and_remaining[1], self.target.names)
 
     @property
     def angles(self) -> tuple[Angle, ...]:
         """Angles whose sines and cosines are arguments of the function for the accelerations."""
-        return self.rotated[0]
+        return self.angles_and_function[0]
 
     @cached_property
     def parts(self) -> two_point.Parts | None:
@@ -130,7 +130,7 @@ class Accelerations:
             return None
         early = {a.name for a in self.function.early}
         return two_point.split(
-            self.rotated[1], self.angles, target.system, {*self.parameter_names, *early}
+            self.angles_and_function[1], self.angles, target.system, {*self.parameter_names, *early}
         )
 
     @property
@@ -140,9 +140,9 @@ class Accelerations:
         return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
 
     @property
-    def long(self) -> bool:
+    def is_long(self) -> bool:
         """Whether the C function for the accelerations is too long to be inlined in every stage.
 
         Compilation would take too long if it were inlined.
         """
-        return outline.weight(self.rotated[1]) > MAX_INLINED_OPERATIONS
+        return outline.weight(self.angles_and_function[1]) > MAX_INLINED_OPERATIONS

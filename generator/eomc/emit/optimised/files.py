@@ -24,7 +24,7 @@ from eomc.emit.optimised.accelerations import Accelerations
 from eomc.emit.optimised.lanes import INLINE, Lane
 from eomc.emit.optimised.runs import prediction_width
 from eomc.emit.optimised.steppers import LaneFields, Steppers
-from eomc.emit.projection import project
+from eomc.emit.projection import project_view
 from eomc.emit.sources import SourceFields
 from eomc.emit.views import NameFields, PrefixFields, Show
 from eomc.integrators.tableaux import RK4
@@ -231,7 +231,7 @@ def steppers(target: Target) -> Steppers:
     return Steppers(Accelerations(target), functions, linearization(functions))
 
 
-def rooms(steppers: Steppers) -> list[int]:
+def workspace_sizes(steppers: Steppers) -> list[int]:
     """Return the lengths of the workspaces that runs in optimised C need, as counts of numbers.
 
     The list has one length for each integration method with fixed steps, and then the length for
@@ -249,7 +249,7 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
     """
     functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    header = show(sources.header(functions, slopes, stamp, rooms(steppers), fast=True))
+    header = show(sources.header(functions, slopes, stamp, workspace_sizes(steppers), fast=True))
     source = show(
         OptimisedSourceView(
             **sources.source_fields(functions, stamp, slopes, show),
@@ -270,7 +270,7 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
 def _wide(steppers: Steppers) -> bool:
     """Return True if code for vector registers is needed."""
     run = steppers.accelerations.target.system.run
-    return run.batch or steppers.functions.swept
+    return run.batch or steppers.functions.iterates_stages
 
 
 def _csrc(steppers: Steppers) -> Iterator[str]:
@@ -286,7 +286,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
     angles = steppers.functions.has_grouped_angles or simd
     if angles:
         lanes += [("four", str(4 * size), simd)]
-    if RK4 in steppers.methods and steppers.predicted:
+    if RK4 in steppers.methods and steppers.predicts_angles:
         prediction_bytes = size * prediction_width(len(steppers.accelerations.angles))
         lanes += [("ahead", str(prediction_bytes), False)]
     texts = [(f"sincos/sincos{end}.h", "", "")] if target.sincos else []
@@ -298,7 +298,9 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
         texts += [(f"lanes/rotate{end}.h", name, width)] * (rotates_angles and rotates)
         needed_functions = (
-            LANE_FUNCTIONS & set(steppers.one.calls) if name in ("wide", "two") else frozenset()
+            LANE_FUNCTIONS & set(steppers.one.math_functions)
+            if name in ("wide", "two")
+            else frozenset()
         )
         selects = bool(needed_functions) or (name == "wide" and adaptive.steps_in_parallel(target))
         texts += [("lanes/select.h", name, width)] * selects
@@ -312,7 +314,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
         integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
         for old, new in (
             # With many angles, inlining the sincos of each makes the code of gcc 50 % slower.
-            *([("static inline void", "static void")] if steppers.accelerations.long else ()),
+            *([("static inline void", "static void")] if steppers.accelerations.is_long else ()),
             ("EOMC_BITS_OF_SIZE", bits),
             ("EOMC_INTEGER", integer),
             # Compilers pass values with larger alignment than a register in different ways.
@@ -346,7 +348,7 @@ def _lanes(steppers: Steppers, show: Show) -> Iterator[str]:
         yield _library_text(steppers.wide, show)
         yield _lane(steppers, steppers.wide, show)
     if steppers.functions.projection:
-        yield show(project(steppers.functions))
+        yield show(project_view(steppers.functions))
         for lane in (steppers.one, *([steppers.wide] * batch)):
             yield show(lane.projection_view(steppers.functions))
     if batch:
@@ -357,7 +359,7 @@ def _lanes(steppers: Steppers, show: Show) -> Iterator[str]:
                 lane=steppers.wide.real.name,
                 constants=steppers.wide.constants if steppers.accelerations.constants else "",
                 inputs=bool(steppers.accelerations.target.system.inputs),
-                blocks=1 if steppers.accelerations.long else 4,
+                blocks=1 if steppers.accelerations.is_long else 4,
             )
         )
 
@@ -383,8 +385,8 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
             angles=lane.angle_count if s.angles else "",
             count=len(s.angles),
             across=lane.simd_angles,
-            angles_at=lane.linear("angles_at", "q", offset=True),
-            changes=lane.linear("changes", "d", offset=False),
+            angles_at=lane.angles_function("angles_at", "q", offset=True),
+            changes=lane.angles_function("changes", "d", offset=False),
             sincos=lane.sincos,
             signal=signal,
             signal_call=""
@@ -394,7 +396,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
             rates_call=lane.velocity.function.call(k="&k", point="0")
             if parts
             else lane.rates.function.call(),
-            accelerations=lane.all_in_one,
+            accelerations=lane.accelerations_function,
             two_point=parts is not None,
             takes_c=bool(s.constants),
             alone=lane.computes_own_sines,
@@ -404,7 +406,7 @@ def _lane(steppers: Steppers, lane: Lane, show: Show) -> str:
 
 def _library_text(lane: Lane, show: Show) -> str:
     """Return the functions of the mathematics library over a lane of several numbers."""
-    names = set(lane.calls) - LANE_FUNCTIONS
+    names = set(lane.math_functions) - LANE_FUNCTIONS
     if lane.name == "wide" and adaptive.steps_in_parallel(lane.accelerations.target):
         names.add("sqrt")
     return show(
@@ -414,7 +416,7 @@ def _library_text(lane: Lane, show: Show) -> str:
             **lane.names,
             count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
             calls=tuple(
-                _library(lane.accelerations, n, lane.end == "_wide") for n in sorted(names)
+                _library(lane.accelerations, n, lane.suffix == "_wide") for n in sorted(names)
             ),
         )
     )
@@ -467,16 +469,16 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
             yield from (show(steppers.explicit(lane, m)) for lane in lanes)
         if runs.predicts(steppers, m):
             yield show(steppers.predictions())
-        yield show(runs.state(steppers, m))
+        yield show(runs.state_view(steppers, m))
         if runs.predicts(steppers, m):
             yield show(steppers.prediction())
         if m.sweeps:
             yield show(steppers.stages(m)) + "\n" + show(steppers.sweeps(m)).rstrip("\n")
         elif m.implicit:
             yield show(steppers.gauss(m))
-        yield show(runs.loop(steppers, m))
+        yield show(runs.runs_view(steppers, m))
         if run.batch:
-            yield show(runs.batch(steppers, m))
+            yield show(runs.batch_view(steppers, m))
     if run.tolerance is not None:
         if adaptive.METHOD not in steppers.methods:
             yield show(steppers.stages(adaptive.METHOD))
@@ -484,7 +486,7 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
         if run.batch:
             side_by_side = adaptive.steps_in_parallel(steppers.accelerations.target)
             batch_view = (
-                runs.adaptive_lanes(steppers, _adaptive(steppers)) if side_by_side else None
+                runs.adaptive_lanes_view(steppers, _adaptive(steppers)) if side_by_side else None
             )
             yield show(batch_view or adaptive.batch_view(steppers.functions))
     yield from map(show, step_derivatives(steppers.functions))
@@ -493,9 +495,9 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
 def _adaptive(steppers: Steppers) -> adaptive.SweepInterface:
     """Return the iteration over the stages for adaptive steps, one stage per lane element."""
     one, m = steppers.one, adaptive.METHOD
-    sweep = steppers.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
+    sweep = steppers.sweep_prototype(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
     return adaptive.SweepInterface(
-        steppers.stepping(one), sweep, steppers.accelerate(one, a="f"), one.c_width,
+        steppers.step_arguments(one), sweep, steppers.accelerate(one, a="f"), one.c_width,
         bool(steppers.accelerations.constants), runs.constants_call(steppers),
         f"{one.target.PREFIX}_LANES",
         one.project_end_call(s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"

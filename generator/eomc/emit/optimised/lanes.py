@@ -29,12 +29,12 @@ from eomc.program.two_point import Angle
 INLINE, NOINLINE = "INLINE", "NOINLINE"
 
 
-def four(n: int) -> int:
+def padded_size(n: int) -> int:
     """Return the smallest multiple of four that is at least `n`."""
     return -(-n // FOUR) * FOUR
 
 
-def interleaved(k: int) -> int:
+def interleaved_index(k: int) -> int:
     """Return the position of coordinate or angle number `k` in the vectors of two_point.c.
 
     That template computes with two configurations q in one vector register. In each group of four,
@@ -94,7 +94,7 @@ class Lane:
         return self.accelerations.target.prefix
 
     @property
-    def end(self) -> str:
+    def suffix(self) -> str:
         """The suffix of C names for this lane type, such as "_wide"; "" for plain numbers."""
         return f"_{self.name}" if self.name else ""
 
@@ -134,7 +134,7 @@ class Lane:
     @property
     def constants(self) -> str:
         """The C type of the struct with the precomputed expressions of the parameters."""
-        return f"{self.prefix}_constants{self.end if self.name != 'two' else ''}"
+        return f"{self.prefix}_constants{self.suffix if self.name != 'two' else ''}"
 
     @property
     def qualifiers(self) -> Mapping[str, str]:
@@ -145,7 +145,7 @@ class Lane:
     def names(self) -> dict[str, Any]:
         """The fields of the template data class `LaneFields` for this lane type, by name."""
         inline = self.qualifiers[INLINE]
-        return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
+        return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.suffix}
 
     @property
     def unroll(self) -> str:
@@ -190,7 +190,10 @@ class Lane:
         if not self.padded:
             return n
         first = self.contiguous_angles or 0
-        return max(four(n), four(first + four(len(self.accelerations.angles))))
+        return max(
+            padded_size(n),
+            padded_size(first + padded_size(len(self.accelerations.angles))),
+        )
 
     @property
     def c_width(self) -> str:
@@ -226,7 +229,7 @@ class Lane:
         if name == "t":
             return CArgument(self.real.name, "t")
         if name == "s":
-            return c.input_array(f"{self.prefix}_sines{self.end}", "s")
+            return c.input_array(f"{self.prefix}_sines{self.suffix}", "s")
         if name == "c":
             return c.input_array(self.constants, "c")
         return c.input_array(self.real.name, name)
@@ -265,7 +268,7 @@ class Lane:
         """
         expressions = {n: c.member("c", n) for n in self.accelerations.constants}
         for n, a in enumerate(self.accelerations.angles):
-            k = interleaved(n) if self.name == "two" else n
+            k = interleaved_index(n) if self.name == "two" else n
             expressions[a.sine] = f"{c.member('s', 's')}[{k}]"
             expressions[a.cosine] = f"{c.member('s', 'c')}[{k}]"
         return expressions
@@ -282,7 +285,7 @@ class Lane:
 
     def _interleaved(self, array: str, name: str) -> str:
         """Return the element of a coordinate in the interleaved layout of two points."""
-        return f"{array}[{interleaved(self.target.names.index(name))}]"
+        return f"{array}[{interleaved_index(self.target.names.index(name))}]"
 
     def generate_function(
         self,
@@ -313,7 +316,7 @@ class Lane:
         function = rename_reserved(function)
         out, supplied_by = signature.out, self._supplied_by(signature)
         outer = CFunction(
-            f"{self.prefix}_{signature.name}{self.end}",
+            f"{self.prefix}_{signature.name}{self.suffix}",
             self.mask,
             (*([out] if out else []), *(a for a, _ in supplied_by)),
             qualifier=self.qualifiers[INLINE if inline else NOINLINE],
@@ -351,7 +354,7 @@ class Lane:
         supplied_by, where = self._supplied_by(signature), self._expressions(signature)
         parts = outline.split(function, outline.PIECE)
         shared = {n: c.member("v", n) for part in parts for n in part.keeps}
-        values = f"{self.prefix}_{name}_values{self.end}"
+        values = f"{self.prefix}_{name}_values{self.suffix}"
         pieces: list[CFunction] = []
         calls: list[str] = []
         for k, part in enumerate(parts, 1):
@@ -366,7 +369,7 @@ class Lane:
             arguments = (*head, *(a for a, names in supplied_by if names & f.uses))
             fails = self._fails(body)
             piece = CFunction(
-                f"{self.prefix}_{name}_{k}{self.end}",
+                f"{self.prefix}_{name}_{k}{self.suffix}",
                 self.mask if fails else "void",
                 arguments,
                 self._statements(f, body, [places[n] for n in part.outputs], fails),
@@ -446,7 +449,7 @@ class Lane:
         """The C function for the accelerations from the state, its sines and the inputs."""
         doc = cost_sentence(self.accelerations.function)
         signature = Signature("rates", self.out, self.places)
-        return self.generate_function(self.accelerations.rotated[1], signature, doc)
+        return self.generate_function(self.accelerations.angles_and_function[1], signature, doc)
 
     @cached_property
     def signal(self) -> GeneratedFunction | None:
@@ -480,10 +483,12 @@ class Lane:
         extra = [(p, parameters, c.member("p", "{}"))] if target.needs_p else ()
         signature = Signature("compute_constants", out, places, (), {}, extra)
         return self.generate_function(
-            self.accelerations.staged[0], signature, "Constants of the parameters."
+            self.accelerations.precomputed_and_remaining[0],
+            signature,
+            "Constants of the parameters.",
         )
 
-    def linear(self, what: str, vector: str, offset: bool) -> CFunction:
+    def angles_function(self, what: str, vector: str, offset: bool) -> CFunction:
         """Return the C function for the angles of the accelerations, or for changes of them.
 
         An angle is a linear combination of coordinates plus a constant; the accelerations read its
@@ -498,9 +503,9 @@ class Lane:
         if self.padded and self.contiguous_angles is not None:
             sums = c.copy_loop("x", vector, self.contiguous_angles, self.angle_count)
         else:
-            sums = self._stored("x", values, four(len(values)))
+            sums = self._stored("x", values, padded_size(len(values)))
         return CFunction(
-            f"{self.prefix}_{what}{self.end}", "void",
+            f"{self.prefix}_{what}{self.suffix}", "void",
             (c.output_array(self.real.name, "x"), c.input_array(self.real.name, vector)),
             (Block("", sums),), frozenset({"x", vector}), self.qualifiers[INLINE],
         )  # fmt: skip
@@ -514,7 +519,7 @@ class Lane:
         return Printer(self.prefix, self.real, where).value(Sum(angle.terms, offset))[0]
 
     @cached_property
-    def calls(self) -> tuple[str, ...]:
+    def math_functions(self) -> tuple[str, ...]:
         """Sorted names of the mathematical functions in the scene's accelerations and signals.
 
         The projection onto the constraints is included; sine and cosine are not.
@@ -543,19 +548,19 @@ class Lane:
         angles are computed at once.
         """
         n = len(self.accelerations.angles)
-        return str(four(n) if self.accelerations.simd_angles and self.name != "wide" else n)
+        return str(padded_size(n) if self.accelerations.simd_angles and self.name != "wide" else n)
 
     @cached_property
-    def all_in_one(self) -> CFunction:
+    def accelerations_function(self) -> CFunction:
         """Prototype of the C function for the accelerations at a state.
 
         If the inputs u are NULL, the function computes them from the scene's signals (formulas for
         inputs). If the sines s of the angles are NULL, it computes these too.
         """
         arguments = (self.out, *map(self.argument, self.argument_names))
-        called = self.padded or self.accelerations.long
+        called = self.padded or self.accelerations.is_long
         return CFunction(
-            f"{self.prefix}_accelerations{self.end}", self.mask, arguments,
+            f"{self.prefix}_accelerations{self.suffix}", self.mask, arguments,
             qualifier=self.qualifiers[NOINLINE if called else INLINE],
         )  # fmt: skip
 
@@ -606,7 +611,7 @@ class Lane:
         out = tuple(c.output_array(self.real.name, n) for n in "rv")
         singular_flag = () if self.name else (CArgument("int *", "singular"),)
         return CFunction(
-            f"{self.prefix}_projected{self.end}",
+            f"{self.prefix}_projected{self.suffix}",
             self.mask if self.name else f"{self.prefix}_status",
             (*out, *map(self.argument, self._constraint_arguments()), *singular_flag),
             qualifier=self.qualifiers[NOINLINE],
@@ -676,16 +681,16 @@ class Lane:
         rate_terms = None if self.name else self.rate_terms
         return ProjectionView(
             **projection.shared_fields(functions),
-            L=self.end,
+            L=self.suffix,
             lane=self.real.name,
             mask=self.mask,
             extent=self.c_width,
             increments=True,
-            sines=f"{self.prefix}_sines{self.end}" if sines else "",
-            sines_call=f"{self.prefix}_sines_at{self.end}(&own, at)"
+            sines=f"{self.prefix}_sines{self.suffix}" if sines else "",
+            sines_call=f"{self.prefix}_sines_at{self.suffix}(&own, at)"
             if sines and self.computes_own_sines
             else "",
-            onto=self.project_stage if functions.swept and not self.name else None,
+            onto=self.project_stage if functions.iterates_stages and not self.name else None,
             projection=self.correction,
             function=self.project_end,
             call=self.correction.function.call(**state),

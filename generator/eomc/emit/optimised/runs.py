@@ -202,10 +202,10 @@ def predicts(steppers: Steppers, m: Method) -> bool:
 
     The sines and cosines of these predicted angles are then computed in advance.
     """
-    return m is RK4 and steppers.predicted
+    return m is RK4 and steppers.predicts_angles
 
 
-def state(steppers: Steppers, m: Method) -> RunStateView:
+def state_view(steppers: Steppers, m: Method) -> RunStateView:
     """Return the template data of the C struct with the state of a run by the method `m`."""
     lane = steppers.one
     return RunStateView(
@@ -252,15 +252,17 @@ def constants_call(steppers: Steppers) -> str:
     return "" if is_empty else function.call(c="&constants")
 
 
-def loop(steppers: Steppers, m: Method) -> OptimisedRunsView:
+def runs_view(steppers: Steppers, m: Method) -> OptimisedRunsView:
     """Return the template data of the C functions for one step and many steps of the method `m`."""
     lane, s, public = steppers.one, steppers.accelerations, steppers.functions.public
     run = public.run(m.name)
-    corrected = steppers.corrected(m)
+    corrected = steppers.passes_sines_to_projection(m)
     here = {"q": "x.q", "qd": "x.qd", "u": "input", "m": "&x", "end": "&sines"}
     end = [c.output_array(f"{lane.prefix}_sines", "end")] if corrected else []
-    advance = steppers.implicit(m) if m.implicit else steppers.advanced(lane, m.name, *end)
-    alone = steppers.advanced(lane, f"{m.name}_alone")
+    advance = (
+        steppers.implicit_step(m) if m.implicit else steppers.step_prototype(lane, m.name, *end)
+    )
+    alone = steppers.step_prototype(lane, f"{m.name}_alone")
     step_end = {"q": "x.q", "qd": "x.qd", "t": "t + h", "singular": "&singular"}
     first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "input", "a": "x.a"}
     zeros = dict.fromkeys(("first", "every", "q_rows", "qd_rows", "memory", "u_stride"), "0")
@@ -273,7 +275,7 @@ def loop(steppers: Steppers, m: Method) -> OptimisedRunsView:
         step=public.step(m.name),
         run_once=run.call(**zeros, t0="t", steps="1", status="&status"),
         run=run,
-        **steppers.driven,
+        **steppers.step_fields,
         unread_p=lane.target.needs_p
         and not constants_call(steppers)
         and "p" not in {a.name for a in advance.arguments},
@@ -282,7 +284,7 @@ def loop(steppers: Steppers, m: Method) -> OptimisedRunsView:
         implicit=m.implicit,
         padded=m.implicit and lane.padded,
         predicted=predicts(steppers, m),
-        start_call=lane.all_in_one.call(**first),
+        start_call=lane.accelerations_function.call(**first),
         predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",
         advance=advance.call(**here),
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
@@ -292,11 +294,11 @@ def loop(steppers: Steppers, m: Method) -> OptimisedRunsView:
     )
 
 
-def batch(steppers: Steppers, m: Method) -> OptimisedBatchView:
+def batch_view(steppers: Steppers, m: Method) -> OptimisedBatchView:
     """Return the template data of the C function that steps many instances by the method `m`."""
     lane, s = steppers.one, steppers.accelerations
     rk4 = m is RK4
-    alone = steppers.advanced(lane, "rk4_alone" if rk4 and s.angles else m.name)
+    alone = steppers.step_prototype(lane, "rk4_alone" if rk4 and s.angles else m.name)
     has_own_constants = bool(constants_call(steppers)) and lane.target.needs_p
     return OptimisedBatchView(
         **steppers.extended(lane),
@@ -305,7 +307,7 @@ def batch(steppers: Steppers, m: Method) -> OptimisedBatchView:
         batch=steppers.functions.public.batch(m.name),
         rk4=rk4,
         angles=bool(s.angles),
-        **steppers.driven,
+        **steppers.step_fields,
         shared_signals=steppers.shared_signals,
         members=s.constants,
         unread_p=lane.target.needs_p and not has_own_constants,
@@ -313,10 +315,10 @@ def batch(steppers: Steppers, m: Method) -> OptimisedBatchView:
         compute_constants=constants_call(steppers),
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         alone=alone.call(q="at", qd="moving", u="input"),
-        corrected=steppers.corrected(m),
+        corrected=steppers.passes_sines_to_projection(m),
         project=steppers.wide.project_end_call(
             q="from[b].q", qd="from[b].qd", t="t + h", c="&from[b].c",
-            s="&w[b].end" if steppers.corrected(m) else "NULL",
+            s="&w[b].end" if steppers.passes_sines_to_projection(m) else "NULL",
         ),
         project_alone=lane.project_end_call(
             q="at", qd="moving", t="t + h", singular="&singular", s="NULL"
@@ -332,7 +334,7 @@ def prediction_width(angles: int) -> int:
     return 1 << (2 * angles - 1).bit_length()
 
 
-def adaptive_lanes(steppers: Steppers, form: SweepInterface) -> AdaptiveLanesView:
+def adaptive_lanes_view(steppers: Steppers, form: SweepInterface) -> AdaptiveLanesView:
     """Return the template data for adaptive steps of many instances side by side.
 
     steppers: the scene's integration methods in optimised C. form: the C calls and arguments that

@@ -428,7 +428,7 @@ class Steppers:
         return self.accelerations.parts is not None
 
     @property
-    def predicted(self) -> bool:
+    def predicts_angles(self) -> bool:
         """Whether RK4 extrapolates angles of a single trajectory from one step to the next.
 
         The sines and cosines of the extrapolated angles are then computed in advance.
@@ -438,7 +438,7 @@ class Steppers:
         free = not (self.two_point or s.target.system.constraints)
         return few and s.target.real is DOUBLE and free
 
-    def corrected(self, method: Method) -> bool:
+    def passes_sines_to_projection(self, method: Method) -> bool:
         """Return True if steps of `method` pass sines and cosines to the constraint projection.
 
         These are the sines and cosines of the angles at the end of the step, which the projection
@@ -470,7 +470,7 @@ class Steppers:
         """
         run = self.accelerations.target.system.run
         alone = run.methods == ("rk4",) and run.tolerance is None
-        return self.shared_signals and alone and not self.predicted
+        return self.shared_signals and alone and not self.predicts_angles
 
     def accelerate(self, lane: Lane, **passed: str) -> str:
         """Return a C call of the function for the accelerations.
@@ -481,10 +481,10 @@ class Steppers:
         """
         if self.accelerations.angles:
             passed = {"s": "NULL"} | passed
-        return lane.all_in_one.call(**passed)
+        return lane.accelerations_function.call(**passed)
 
     @property
-    def driven(self) -> dict[str, Any]:
+    def step_fields(self) -> dict[str, Any]:
         """The fields of the template data class `StepFields`, by name.
 
         They state whether steps read time, inputs and precomputed expressions.
@@ -511,7 +511,7 @@ class Steppers:
 
     # what a step takes
 
-    def stepping(self, lane: Lane) -> tuple[CArgument, ...]:
+    def step_arguments(self, lane: Lane) -> tuple[CArgument, ...]:
         """Return the arguments of the C function for one step: q, qd, t, h, u and c.
 
         Arguments that the scene does not need (t, u, c) are left out. h is the step size, and c the
@@ -524,7 +524,7 @@ class Steppers:
         position = next((k for k, n in enumerate(names) if n in "uc"), len(names))
         return (*arguments[:position], CArgument(real, "h"), *arguments[position:])
 
-    def advanced(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
+    def step_prototype(self, lane: Lane, name: str, *extra: CArgument) -> CFunction:
         """Return the prototype of the C function that computes one step of a method.
 
         The function stores the increments of q and q̇ in its arguments r and v. lane: the C type
@@ -533,7 +533,9 @@ class Steppers:
         """
         out = tuple(c.output_array(lane.real.name, n) for n in "rv")
         return CFunction(
-            f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *extra)
+            f"{lane.prefix}_{name}{lane.suffix}",
+            lane.mask,
+            (*out, *self.step_arguments(lane), *extra),
         )
 
     # methods
@@ -552,7 +554,7 @@ class Steppers:
         return OptimisedRK4View(
             **self.looping(lane),
             **lane.names,
-            **self.driven,
+            **self.step_fields,
             extent=lane.c_width,
             noinline=lane.qualifiers[NOINLINE],
             constants_type=lane.constants,
@@ -571,8 +573,8 @@ class Steppers:
             velocity_call=lane.velocity.function.call(**here, k=f"&{known}", point="k % 2")
             if two_point
             else "",
-            stage_call=lane.all_in_one.call(**here),
-            corrected=self.corrected(RK4),
+            stage_call=lane.accelerations_function.call(**here),
+            corrected=self.passes_sines_to_projection(RK4),
         )
 
     def predictions(self) -> PredictionsView:
@@ -596,7 +598,7 @@ class Steppers:
         shared = self.shared_signals
 
         def stage(k: int) -> str:
-            names = ["&w", *(a.name for a in self.stepping(lane))]
+            names = ["&w", *(a.name for a in self.step_arguments(lane))]
             named = {"q": "x.q", "qd": "x.qd", "u": "w.u[0]" if shared else "input"}
             arguments = [str(k), "1", *(named.get(n, n) for n in names)]
             return f"{lane.prefix}_rk4_stage({', '.join(arguments)})"
@@ -609,7 +611,7 @@ class Steppers:
             **self.looping(lane),
             noinline=lane.qualifiers[NOINLINE],
             angles=len(s.angles),
-            **self.driven,
+            **self.step_fields,
             shared_signals=shared,
             signal_first=signalled("w.u[2]", f"t0 + ({real})(first + n)*h"),
             signal_mid=signalled("w.u[1]", "t + h/2"),
@@ -644,7 +646,7 @@ class Steppers:
             unroll=lane.unroll,
             extent=lane.c_width,
             **lane.names | ({} if m.stages < 4 else {"inline": lane.qualifiers[NOINLINE]}),
-            **self.driven,
+            **self.step_fields,
             clear=lane.clear,
             constants_type=lane.constants,
             name=m.name,
@@ -658,12 +660,12 @@ class Steppers:
             velocity=total(round_weights(m.b, real)),
         )
 
-    def implicit(self, m: Method) -> CFunction:
+    def implicit_step(self, m: Method) -> CFunction:
         """Return the prototype of the C function for a step of the implicit method `m`."""
         lane = self.one
         state = c.output_array(f"{lane.prefix}_{m.name}_state", "m")
         extra = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
-        prototype = self.advanced(lane, m.name, *extra, state)
+        prototype = self.step_prototype(lane, m.name, *extra, state)
         return c.static_prototype(prototype.name, f"{lane.prefix}_status", *prototype.arguments)
 
     @property
@@ -676,10 +678,10 @@ class Steppers:
         if slopes is None or not self.accelerations.target.needs_p:
             return False
         arguments_read = {a.name for a in slopes.slopes.function.arguments}
-        return "p" in arguments_read or bool(slopes.signal_call) or self.follows
+        return "p" in arguments_read or bool(slopes.signal_call) or self.signals_read_state
 
     @property
-    def follows(self) -> bool:
+    def signals_read_state(self) -> bool:
         """Whether the scene's signals (formulas for its inputs) depend on the state."""
         return self.accelerations.target.signal_state
 
@@ -688,7 +690,7 @@ class Steppers:
         lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
         assert slopes is not None
         f = self.functions
-        signal = f.signal if slopes.signal_call or self.follows else None
+        signal = f.signal if slopes.signal_call or self.signals_read_state else None
         state = lane.argument
         time_and_inputs = [n for n in ("t", "u") if n in lane.argument_names]
         factor = c.static_prototype(
@@ -701,7 +703,7 @@ class Steppers:
         arguments_read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
         return OptimisedGaussView(
             **self.extended(lane),
-            **self.literals,
+            **self.literal_fields,
             nudge=target.literal(sqrt(real.epsilon)),
             title=m.title,
             source=m.source,
@@ -717,10 +719,10 @@ class Steppers:
             ),
             signal_call=slopes.signal_call,
             follows=signal.call(u="near_u", q="near_q", qd="near_qd")
-            if signal and self.follows
+            if signal and self.signals_read_state
             else "",
             slopes_call=slopes.slopes_call,
-            solve=self.implicit(m),
+            solve=self.implicit_step(m),
             factor_now=factor.call(),
             factor_mid=factor.call(q="mid_q", qd="mid_qd", t="t + h/2"),
             start=self.accelerate(lane, a="f"),
@@ -728,7 +730,7 @@ class Steppers:
         )
 
     @property
-    def literals(self) -> dict[str, Any]:
+    def literal_fields(self) -> dict[str, Any]:
         """Template fields by name, for the C type of numbers.
 
         f: suffix of C literals. fabs: name of the C function for |x|. eps: the rounding unit.
@@ -740,7 +742,7 @@ class Steppers:
             "eps": self.one.target.literal(real.epsilon),
         }  # fmt: skip
 
-    def sweep(self, m: Method) -> CFunction:
+    def sweep_prototype(self, m: Method) -> CFunction:
         """Return the prototype of the C function for one iteration over the stages of `m`.
 
         From the accelerations at all stages of a step it computes improved ones, side by side in
@@ -749,11 +751,11 @@ class Steppers:
         P = f"{self.one.prefix}_{m.name}"
         out = c.output_array(f"{P}_stages", "b")
         arguments = (c.input_array(f"{P}_stages", "a"), c.input_array(f"{P}_sums", "w"))
-        others = (*self.stepping(self.one), *self.functions.moves_stages)
+        others = (*self.step_arguments(self.one), *self.functions.onto_argument)
         return c.static_prototype(f"{P}_sweep", "int", out, *arguments, *others)
 
     def stages(self, m: Method) -> StagesView:
-        """Return the template data of the C function whose prototype `sweep` returns.
+        """Return the template data of the C function whose prototype `sweep_prototype` returns.
 
         It makes one fixed-point iteration over all stages of a step by the implicit method `m`.
         """
@@ -775,7 +777,7 @@ class Steppers:
             c=literals(m.c, real),
             within=(by_stage(m.a), by_stage(m.a_squared)),
             extrapolated=before,
-            sweep=self.sweep(m),
+            sweep=self.sweep_prototype(m),
             together=self.accelerate(
                 wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? input : NULL", c="&wide"
             ),
@@ -786,7 +788,7 @@ class Steppers:
         )
 
     def sweeps(self, m: Method) -> SweepsView:
-        """Return the template data of a step of an implicit method `m` that iterates `sweep`.
+        """Return the template data of a step of an implicit method `m` by fixed-point iteration.
 
         The number of iterations is fixed; if they do not converge, the step iterates further.
         """
@@ -794,12 +796,12 @@ class Steppers:
         P = f"{lane.prefix}_{m.name}"
         state = c.output_array(f"{P}_state", "m")
         values = c.output_array(f"{P}_stages", "a")
-        arguments = (values, CArgument("int", "fresh"), *self.stepping(lane), state)
+        arguments = (values, CArgument("int", "fresh"), *self.step_arguments(lane), state)
         settle = c.static_prototype(f"{P}_settle", f"{lane.prefix}_status", *arguments)
-        sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"
+        sweep, within, before = self.sweep_prototype(m), f"&{P}_within", f"&{P}_extrapolated"
         return SweepsView(
             **self.extended(lane),
-            **self.literals,
+            **self.literal_fields,
             # Steps that need more than five iterations are long, with errors above this value.
             enough=lane.target.literal(max(1e-8, real.epsilon)),
             tolerance=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
@@ -821,7 +823,7 @@ class Steppers:
             sweep_back=sweep.call(b="&b", a="&a", w=within, onto="0"),
             sweep_forth=sweep.call(b="&a", a="&b", w=within, onto="0"),
             start=self.accelerate(lane, a="f"),
-            solve=self.implicit(m),
+            solve=self.implicit_step(m),
         )
 
 
