@@ -2,8 +2,9 @@
 
     scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
 
-`load` runs all stages; `sources` stops at the text. Each arrow is a function of one module:
-scene.read, system.from_scene, lagrange.derive, program.build, render.render, cache.build.
+`load` runs all stages; `sources` stops at the text. The arrows are the functions scene.read.read,
+model.from_scene.from_scene, derive.lagrange.derive, program.program.build, emit.render.render and
+toolchain.cache.build.
 """
 
 from __future__ import annotations
@@ -205,11 +206,11 @@ def build(
     else:
         system = None
         name, digest = name_and_digest(Path(scene))
-    folder = cache.place(name, Path(root), form)
+    folder = cache.build_folder(name, Path(root), form)
     try:
         key = cache.key(digest, form)
     except NoCompilerError:
-        if name and (there := cache.key_there(folder, digest, form)):
+        if name and (there := cache.find_valid_key(folder, digest, form)):
             return cache.Built(name, folder, False, there)
         raise
     if name and cache.is_built(folder, key):

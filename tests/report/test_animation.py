@@ -287,7 +287,7 @@ def test_a_batch_as_a_film(batch, tmp_path):
 def film(made, file, **how):
     from eomc.report import film
 
-    film.write([Timeline(system(made), motion(made, **how))], file, None)
+    film.write_film([Timeline(system(made), motion(made, **how))], file, None)
 
 
 @pytest.mark.slow
@@ -346,10 +346,10 @@ def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
         film(scene("cartpole"), tmp_path / "a.gif", seconds=1000.0)
     bare = system(scene("cartpole"))
     bare.scene, bare.definitions = None, ()
-    from eomc.report.film import write
+    from eomc.report.film import write_film
 
     with pytest.raises(EomcError, match="says nothing about its shape"):
-        write([Timeline(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
+        write_film([Timeline(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
 
 
 def test_without_matplotlib_a_film_says_what_to_do(tmp_path, monkeypatch):

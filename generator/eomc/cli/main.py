@@ -31,11 +31,11 @@ class _Group(terminal.CommandGroup):
     """Prints errors that the user can correct without a traceback, with exit status 2."""
 
     def list_commands(self, context: click.Context) -> list[str]:
-        """Return all commands in the order of the help text."""
+        """Return the names of all commands in the order of the help text."""
         return [*COMMANDS]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        """Import and return a command."""
+        """Import the module of a command, and return the command; None if it does not exist."""
         if name not in COMMANDS:
             return None
         module = import_module(f"eomc.cli.{COMMANDS[name]}")
@@ -70,7 +70,7 @@ class _Group(terminal.CommandGroup):
 
 
 def error_text(fault: EomcError) -> str:
-    """Return the message of an error with the notes added to it."""
+    """Return the message of an error, followed by the notes that were added to it."""
     return "\n".join([str(fault), *getattr(fault, "__notes__", ())])
 
 

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and what they have in common."""
+"""Options and arguments that several commands share, and functions that parse and check them."""
 
 from __future__ import annotations
 

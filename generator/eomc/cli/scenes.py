@@ -266,7 +266,7 @@ def _row(path: Path, root: Path) -> Row | None:
     try:
         built = bool(name) and cache.is_built(root / name, cache.key(digest))
     except NoCompilerError:
-        built = bool(cache.key_there(root / name, digest))
+        built = bool(cache.find_valid_key(root / name, digest))
     return {
         "scene": str(path), "name": text["name"], "title": str(text.get("title", "")),
         "coordinates": _keys(text, "coordinates"), "inputs": _keys(text, "inputs"),

@@ -22,7 +22,11 @@ class CommandGroup(click.Group):
     """A group of commands that handles closed or full output streams and missing encodings."""
 
     def main(self, *args: Any, **how: Any) -> Any:
-        """Run as click does; exit with status 2 if output can't be written, 1 after `| head`."""
+        """Run a command as click does.
+
+        Exit with status 2 if the output can't be written, and with status 1 if the program that
+        reads the output has ended, as after `| head`.
+        """
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
             if stream is None:  # closed by the caller
@@ -49,23 +53,23 @@ def _close(name: str) -> None:
 
 
 def fail(message: str) -> NoReturn:
-    """Exit with status 2, for bad input."""
+    """Print a message to stderr, and exit with status 2, which means bad input."""
     say(message, err=True)
     sys.exit(2)
 
 
 def say(words: str = "", err: bool = False) -> None:
-    """Print text; control characters are escaped."""
+    """Print text to stdout, or to stderr if `err` is True. Control characters are escaped."""
     click.echo(texts.lines(words), err=err)
 
 
 def shown(path: object) -> str:
-    """Return the name of a file on one line."""
+    """Return the text of a path or another object on one line, with control characters escaped."""
     return texts.line(str(path))
 
 
 def warn(problem: Problem) -> None:
-    """Print a warning."""
+    """Print a warning about a scene to stderr."""
     say(str(problem), err=True)
 
 
@@ -77,7 +81,11 @@ def _is_interactive(silent: bool) -> bool:
 def progress_bar(
     what: str, silent: bool, after: float = 1.0
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar after `after` seconds, if stderr is a terminal."""
+    """Show a progress bar while the block of the with statement runs, if stderr is a terminal.
+
+    The block receives a function, which it calls as update(completed, total). what: text in front
+    of the bar. silent: True to show no bar. after: time in s after which the bar appears.
+    """
     if not _is_interactive(silent):
         yield lambda completed, total: None
         return
@@ -106,7 +114,10 @@ def progress_bar(
 
 @contextmanager
 def status_line(what: str, silent: bool) -> Iterator[None]:
-    """Show a status line with a spinner, if stderr is a terminal."""
+    """Show a line of text and a spinner while the block runs, if stderr is a terminal.
+
+    what: the text. silent: True to show nothing.
+    """
     if not _is_interactive(silent):
         yield
         return

@@ -83,7 +83,7 @@ def animate(
     timelines = [
         Timeline(system_of(run, scene if k == 0 else None), run) for k, run in enumerate(runs)
     ]
-    return shown(timelines, file, title)
+    return make_animation(timelines, file, title)
 
 
 def instances(
@@ -103,7 +103,9 @@ def instances(
     errors are those of `animate`; in addition, KeyError is raised for unknown names.
     """
     _check(file)
-    return shown([BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title)
+    return make_animation(
+        [BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title
+    )
 
 
 def _check(file: str | os.PathLike[str] | None) -> None:
@@ -113,18 +115,18 @@ def _check(file: str | os.PathLike[str] | None) -> None:
         )
 
 
-def shown(
+def make_animation(
     timelines: Sequence[Timeline], file: str | os.PathLike[str] | None, title: str | None
 ) -> Animation | None:
-    """Make the animation of the timelines (runs to draw side by side) and write it to `file`.
+    """Animate the runs of the timelines, drawn side by side, and write the page or film to `file`.
 
-    Returns the page, or None if the suffix of `file` requests a film. If `file` is None, nothing is
-    written.
+    title: heading that replaces the titles of the scenes. Returns the page, or None if the suffix
+    of `file` requests a film. If `file` is None, no file is written.
     """
     if file is not None and Path(file).suffix.lower() in FILMS:
         from eomc.report import film
 
-        film.write(timelines, Path(file), title)
+        film.write_film(timelines, Path(file), title)
         return None
     count = max(len(list(timeline.panels(np.zeros(1, dtype=int)))) for timeline in timelines)
     animation = Animation(page(timelines, title), count)

@@ -63,6 +63,10 @@ class WorkPrecisionPoint:
         Name of the stepper (integration method).
     h
         Step size in s; for adaptive steps, the mean step size.
+    steps
+        Number of steps.
+    status
+        "ok", or why the run ended early.
     q, qd, end
         Error of the final positions, error of the final velocities, and the larger of these two.
     along
@@ -167,6 +171,8 @@ class WorkPrecisionReport:
 
     Attributes
     ----------
+    scene, title, coordinates
+        Name of the scene, its title, and the names of its coordinates.
     duration
         Simulated time in s.
     digits
@@ -181,7 +187,7 @@ class WorkPrecisionReport:
         Largest condition number of the mass matrix D, with the time t and the coordinates q at
         which it occurs.
     corners
-        Text that lists the non-smooth functions in the equations.
+        Names of the non-smooth functions in the equations, as text.
     events
         Names of the scene's events.
     t
@@ -235,6 +241,7 @@ def measure(
     Parameters
     ----------
     scene : System or path
+        A system, or the path of a scene file.
     root : path, optional
         Build directory.
     longest : float, optional
@@ -242,7 +249,7 @@ def measure(
     methods : sequence of str, optional
         Steppers, "adaptive" among them; all by default.
     progress : callable, optional
-        Called as progress(done, total).
+        Called as progress(completed, total) with the numbers of completed and of all measurements.
 
     Returns
     -------
@@ -461,7 +468,7 @@ def _compare(
 
 
 def simulate(module: ModuleType, **options: Any) -> Any:
-    """Return the run of `module.simulate(**options)`, with all its warnings suppressed."""
+    """Return the run of `module.simulate(**options)`; warnings are suppressed."""
     # failures and advice are what is measured here
     quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
     with quiet, np.errstate(all="ignore"):

@@ -61,7 +61,7 @@ class Equations:
         Constraints zero = 0 and their Jacobian. With constraints, the right-hand side is tau + A^T
         lambda.
     forces : Matrix (nq, 1)
-        Generalized forces without friction, which the scalar equations have on their left.
+        Generalized forces without friction, which is on the left of the scalar equations.
     left : tuple of lists of pairs
         Left-hand side of each scalar equation: pairs of a product of velocities or accelerations,
         and its coefficient.
@@ -247,6 +247,7 @@ def equations(scene: System | ScenePath) -> Equations:
     Parameters
     ----------
     scene : str, path or System
+        Path of a scene file, or a system.
 
     Returns
     -------
@@ -257,7 +258,7 @@ def equations(scene: System | ScenePath) -> Equations:
     Raises
     ------
     SceneError
-        If the scene is faulty.
+        If the scene is invalid.
     EomcError
         If the equations would fill many pages.
     """
@@ -537,9 +538,9 @@ def right_hand_side(driven: bool, system: System) -> str:
 
 
 def constraint_note(c: Constraint) -> list[str]:
-    """Return a list of one line: the name of a constraint, its kind, and if it is redundant.
+    """Return one line, in a list: a constraint's name and kind, and whether it is redundant.
 
-    The kind is "positions" for a holonomic constraint, else "rates".
+    The kind is "positions" if the constraint is holonomic, else "rates".
     """
     parts = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
     parts += ["implied by others, its multiplier 0"] if c.redundant else []

@@ -58,8 +58,13 @@ def write_equations(system: System, form: str = "text") -> str:
     Parameters
     ----------
     system : System
+        The mechanical system.
     form : {"text", "latex", "python"}
         "text" is Unicode text for a terminal; "python" is source code with SymPy matrices.
+
+    Returns
+    -------
+    str
 
     Raises
     ------

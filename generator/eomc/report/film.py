@@ -33,7 +33,7 @@ SIZE, DPI = 4.8, 100  # inches of a run, dots an inch
 WHITE_LEVEL = 248  # entries brighter than this become white: Pillow is off by about 4
 
 
-def write(timelines: Sequence[Timeline], file: Path, title: str | None) -> None:
+def write_film(timelines: Sequence[Timeline], file: Path, title: str | None) -> None:
     """Write a film (.gif or .mp4) that shows the mechanisms side by side in real time.
 
     timelines: the runs to show. Raises EomcError if matplotlib or ffmpeg is missing, the film would

@@ -98,9 +98,11 @@ def digit_rows(report: WorkPrecisionReport) -> list[tuple[str, ...]]:
 
 
 def remarks(report: WorkPrecisionReport) -> list[str]:
-    """Return sentences on chaos, the accuracy of the reference solution, the condition of D, etc.
+    """Return the remarks of the report on the motion, each a sentence.
 
-    Further sentences name events, non-smooth functions and steppers that can't be used.
+    They state how fast perturbations grow (chaos), how accurate the reference solution is, and how
+    well-conditioned the mass matrix D is, and name events, non-smooth functions and the steppers
+    that can't be used.
     """
     g = report.growth
     sentences = [

@@ -138,8 +138,9 @@ def solve(
     Parameters
     ----------
     scene : System or path
+        A system, or the path of a scene file.
     duration : float, optional
-        In s; the scene's duration by default.
+        Duration in s; that of the scene by default.
     rows : int, optional
         Number of equal intervals between the rows + 1 times of the solution; a power of two, so
         that steps of h = duration/2^k end at these times.
@@ -280,8 +281,7 @@ def gauss(stages: int) -> str:
     The text contains the number of stages, c, A, A A, b, b A and weights, separated by blanks.
     Nodes are the zeros of the Legendre polynomial P_s on [0, 1], a_ij = int_0^c_i l_j, by the exact
     rule l_j = b_j sum_k (2k + 1) P_k(c_j) P_k (Hairer & Wanner, Solving ODEs II, sec. IV.5). The
-    weights
-    (2k + 1) b_j P_k(c_j) give the Legendre coefficients of the accelerations.
+    weights (2k + 1) b_j P_k(c_j) give the Legendre coefficients of the accelerations.
     """
     with mpmath.workdps(60):
         n = stages
@@ -402,7 +402,7 @@ class _PlainEquations:
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
         """Solve D q̈ = τ - bias + Aᵀλ for the accelerations q̈ at (q, q̇, t); return them as a list.
 
-        All numbers are of mpmath.
+        All numbers are mpmath numbers.
         """
         u = [mpmath.mpf(0)] * self.m
         if self.m:

@@ -104,7 +104,7 @@ def key(scene_digest: str, form: str = "fast") -> str:
     )
 
 
-def key_there(folder: Path, scene_digest: str, form: str = "fast") -> str:
+def find_valid_key(folder: Path, scene_digest: str, form: str = "fast") -> str:
     """Return the key of the build in `folder` if it is complete and up to date; otherwise "".
 
     It is up to date if scene, eomc, Python, flags and processor are the same as now. The compiler
@@ -212,7 +212,7 @@ def build(
     EomcError
         With the compiler's message if it fails, or if the folder can't be written.
     """
-    folder = place(name, root, form)
+    folder = build_folder(name, root, form)
     root = folder.parent
     if is_built(folder, build_key):
         return Built(name, folder, False, build_key)
@@ -233,11 +233,11 @@ def build(
     return Built(name, folder, True, build_key)
 
 
-def place(name: str, root: Path, form: str = "fast") -> Path:
-    """Return the folder below `root` for the module of the scene `name`.
+def build_folder(name: str, root: Path, form: str = "fast") -> Path:
+    """Return the folder of the module of a scene: `root`/`name`, or a subfolder of it.
 
-    form: "fast" for the module of optimised C; "plain" for that of portable C, whose folder is a
-    subfolder of the former.
+    form: "fast" for the module of optimised C; "plain" for that of portable C, which is in the
+    subfolder .plain.
     """
     return root / name if form == "fast" else root / name / ".plain"
 
