@@ -469,8 +469,9 @@ class AdaptiveFunctions:
 
     @property
     def step_arguments(self) -> Sequence[CArgument]:
-        """The C arguments that are constant during a run, including all that step functions
-        take.
+        """The C arguments that are constant during a run.
+
+        They include all such arguments of the functions for steps of fixed size.
         """
         rest = self.constant_arguments
         present = {a.name for a in rest}

@@ -392,8 +392,7 @@ def _failures(
 
 
 def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) -> str:
-    """Return the condition that a pivot is not positive, or below the rounding error of the
-    diagonal entry.
+    """Return the C condition that a pivot is not larger than the rounding error of its diagonal.
 
     NaN passes: the resulting state is reported as not finite.
     """
@@ -456,8 +455,9 @@ def _sincos_several(
     set_to: Callable[[str, str], str],
     numbers: Iterator[int],
 ) -> list[str]:
-    """Return the statements for sines of several angles. numbers: numbers for names of
-    variables.
+    """Return the statements for sines of several angles.
+
+    numbers: numbers for names of variables.
     """
     lane, lines, groups = f"{printer.prefix}_four", list[str](), list(angles.items())
     for first in range(0, len(groups), FOUR):

@@ -118,79 +118,84 @@ class DerivativeView(NameFields, TableauFields):
 # --- the derivatives of the accelerations ---------------------------------------------------------
 
 
-def linearization(plain: SceneFunctions) -> LinearizationView | None:
+def linearization(functions: SceneFunctions) -> LinearizationView | None:
     """Return the template data for the derivatives of the accelerations q̈.
 
     The derivatives are A_q = ∂q̈/∂q, A_qd = ∂q̈/∂q̇ and B = ∂q̈/∂u. Return None if the program does
-    not contain them. plain: the C functions of the scene.
+    not contain them. functions: the C functions of the scene.
     """
-    target = plain.target
+    target = functions.target
     function = program_function(target, "linearization")
     if function is None:
         return None
-    NQ, inputs = plain.NQ, bool(target.system.inputs)
-    width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
+    NQ, inputs = functions.NQ, bool(target.system.inputs)
+    width = f"2*{NQ} + {functions.NU}" if inputs else f"2*{NQ}"
     cost, doc = cost_sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
     if "linearization" in target.program:
-        slopes = plain.static(function, "slopes", "slopes", doc, fails=True)
+        slopes = functions.static(function, "slopes", "slopes", doc, fails=True)
     else:
         column = "[da/dq, da/dqd, da/du] times along."
-        one = plain.static(function, "slopes_column", "column", column, fails=True)
+        one = functions.static(function, "slopes_column", "column", column, fails=True)
         along = ("column", "along")
         arguments_ = tuple(a for a in one.function.arguments if a.name not in along)
         loop_function = replace(
-            one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
-            arguments=(c.output_array(plain.real, "slopes"), *arguments_),
+            one.function,
+            name=f"{functions.prefix}_slopes",
+            result=functions.status,
+            body=(),
+            doc=(doc,),
+            arguments=(c.output_array(functions.real, "slopes"), *arguments_),
         )  # fmt: skip
         slopes = GeneratedFunction(
             loop_function, (*one.parts, one.function), one.values, one.function.call()
         )
         cost = f"By {width} columns, each: {cost[0].lower()}{cost[1:]}"
-    arguments = plain.arguments(*plain.state, "u", "p")
-    arguments_read = plain.arguments_read(function)
-    reads_u = plain.reads_u(function) and plain.signal is not None
+    arguments = functions.arguments(*functions.state, "u", "p")
+    arguments_read = functions.arguments_read(function)
+    reads_u = functions.reads_u(function) and functions.signal is not None
     return LinearizationView(
-        **plain.names,
+        **functions.names,
         inputs=inputs,
         width=width,
         slopes=slopes,
-        linearization=replace(plain.public.linearization, doc=(cost,)),
+        linearization=replace(functions.public.linearization, doc=(cost,)),
         unread=tuple(a.name for a in arguments if a.name not in arguments_read),
-        signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
+        signal_call=functions.signal.call(u="now") if reads_u and functions.signal else "",
         slopes_call=slopes.function.call(),
     )
 
 
-def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
+def step_derivatives(functions: SceneFunctions) -> Iterator[DerivativeView]:
     """Yield, for each integration method, the data for the template of the derivatives of a step.
 
     The derivatives are with respect to q, qd and u. Nothing is yielded if the scene does not
-    request them. The first method's data include the C functions that all methods share. `plain`
-    has the C functions in portable form.
+    request them. The first method's data include the C functions that all methods share.
+
+    functions: the C functions of the scene.
     """
-    target, real = plain.target, plain.target.real
+    target, real = functions.target, functions.target.real
     run = target.system.run
     if not run.discretize:
         return
     inputs, suffix = bool(target.system.inputs), real.function_suffix
-    state = plain.arguments("q", "qd", *plain.state[2:], "u", "p")
-    J = c.output_array(plain.real, "J")
-    rates = c.static_prototype(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
+    state = functions.arguments("q", "qd", *functions.state[2:], "u", "p")
+    J = c.output_array(functions.real, "J")
+    rates = c.static_prototype(f"{functions.prefix}_stage_slopes", functions.status, J, *state)
     feedback = ""
     if "signal_slopes" in target.program:
-        feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
-    accelerate = plain.acceleration.function.call
-    projection = plain.projection_along
-    projected = _project_derivatives(plain) if projection else None
+        feedback = functions.public.evaluation("signal_slopes").call(slopes="K")
+    accelerate = functions.acceleration.function.call
+    projection = functions.projection_along
+    projected = _project_derivatives(functions) if projection else None
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
         yield DerivativeView(
-            **plain.names,
+            **functions.names,
             inputs=inputs,
-            width=f"2*{plain.NQ} + {plain.NU}" if inputs else f"2*{plain.NQ}",
+            width=f"2*{functions.NQ} + {functions.NU}" if inputs else f"2*{functions.NQ}",
             rates=rates if m is methods[0] else None,
-            linearization=plain.public.linearization.call(),
+            linearization=functions.public.linearization.call(),
             feedback=feedback,
             eliminate=m is first_implicit,
             projection=projection if m is methods[0] else None,
@@ -199,11 +204,11 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
             move=projected.call(X="ends", t="t + h") if projected else "",
             near=target.literal(large_correction_limit(target)),
             scale_floor=target.literal(ZERO_SQUARE),
-            function=plain.public.derivative(m.name),
+            function=functions.public.derivative(m.name),
             implicit=m.implicit,
             stages=m.stages,
             **tableau(m, real),
-            step=plain.public.step(m.name).call(q="at", qd="moving"),
+            step=functions.public.step(m.name).call(q="at", qd="moving"),
             start=accelerate(qdd="a"),
             stage=accelerate(qdd="f" if m.implicit else "a + NQ*i", q="r", qd="v", t="t + c[i]*h"),
             rates_call=rates.call(q="r", qd="v", t="t + c[i]*h"),
@@ -217,16 +222,17 @@ def step_derivatives(plain: SceneFunctions) -> Iterator[DerivativeView]:
         )
 
 
-def _project_derivatives(plain: SceneFunctions) -> CFunction:
-    """Return the static function that projects a step's end and its derivatives onto the
-    constraints.
-    """
-    state = (c.output_array(plain.real, "X"), *(c.output_array(plain.real, n) for n in "rv"))
-    arguments_read = plain.arguments_read(plain.target.program["projection_along"])
+def _project_derivatives(functions: SceneFunctions) -> CFunction:
+    """Return the static function that projects the end of a step, and its derivatives."""
+    state = (
+        c.output_array(functions.real, "X"),
+        *(c.output_array(functions.real, n) for n in "rv"),
+    )
+    arguments_read = functions.arguments_read(functions.target.program["projection_along"])
     other_arguments = (
-        plain.argument("q"),
-        *plain.arguments(*(n for n in ("t", "p") if n in arguments_read)),
+        functions.argument("q"),
+        *functions.arguments(*(n for n in ("t", "p") if n in arguments_read)),
     )
     return c.static_prototype(
-        f"{plain.prefix}_derivative_projected", plain.status, *state, *other_arguments
+        f"{functions.prefix}_derivative_projected", functions.status, *state, *other_arguments
     )

@@ -178,8 +178,9 @@ class InitialEventsView(NameFields):
 def adaptive_views(
     functions: SceneFunctions, form: SweepInterface
 ) -> Iterator[AdaptiveStepView | FixedStepsView | EventsView | InitialEventsView | AdaptiveRunView]:
-    """Yield the data for the templates of adaptive steps, events and runs, in their order in the C
-    file.
+    """Yield the data for the templates of adaptive steps, events and runs.
+
+    They are in the order of the C file.
 
     form: what differs between portable and optimised C. Without events, there are only the
     templates of adaptive steps and runs.
@@ -324,8 +325,7 @@ def _event_view(stepping: AdaptiveFunctions) -> EventsView:
 
 
 def _rounding(stepping: AdaptiveFunctions, extra: Sequence[CArgument]) -> dict[str, Any]:
-    """Return the template variables for the C function that estimates rounding errors of event
-    functions.
+    """Return the fields of `EventsView` for the rounding errors of event functions.
 
     They are its prototype, its call, and the call of the event functions in it. extra: its
     arguments besides the state.
@@ -340,9 +340,7 @@ def _rounding(stepping: AdaptiveFunctions, extra: Sequence[CArgument]) -> dict[s
 
 
 def _jump_flags(system: System) -> tuple[str, ...]:
-    """Return, for each event of the scene, flags in braces: which entries of [q, qd] its jump
-    sets.
-    """
+    """Return, for each event of the scene, flags in braces: the entries of [q, qd] that jump."""
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
     rows = ({name for name, _ in e.jump} for e in system.own_events)
     return c.initialiser_rows([str(int(name in names)) for name in states] for names in rows)

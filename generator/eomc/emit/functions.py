@@ -351,8 +351,7 @@ class SceneFunctions:
         )
 
     def _sum_of_energies(self, energy: CFunction) -> GeneratedFunction | None:
-        """Return the C function `energy` as a call of kinetic_energy plus a call of
-        potential_energy.
+        """Return the C function `energy` as the sum of calls for kinetic and potential energy.
 
         Returns None if the two need arguments that `energy` does not have.
         """
@@ -494,9 +493,7 @@ class SceneFunctions:
 
     @property
     def _projection_arguments(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
-        """The C arguments of a projection: the state to be changed (r, v), and t and p if
-        needed.
-        """
+        """The C arguments of a projection: the state to be changed (r, v); t and p if needed."""
         arguments = (
             self.arguments_read(self.target.program["projection"])
             if self.projection

@@ -366,9 +366,7 @@ def _rows(target: Target) -> dict[str, str]:
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
-    """Return the C calls for step, run, batch and derivative of each integration method in the
-    binding.
-    """
+    """Return the C calls of each integration method in the Python binding."""
     public, p, NQ = Public(target), _parameters(target), f"{target.PREFIX}_NQ"
     memory = f"work ? &{member('work', 'memory')} : NULL"
     return tuple(

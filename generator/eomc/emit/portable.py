@@ -231,27 +231,29 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     show: function that renders template data as text. real: the C type of numbers; by default that
     of the scene.
     """
-    plain = portable_functions(program, real)
-    name = plain.prefix
-    methods = [METHODS[m] for m in plain.target.system.run.methods]
-    loops = [runs_view(plain, m) for m in methods]
-    swept = plain.target.system.run.tolerance is not None or any(m.implicit for m in methods)
-    views: list[View] = [implicit_view(plain, methods)] if swept else []
+    functions = portable_functions(program, real)
+    name = functions.prefix
+    methods = [METHODS[m] for m in functions.target.system.run.methods]
+    loops = [runs_view(functions, m) for m in methods]
+    swept = functions.target.system.run.tolerance is not None or any(m.implicit for m in methods)
+    views: list[View] = [implicit_view(functions, methods)] if swept else []
     views += [
-        view for m, run in zip(methods, loops, strict=True) for view in (step_view(plain, m), run)
+        view
+        for m, run in zip(methods, loops, strict=True)
+        for view in (step_view(functions, m), run)
     ]
-    views += [*step_derivatives(plain), *_adaptive(plain)]
-    if onto := projection.portable_view(plain):
-        views[:0] = [onto, projection.project_view(plain)]
+    views += [*step_derivatives(functions), *_adaptive(functions)]
+    if onto := projection.portable_view(functions):
+        views[:0] = [onto, projection.project_view(functions)]
     steppers = [show(view).rstrip("\n") for view in views]
-    slopes = linearization(plain)
+    slopes = linearization(functions)
     texts = (
-        show(sources.header(plain, slopes, handshake(plain))),
+        show(sources.header(functions, slopes, handshake(functions))),
         show(
             PortableSourceView(
-                **sources.source_fields(plain, handshake(plain), slopes, show),
+                **sources.source_fields(functions, handshake(functions), slopes, show),
                 steppers=tuple(steppers),
-                adaptive=plain.target.system.run.tolerance is not None,
+                adaptive=functions.target.system.run.tolerance is not None,
             )
         ),
     )
@@ -260,20 +262,18 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     }
 
 
-def handshake(plain: SceneFunctions) -> str:
+def handshake(functions: SceneFunctions) -> str:
     """Return a hexadecimal C constant that must be the same in the C source and in its header.
 
     The C compiler reports a header of another scene or form. Optimised C has another constant than
     portable C, since its workspaces differ in size.
     """
-    digest = hashlib.sha256(f"plain {plain.target.system.digest}".encode()).hexdigest()
+    digest = hashlib.sha256(f"plain {functions.target.system.digest}".encode()).hexdigest()
     return f"0x{digest[:8]}u"
 
 
 def _about(m: Method) -> tuple[str, ...]:
-    """Return the description of a method, its reference and stability limits, as lines of a
-    comment.
-    """
+    """Return the lines of a comment on a method: title, reference and stability limits."""
     undamped, decay = m.limits
     stable = f"h omega <= {undamped:.3g} undamped" + (
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
@@ -287,20 +287,20 @@ def _about(m: Method) -> tuple[str, ...]:
 
 
 def step_view(
-    plain: SceneFunctions, m: Method
+    functions: SceneFunctions, m: Method
 ) -> PortableRK4View | PortableExplicitView | PortableGaussView:
     """Return the template data for the C function that makes one step of the method `m`.
 
-    plain: the C functions of the scene.
+    functions: the C functions of the scene.
     """
     if m.implicit:
-        return _gauss(plain, m)
-    accelerate, step = plain.acceleration.function.call, plain.public.step(m.name)
-    advance, correct = _advance(plain, m)
+        return _gauss(functions, m)
+    accelerate, step = functions.acceleration.function.call, functions.public.step(m.name)
+    advance, correct = _advance(functions, m)
     inner = advance.call(singular="&singular")
     if m is RK4:
         return PortableRK4View(
-            **plain.names,
+            **functions.names,
             about=_about(m),
             step=step,
             advance=advance,
@@ -312,122 +312,125 @@ def step_view(
             fourth=accelerate(qdd="a4", q="r", qd="v", t="t + h"),
         )
     return PortableExplicitView(
-        **plain.names,
+        **functions.names,
         about=_about(m),
         step=step,
         advance=advance,
         advance_call=inner,
         correct=correct,
         stages=m.stages,
-        **tableau(m, plain.target.real),
+        **tableau(m, functions.target.real),
         stage=accelerate(qdd="a[i]", q="r", qd="v", t="t + c[i]*h"),
     )
 
 
-def _advance(plain: SceneFunctions, m: Method) -> tuple[CFunction, str]:
+def _advance(functions: SceneFunctions, m: Method) -> tuple[CFunction, str]:
     """Return the function for a step of an explicit method, and the call that projects its end.
 
     With constraints, it is a static function that the public function calls.
     """
-    step = plain.public.step(m.name)
-    if not plain.projection:
+    step = functions.public.step(m.name)
+    if not functions.projection:
         return step, ""
-    singular_flag = plain.project_end.arguments[-1]
+    singular_flag = functions.project_end.arguments[-1]
     inner = c.static_prototype(
-        f"{plain.prefix}_{m.name}", plain.status, *step.arguments, singular_flag
+        f"{functions.prefix}_{m.name}", functions.status, *step.arguments, singular_flag
     )
-    return inner, plain.project_end.call(t="t + h")
+    return inner, functions.project_end.call(t="t + h")
 
 
-def implicit_view(plain: SceneFunctions, methods: Sequence[Method]) -> PortableImplicitView:
+def implicit_view(functions: SceneFunctions, methods: Sequence[Method]) -> PortableImplicitView:
     """Return the template data for the C functions that implicit methods share.
 
-    methods: the integration methods of the scene, of which some may be implicit. plain: the C
+    methods: the integration methods of the scene, of which some may be implicit. functions: the C
     functions of the scene.
     """
-    real, accelerate = plain.target.real, plain.acceleration.function.call
+    real, accelerate = functions.target.real, functions.acceleration.function.call
     newton = any(m.newton for m in methods)
     return PortableImplicitView(
-        **plain.names,
+        **functions.names,
         fabs=f"fabs{real.function_suffix}",
         fmax=f"fmax{real.function_suffix}",
-        tiny=plain.target.literal(1e-30),
-        nudge=plain.target.literal(sqrt(real.epsilon)),
+        tiny=functions.target.literal(1e-30),
+        nudge=functions.target.literal(sqrt(real.epsilon)),
         corrections=any(m.implicit for m in methods),
-        factors=newton or plain.target.system.run.tolerance is not None,
+        factors=newton or functions.target.system.run.tolerance is not None,
         newton=newton,
         slopes=c.static_prototype(
-            f"{plain.prefix}_differences",
-            plain.status,
-            c.output_array(plain.real, "slopes"),
-            *plain.arguments(*plain.state, "u", "p"),
+            f"{functions.prefix}_differences",
+            functions.status,
+            c.output_array(functions.real, "slopes"),
+            *functions.arguments(*functions.state, "u", "p"),
         ),
         here=accelerate(qdd="here"),
         near=accelerate(qdd="near", q="x", qd="x + NQ"),
     )
 
 
-def _gauss(plain: SceneFunctions, m: Method) -> PortableGaussView:
+def _gauss(functions: SceneFunctions, m: Method) -> PortableGaussView:
     """Return the view of a Gauss method."""
-    accelerate = plain.acceleration.function.call
-    method = f"{plain.prefix}_{m.name}"
-    state_arguments = plain.arguments(*plain.state, "h", "u", "p")
-    shared = implicit_view(plain, [m])
-    onto = plain.onto_argument if m.sweeps else ()
-    out = (c.output_array(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
-    a = c.input_array(plain.real, "a")
+    accelerate = functions.acceleration.function.call
+    method = f"{functions.prefix}_{m.name}"
+    state_arguments = functions.arguments(*functions.state, "h", "u", "p")
+    shared = implicit_view(functions, [m])
+    onto = functions.onto_argument if m.sweeps else ()
+    out = (c.output_array(functions.real, name) for name in ("f", "q_mid", "qd_mid"))
+    a = c.input_array(functions.real, "a")
     stages = c.static_prototype(
-        f"{method}_evaluated", plain.status, *out, a, *state_arguments, *onto
+        f"{method}_evaluated", functions.status, *out, a, *state_arguments, *onto
     )
-    matrix_out = (c.output_array(plain.real, "M"), c.output_array("int", "row"))
+    matrix_out = (c.output_array(functions.real, "M"), c.output_array("int", "row"))
     matrix_function = c.static_prototype(
-        f"{method}_matrix", plain.status, *matrix_out, *state_arguments
+        f"{method}_matrix", functions.status, *matrix_out, *state_arguments
     )
-    one = plain.public.step(m.name)
+    one = functions.public.step(m.name)
     count = CArgument("long *", "evaluations")
-    singular_flag = plain.project_end.arguments[-1:] if plain.projection else ()
-    solve = c.static_prototype(method, plain.status, *one.arguments, count, *singular_flag)
+    singular_flag = functions.project_end.arguments[-1:] if functions.projection else ()
+    solve = c.static_prototype(method, functions.status, *one.arguments, count, *singular_flag)
     return PortableGaussView(
-        **plain.names,
+        **functions.names,
         title=m.title,
         method=method,
         newton=m.newton,
         sweeps=MAX_ITERATIONS[m.newton],
         stages=m.stages,
-        **tableau(m, plain.target.real),
-        eps=plain.target.literal(plain.target.real.epsilon),
-        tenth=plain.target.literal(0.1),
-        half=plain.target.literal(0.5),
+        **tableau(m, functions.target.real),
+        eps=functions.target.literal(functions.target.real.epsilon),
+        tenth=functions.target.literal(0.1),
+        half=functions.target.literal(0.5),
         stages_function=stages,
         matrix=matrix_function,
         about=_about(m),
         solve=solve,
         step=one,
         stage=accelerate(qdd="f + NQ*i", q="r", qd="v", t=f"t + {method}_c[i]*h"),
-        onto=plain.project_stage.call(t=f"t + {method}_c[i]*h") if onto else "",
+        onto=functions.project_stage.call(t=f"t + {method}_c[i]*h") if onto else "",
         slopes_call=shared.slopes.call(),
         start=accelerate(qdd="a"),
         sweep=stages.call(),
         matrix_start=matrix_function.call(),
         matrix_mid=matrix_function.call(q="q_mid", qd="qd_mid", t="t + h/2"),
         solve_call=solve.call(evaluations="&evaluations", singular="&singular"),
-        correct=plain.project_end.call(t="t + h") if plain.projection else "",
+        correct=functions.project_end.call(t="t + h") if functions.projection else "",
     )
 
 
-def _adaptive(plain: SceneFunctions) -> list[View]:
+def _adaptive(functions: SceneFunctions) -> list[View]:
     """Return the views of adaptive steps, where the scene requests them."""
-    if plain.target.system.run.tolerance is None:
+    if functions.target.system.run.tolerance is None:
         return []
-    m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
-    state_arguments = plain.arguments(*plain.state, "h", "u", "p")
+    m, method = adaptive.METHOD, f"{functions.prefix}_{adaptive.METHOD.name}"
+    state_arguments = functions.arguments(*functions.state, "h", "u", "p")
     values = (c.output_array(f"{method}_stages", "b"), c.input_array(f"{method}_stages", "a"))
     sweep = c.static_prototype(
-        f"{method}_sweep", "int", *values, *state_arguments, *plain.onto_argument
+        f"{method}_sweep", "int", *values, *state_arguments, *functions.onto_argument
     )
-    accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
+    accelerate, coefficients = (
+        functions.acceleration.function.call,
+        tableau(m, functions.target.real),
+    )
     nodes = PortableStagesView(
-        **plain.names,
+        **functions.names,
         title=adaptive.TITLE,
         name=m.name,
         stages=m.stages,
@@ -436,34 +439,35 @@ def _adaptive(plain: SceneFunctions) -> list[View]:
         AA=coefficients["AA"],
         sweep=sweep,
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
-        onto=plain.project_stage.call(t="t + c[i]*h") if plain.projection else "",
+        onto=functions.project_stage.call(t="t + c[i]*h") if functions.projection else "",
     )
     end = f"{c.member('x', 't')} + h"
-    projection_call = plain.project_end.call(r="at", v="moving", t=end, singular="&singular")
+    projection_call = functions.project_end.call(r="at", v="moving", t=end, singular="&singular")
     form = adaptive.SweepInterface(
-        state_arguments, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
-        project=projection_call if plain.projection else "", whole=True,
+        state_arguments, sweep.call(b="to", a="from"), accelerate(qdd="f"), functions.NQ,
+        project=projection_call if functions.projection else "", whole=True,
     )  # fmt: skip
-    batch_views = [adaptive.batch_view(plain)] if plain.target.system.run.batch else []
-    return [nodes, *events.adaptive_views(plain, form), *batch_views]
+    batch_views = [adaptive.batch_view(functions)] if functions.target.system.run.batch else []
+    return [nodes, *events.adaptive_views(functions, form), *batch_views]
 
 
-def runs_view(plain: SceneFunctions, m: Method) -> PortableRunsView:
+def runs_view(functions: SceneFunctions, m: Method) -> PortableRunsView:
     """Return the template data for the C functions that make many steps by the method `m`.
 
-    One function is for a run of one instance, the other for a batch of many instances. plain: the C
-    functions of the scene.
+    One function is for a run of one instance, the other for a batch of many instances.
+
+    functions: the C functions of the scene.
     """
-    NQ, real = plain.NQ, plain.real
-    run = plain.public.run(m.name)
-    one = step_view(plain, m)
+    NQ, real = functions.NQ, functions.real
+    run = functions.public.run(m.name)
+    one = step_view(functions, m)
     advance = one.solve if isinstance(one, PortableGaussView) else one.advance
     return PortableRunsView(
-        **plain.names,
+        **functions.names,
         implicit=m.implicit,
-        constrained=bool(plain.projection),
+        constrained=bool(functions.projection),
         run=run,
-        batch=plain.public.batch(m.name) if plain.target.system.run.batch else None,
+        batch=functions.public.batch(m.name) if functions.target.system.run.batch else None,
         one_step=advance.call(
             t=f"t0 + ({real})(first + n)*h", u="u ? u + u_stride*n : 0", singular="&singular"
         ),

@@ -249,8 +249,9 @@ def portable_view(functions: SceneFunctions) -> ProjectionView | None:
 
 
 def project_view(functions: SceneFunctions) -> ProjectView:
-    """Return the data for the public C function `project`, which projects a state onto the
-    constraints.
+    """Return the data for the template of the public C function `project`.
+
+    That function projects a state (q, qd) onto the constraints.
     """
     target, public = functions.target, functions.public
     end, eps = target.real.function_suffix, target.real.epsilon

@@ -47,9 +47,7 @@ class Kind:
 
     @property
     def extra_argument(self) -> str:
-        """The argument qdd, wrenches or lambda, if the function takes it in every scene; otherwise
-        "".
-        """
+        """The argument qdd, wrenches or lambda if the function takes it in every scene, or ""."""
         return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
 
 
@@ -442,8 +440,9 @@ class Public:
         )  # fmt: skip
 
     def _status(self, name: str, *arguments: CArgument) -> CFunction:
-        """Return the prototype of the C function `name` (without the scene's prefix), which returns
-        a status.
+        """Return the prototype of a C function that returns a status.
+
+        name: its C name without the scene's prefix.
         """
         return CFunction(f"{self.target.prefix}_{name}", f"{self.target.prefix}_status", arguments)
 
@@ -455,17 +454,13 @@ class Public:
 
     @property
     def _steps(self) -> tuple[CArgument, ...]:
-        """The C arguments of a run: initial time (if needed), step size, first step and number of
-        steps.
-        """
+        """The C arguments of a run: initial time, step size, first step and number of steps."""
         real = self.target.real.name
         t0 = [CArgument(real, "t0")] if self.target.driven else []
         return (*t0, CArgument(real, "h"), CArgument("long", "first"), CArgument("long", "steps"))
 
     @property
     def _row_output(self) -> tuple[CArgument, ...]:
-        """The C arguments for stored states: `every` (steps between them) and arrays for q and
-        qd.
-        """
+        """The C arguments for stored states: `every` (steps between them), arrays for q and qd."""
         rows = (output_array(self.target.real.name, f"{name}_rows") for name in STATE)
         return (CArgument("long", "every"), *rows)

@@ -186,7 +186,7 @@ class SourceFields:
 
 
 def header(
-    plain: SceneFunctions,
+    functions: SceneFunctions,
     slopes: LinearizationView | None,
     stamp: str,
     rooms: Sequence[int] = (),
@@ -196,7 +196,7 @@ def header(
 
     Parameters
     ----------
-    plain
+    functions
         The C functions of the scene.
     slopes
         Template data of the derivatives of the accelerations; None if the scene does not need them.
@@ -208,47 +208,47 @@ def header(
     fast
         Whether the header belongs to the optimised C.
     """
-    target, s = plain.target, plain.target.system
+    target, s = functions.target, functions.target.system
     methods = [METHODS[name] for name in s.run.methods]
     *fixed_rooms, adaptive_room = rooms or [
         *(0 for _ in methods),
         adaptive.workspace_size(s, len(s.coordinates)),
     ]
-    functions = [*plain.evaluations, plain.acceleration]
     return HeaderView(
         title=FreeText(s.title),
         stamp=tuple(views.stamp(target)),
         notes=tuple(views.energy_notes(target)),
         description=tuple(views.description(target)),
-        **plain.names,
+        **functions.names,
         handshake=stamp,
         fast=fast,
-        coordinates=indexed(plain, s.coordinates),
-        inputs=indexed(plain, s.inputs),
-        outputs=indexed(plain, s.outputs, "OUT_"),
-        constraints=indexed(plain, s.constraints, "CONSTRAINT_"),
-        events=indexed(plain, s.events, "EVENT_"),
+        coordinates=indexed(functions, s.coordinates),
+        inputs=indexed(functions, s.inputs),
+        outputs=indexed(functions, s.outputs, "OUT_"),
+        constraints=indexed(functions, s.constraints, "CONSTRAINT_"),
+        events=indexed(functions, s.events, "EVENT_"),
         frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.output_frames),
-        parameters=parameters(plain),
+        parameters=parameters(functions),
         implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
         timed=target.driven,
-        functions=tuple(x.function for x in functions),
+        functions=tuple(x.function for x in (*functions.evaluations, functions.acceleration)),
         linearization=slopes.linearization if slopes else None,
-        project=plain.public.project if s.constraints else None,
+        project=functions.public.project if s.constraints else None,
         methods=tuple(
             MethodDeclarations(
-                m.name, method_title(m), m.implicit, room, plain.public.step(m.name),
-                plain.public.run(m.name), plain.public.batch(m.name) if s.run.batch else None,
-                plain.public.derivative(m.name) if s.run.discretize else None,
+                m.name, method_title(m), m.implicit, room, functions.public.step(m.name),
+                functions.public.run(m.name),
+                functions.public.batch(m.name) if s.run.batch else None,
+                functions.public.derivative(m.name) if s.run.discretize else None,
             )
             for m, room in zip(methods, fixed_rooms, strict=True)
         ),
         adaptive=AdaptiveDeclarations(
-            adaptive.TITLE, adaptive.workspace_type(plain), adaptive_room,
-            plain.public.adaptive(adaptive.METHOD.name),
-            plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
+            adaptive.TITLE, adaptive.workspace_type(functions), adaptive_room,
+            functions.public.adaptive(adaptive.METHOD.name),
+            functions.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.steps_in_parallel(target),
-            plain.public.fixed_type if s.events else None,
+            functions.public.fixed_type if s.events else None,
         ) if s.run.tolerance else None,
         max_events=adaptive.max_events_per_step(s),
     )  # fmt: skip
@@ -280,7 +280,7 @@ def source_fields(
 
 
 def indexed(
-    plain: SceneFunctions,
+    functions: SceneFunctions,
     items: Sequence[Constraint | Coordinate | Event | Input | Output],
     prefix: str = "",
 ) -> tuple[Enumerator, ...]:
@@ -289,17 +289,19 @@ def indexed(
     items: coordinates, inputs, outputs, constraints or events. prefix: "OUT_", "EVENT_" or
     "CONSTRAINT_", which `Target.enum` adds to the names of such items.
     """
-    enum = plain.target.enum
+    enum = functions.target.enum
     return tuple(
         Enumerator(enum[prefix + x.name], views.unit_and_note(x.unit, x.note)) for x in items
     )
 
 
-def parameters(plain: SceneFunctions) -> tuple[ParameterMember, ...]:
+def parameters(functions: SceneFunctions) -> tuple[ParameterMember, ...]:
     """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
     return tuple(
-        ParameterMember(p.name, plain.target.literal(p.value), views.unit_and_note(p.unit, p.note))
-        for p in plain.target.system.parameters
+        ParameterMember(
+            p.name, functions.target.literal(p.value), views.unit_and_note(p.unit, p.note)
+        )
+        for p in functions.target.system.parameters
     )
 
 

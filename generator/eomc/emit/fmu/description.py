@@ -271,9 +271,7 @@ class Dependencies:
         return dict(zip(names, dependencies_of_results(self.program["signal"]), strict=True))
 
     def _results_of(self, name: str) -> Sequence[Names]:
-        """Return the dependencies of each result of a function; [] where the program does not have
-        it.
-        """
+        """Return the dependencies of each result of a function; [] if the program lacks it."""
         return (
             [self._resolved(x) for x in dependencies_of_results(self.program[name])]
             if name in self.program

@@ -337,9 +337,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
 
 
 def _lanes(steppers: Steppers, show: Show) -> Iterator[str]:
-    """Yield the accelerations over each lane, and RK4 or other explicit methods over vector
-    registers.
-    """
+    """Yield the C text of the accelerations, and of the projection, over each lane type."""
     if steppers.two_point:
         yield _library_text(Lane(steppers.accelerations, "two"), show)
     yield _lane(steppers, steppers.one, show)

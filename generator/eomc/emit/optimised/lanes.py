@@ -276,9 +276,7 @@ class Lane:
     # bodies
 
     def _loads(self, function: Function) -> Block:
-        """Return definitions of local variables for the coordinates, velocities and inputs that are
-        read.
-        """
+        """Return definitions of local variables for the q, qd and u that a function reads."""
         element = self.target.element
         state = self._interleaved if self.name == "two" else element
         return Block("", tuple(self.target.loads(function, state, element)))
@@ -421,9 +419,7 @@ class Lane:
         return (head, self._loads(function), *body.early, *body.blocks, end)
 
     def _stored(self, array: str, values: Sequence[str], width: int) -> tuple[str, ...]:
-        """Return statements that store numbers, in groups of four padded with zeros where
-        `simd_angles`.
-        """
+        """Return statements that store numbers; if `simd_angles`, in groups of four with zeros."""
         if not self.simd_angles:
             return tuple(c.assign(f"{array}[{k}]", x) for k, x in enumerate(values))
         padded = [*values, *[self.target.zero] * (width - len(values))]
