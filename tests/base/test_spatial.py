@@ -19,7 +19,9 @@ number = st.floats(-10, 10)
 vectors = st.tuples(number, number, number)
 axes = vectors.filter(lambda v: math.hypot(*v) > 1e-3).map(lambda v: unit(v))
 angles = st.floats(-7, 7)
-rotations = st.builds(lambda v, a: spatial.about(v, math.cos(a), math.sin(a)), axes, angles)
+rotations = st.builds(
+    lambda v, a: spatial.axis_angle_rotation(v, math.cos(a), math.sin(a)), axes, angles
+)
 # a rigid body: masses at places
 masses = st.lists(st.tuples(st.floats(0.1, 5), vectors), min_size=1, max_size=6)
 # linear in nearly all that is drawn: a wrong entry shows at once
@@ -42,7 +44,7 @@ def inertia_about_origin(points: Sequence[tuple[float, Vector[float]]]) -> np.nd
 
 
 def six(tensor: np.ndarray) -> spatial.Inertia[float]:
-    return spatial.six(tensor[i][j] for i, j in spatial.ENTRIES)
+    return spatial.as_inertia(tensor[i][j] for i, j in spatial.ENTRIES)
 
 
 @few
@@ -57,7 +59,7 @@ def test_vectors(a: Vector[float], b: Vector[float], factor: float) -> None:
 @few
 @given(axes, angles)
 def test_rotation_about_any_axis(axis: Vector[float], angle: float) -> None:
-    found = spatial.about(axis, math.cos(angle), math.sin(angle))
+    found = spatial.axis_angle_rotation(axis, math.cos(angle), math.sin(angle))
     assert np.allclose(found, Rotation.from_rotvec(np.multiply(axis, angle)).as_matrix(), **CLOSE)
 
 
@@ -65,7 +67,7 @@ def test_rotation_about_any_axis(axis: Vector[float], angle: float) -> None:
 @few
 @given(angle=angles)
 def test_rotation_about_a_coordinate_axis(k: int, angle: float) -> None:
-    found = spatial.about_axis(k, math.cos(angle), math.sin(angle))
+    found = spatial.elementary_rotation(k, math.cos(angle), math.sin(angle))
     assert np.allclose(found, Rotation.from_euler("xyz"[k], angle).as_matrix(), **CLOSE)
 
 
@@ -112,7 +114,7 @@ def test_expressions_stay_short() -> None:
     """Of SymPy's expressions too: no term with a zero, no factor one."""
     c, s, x = sympy.symbols("c s x")
     zero, one = sympy.S.Zero, sympy.S.One
-    turn = spatial.about_axis(2, c, s)
+    turn = spatial.elementary_rotation(2, c, s)
     assert turn == ((c, -s, 0), (s, c, 0), (0, 0, 1))
     assert spatial.apply(turn, (x, zero, one)) == (c * x, s * x, 1)
     assert spatial.product(turn, spatial.transposed(turn))[0] == (c**2 + s**2, 0, 0)

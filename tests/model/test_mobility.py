@@ -28,7 +28,7 @@ def count(*parts: str, gravity: str = "[0, 0, -9.81]", coordinates: str = "") ->
         name, _, unit = word.partition(":")
         entries.append(f'{name} = {{ unit = "{unit or "rad"}" }}')
     head = f'eomc = 1\nname = "scene_1"\ngravity = {gravity}\n[coordinates]\n'
-    return mobility.count(parse(head + "\n".join(entries) + "\n" + "\n".join(parts)))
+    return mobility.compute_mobility(parse(head + "\n".join(entries) + "\n" + "\n".join(parts)))
 
 
 def body(name: str, joint: str, coordinates: str = "", parent: str = "world", **keys: str) -> str:
@@ -195,7 +195,7 @@ mass = 1.0
 def test_gimbal_lock_at_the_start_is_reported() -> None:
     head = 'eomc = 1\nname = "top_1"\ngravity = [0, 0, 0]\n[coordinates]\nyaw = {}\n'
     head += 'pitch = { start = "pi/2" }\nroll = {}\n'
-    found = mobility.count(parse(head + body("a", "spherical", "yaw pitch roll")))
+    found = mobility.compute_mobility(parse(head + body("a", "spherical", "yaw pitch roll")))
     assert found.rank == 3 and any("singular start" in r and "yaw" in r for r in found.remarks)
 
 
@@ -269,11 +269,13 @@ def test_ends_that_meet_at_the_start_are_reported(
     start: str, rest: str, reported: list[str]
 ) -> None:
     made = parse(suspended(start, rest))
-    found = mobility.meeting(made)
+    found = mobility.find_coincident_ends(made)
     assert [problem.key for problem in found] == reported
     warnings = from_scene(made).warnings[len(made.warnings) :]
     assert [problem.key for problem in warnings] == reported
-    remarks = [r for r in mobility.count(made).remarks if "its ends meet at the start" in r]
+    remarks = [
+        r for r in mobility.compute_mobility(made).remarks if "its ends meet at the start" in r
+    ]
     assert [r.partition(":")[0] for r in remarks] == reported
 
 
@@ -302,8 +304,8 @@ offset = [1, 0]
 mass = 1
 center = [1, 0]
 """
-    monkeypatch.delattr(kinematics, "_null")
-    found = mobility.count(parse(text))
+    monkeypatch.delattr(kinematics, "null_space")
+    found = mobility.compute_mobility(parse(text))
     assert (found.M, found.rank) == (last + 1, last + 1) and not found.remarks
 
 
@@ -351,7 +353,7 @@ def test_a_long_chain_has_all_its_freedoms() -> None:
 def test_scenes_without_bodies_are_reported_so() -> None:
     text = 'eomc = 1\nname = "s_1"\n[coordinates]\nx = {}\n[energy]\nkinetic = "x_dot**2"\n'
     with pytest.raises(EomcError, match=r"no \[\[body\]\], .* each coordinate is a freedom, x$"):
-        mobility.count(parse(text))
+        mobility.compute_mobility(parse(text))
 
 
 def test_the_command(tmp_path: Path) -> None:
@@ -387,11 +389,11 @@ BARS = (
 
 
 def test_loops_and_rows_count():
-    found = mobility.count(parse(FOUR_BAR + "\n".join(BARS)))
+    found = mobility.compute_mobility(parse(FOUR_BAR + "\n".join(BARS)))
     assert (found.M, found.coordinates, dict(found.loops)) == (1, 3, {"revolute": 1})
     assert "in loops 1 revolute (f = 1)" in found.table()
     row = '\n[constraints]\ndrive = "q1 - t"\n'
-    driven = mobility.count(parse(FOUR_BAR + row + "\n".join(BARS)))
+    driven = mobility.compute_mobility(parse(FOUR_BAR + row + "\n".join(BARS)))
     assert driven.M == 0
     assert "M = d(N - 1 - j) + sum f - constraints = 3(4 - 1 - 4) + 4 - 1 = 0" in driven.table()
 

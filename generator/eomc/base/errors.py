@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import ClassVar
 
 from eomc.base import texts
-
-WIDTH = 100  # characters of a source line shown, at most
-LONGEST = 1_000  # characters of a message shown, at most
-MOST = 50  # problems shown, at most
 
 
 class EomcError(Exception):
@@ -77,6 +74,9 @@ class Problem:
         "error", "warning" or "note".
     """
 
+    MAX_WIDTH: ClassVar[int] = 100  # characters shown of a key and of a source line
+    MAX_MESSAGE: ClassVar[int] = 1_000  # characters shown of a message
+
     message: str
     key: str = ""
     file: str = ""
@@ -92,15 +92,21 @@ class Problem:
             place += f":{self.line}"
             if self.column >= 0:
                 place += f":{self.column + 1}"
-        parts = (place, self.severity, _cut(self.key, WIDTH), _cut(self.message, LONGEST))
+        parts = (
+            place,
+            self.severity,
+            _cut(self.key, self.MAX_WIDTH),
+            _cut(self.message, self.MAX_MESSAGE),
+        )
         text = ": ".join(texts.line(part) for part in parts if part)
         if not self.source:
             return text
         # of a long line, the part around the fault
-        start = max(self.column - WIDTH // 2, 0) if len(self.source) > WIDTH else 0
-        shown = _shown(self.source[start : start + WIDTH])
+        most = self.MAX_WIDTH
+        start = max(self.column - most // 2, 0) if len(self.source) > most else 0
+        shown = _shown(self.source[start : start + most])
         before = "…" if start else ""
-        after = "…" if len(self.source) > start + WIDTH else ""
+        after = "…" if len(self.source) > start + most else ""
         gutter = f"  {self.line} | "
         text += f"\n{gutter}{before}{shown}{after}"
         if self.column >= 0:
@@ -126,11 +132,13 @@ class SceneError(EomcError):
     the first 50.
     """
 
+    MAX_SHOWN: ClassVar[int] = 50  # problems
+
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda p: (p.line, p.column)))
-        shown = [str(p) for p in self.problems[:MOST]]
-        if len(self.problems) > MOST:
-            shown.append(f"... and {len(self.problems) - MOST} more")
+        shown = [str(p) for p in self.problems[: self.MAX_SHOWN]]
+        if len(self.problems) > self.MAX_SHOWN:
+            shown.append(f"... and {len(self.problems) - self.MAX_SHOWN} more")
         super().__init__("\n".join(shown))
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[Sequence[Problem]]]:

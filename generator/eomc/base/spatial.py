@@ -66,7 +66,7 @@ def matrix(rows: Any) -> Matrix[Any]:
     return (a, b, c), (d, e, f), (g, h, i)
 
 
-def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
+def elementary_rotation(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
     """Return the matrix of a rotation about the coordinate axis `k` (0, 1 or 2).
 
     The matrix transforms the components of a vector from the rotated frame to the original one.
@@ -80,7 +80,7 @@ def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
     return matrix(rows)
 
 
-def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
+def axis_angle_rotation(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
     """Return the matrix of a rotation about a unit vector `axis`, by the formula of Rodrigues.
 
     The matrix transforms the components of a vector from the rotated frame to the original one.
@@ -113,7 +113,7 @@ def rotated_inertia(R: Matrix[T], inertia: Sequence[T]) -> Inertia[T]:
     Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
     """
     rotated = product(product(R, tensor(inertia)), transposed(R))
-    return six(rotated[i][j] for i, j in ENTRIES)
+    return as_inertia(rotated[i][j] for i, j in ENTRIES)
 
 
 def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
@@ -134,10 +134,10 @@ def moved_inertia(inertia: Sequence[Any], mass: Any, center: Sequence[Any]) -> I
     inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass. center: position of the centre
     of mass relative to the origin. The result has the same six entries.
     """
-    return six(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
+    return as_inertia(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
 
 
-def six(values: Any) -> Inertia[Any]:
+def as_inertia(values: Any) -> Inertia[Any]:
     """Return an inertia, a tuple of six entries, from an iterable of six values."""
     xx, yy, zz, xy, xz, yz = values
     return xx, yy, zz, xy, xz, yz

@@ -35,7 +35,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
     counted: dict[str, Any] = {"scene": checked_scene.name}
     lines = []
     if not checked_scene.constrained or (checked_scene.assembly and checked_scene.assembly.bodies):
-        mobility_count = mobility.count(checked_scene)
+        mobility_count = mobility.compute_mobility(checked_scene)
         counted, lines = mobility_count.as_dict(), [mobility_count.table()]
     if checked_scene.constrained:
         from eomc import pipeline

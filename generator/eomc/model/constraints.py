@@ -13,14 +13,10 @@ from sympy import Expr, Symbol
 
 from eomc.model import loops
 from eomc.model.algebra import compiled
-from eomc.model.loops import Closed
+from eomc.model.loops import LoopEquations
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
-NEAR = 1e-9  # m or rad; smaller residuals count as zero
-ROUNDING = 1e-13  # relative to the loop's length (1 for axis equations); smaller changes count as 0
 NONSMOOTH = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
-SAMPLES = 4  # random configurations at which loop equations are evaluated
-MAX_FORMULA_LENGTH = 80  # characters of a formula in a message
 
 NOTHING_MOVES = (
     "has no coordinates or rates, so that no motion can make it zero: write what is to be zero, "
@@ -105,7 +101,7 @@ class VelocityDegree:
         return all(p.exact for p in parts if p.degree)
 
 
-class Rows:
+class ConstraintChecker:
     """Checker and classifier of the constraint equations of a system.
 
     Parameters
@@ -122,6 +118,11 @@ class Rows:
         Function that reports a warning; it is called with the constraint and a message.
     """
 
+    ZERO_RESIDUAL = 1e-9  # m or rad; smaller residuals count as zero
+    SAMPLES = 4  # random configurations at which loop equations are evaluated
+    # changes relative to the loop's length (1 for axis equations) that count as zero
+    ROUNDING_TOLERANCE = 1e-13
+
     def __init__(
         self,
         coordinates: Sequence[Coordinate],
@@ -137,7 +138,7 @@ class Rows:
         self.doubt = doubt
         self.velocity_degree = VelocityDegree(coordinates, definitions)
 
-    def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
+    def classify(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
         """Return the valid constraints, holonomic ones first, with the attribute `holonomic` set.
 
         rows: the constraint equations to check. An invalid constraint is left out and reported as
@@ -159,7 +160,7 @@ class Rows:
                 others.append(replace(row, holonomic=False))
         return (*holonomic, *others)
 
-    def without_constant_rows(self, closed: Closed) -> Closed:
+    def without_constant_rows(self, closed: LoopEquations) -> LoopEquations:
         """Return a copy of a loop from which constant constraint equations are removed.
 
         The left-hand side of such an equation does not depend on the coordinates. If it is zero, a
@@ -171,7 +172,7 @@ class Rows:
             hardly = self._hardly_moved(closed)
             fixed = [b if a is None else a for a, b in zip(fixed, hardly, strict=True)]
         reduced, constant = loops.without_constant_rows(closed, fixed)
-        far = [(row, value) for row, value in constant if not abs(value) <= NEAR]
+        far = [(row, value) for row, value in constant if not abs(value) <= self.ZERO_RESIDUAL]
         for row, value in far:
             why = f"can't close: its row {row.name} is {value:.6g} wherever its bodies move"
             self.fault(row, f"{why}: check its points and axes")
@@ -196,7 +197,7 @@ class Rows:
             float(value) if value.is_number else math.inf
         )  # a function of t: the loop does not stay closed
 
-    def _hardly_moved(self, closed: Closed) -> list[float | None]:
+    def _hardly_moved(self, closed: LoopEquations) -> list[float | None]:
         """Return the values of a loop's equations that change by rounding only, None for others.
 
         Axes of a planar mechanism that is tilted in space are parallel to sixteen digits only, if
@@ -213,7 +214,7 @@ class Rows:
         names = [*self.values, t, *(c.q for c in self.coordinates)]
         of = compiled(names, expressions, "math", known)
         draw, samples = random.Random(1), list[list[float]]()
-        for _ in range(SAMPLES):
+        for _ in range(self.SAMPLES):
             p = [x + 0.1 * draw.uniform(-1, 1) * (abs(x) or 1.0) for x in self.values.values()]
             q = [c.start + draw.uniform(-1, 1) for c in self.coordinates]
             with suppress(ArithmeticError, ValueError, TypeError):  # no real value
@@ -224,7 +225,9 @@ class Rows:
         sizes = {"m": size, "m^2": size**2}
         columns = list(zip(*samples, strict=True))[6:]
         return [
-            column[0] if max(column) - min(column) <= ROUNDING * sizes.get(row.unit, 1) else None
+            column[0]
+            if max(column) - min(column) <= self.ROUNDING_TOLERANCE * sizes.get(row.unit, 1)
+            else None
             for row, column in zip(closed.rows, columns, strict=True)
         ]
 
@@ -236,6 +239,6 @@ def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:
     plain = all(term.has(dot) or term.free_symbols & positions.keys() for term in terms)
     position = rate.replace(dot, lambda e: e).xreplace(positions)
     shown = str(position)
-    if not plain or len(shown) > MAX_FORMULA_LENGTH:
+    if not plain or len(shown) > 80:
         return "write the position itself, less its value at the start"
     return f"write the position itself, {shown}, less its value at the start"

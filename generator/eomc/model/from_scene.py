@@ -11,7 +11,7 @@ from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, constraints
 from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.hybrid import Friction, add_hybrid_dynamics
-from eomc.model.loops import Closed
+from eomc.model.loops import LoopEquations
 from eomc.model.multibody import Builder, Terms
 from eomc.model.symbols import (
     Constraint,
@@ -153,7 +153,7 @@ class _Formulas:
         self,
         coordinates: Sequence[Coordinate],
         definitions: Sequence[tuple[Symbol, Expr]],
-        closed: Iterable[Closed],
+        closed: Iterable[LoopEquations],
     ) -> tuple[tuple[Constraint, ...], tuple[Reaction, ...]]:
         """Return the constraint equations of the scene, holonomic ones first, and loop reactions.
 
@@ -177,7 +177,7 @@ class _Formulas:
         if self.problems:  # a formula without a value is 0
             return (), ()
         values = {p.name: p.value for p in self.scene.parameters}
-        checks = constraints.Rows(
+        checks = constraints.ConstraintChecker(
             coordinates,
             definitions,
             {symbol(name): value for name, value in values.items()},
@@ -186,7 +186,7 @@ class _Formulas:
         )
         loops = [checks.without_constant_rows(loop) for loop in closed]
         rows += [row for loop in loops for row in loop.rows]
-        return checks.sorted(rows), tuple(r for loop in loops for r in loop.reactions)
+        return checks.classify(rows), tuple(r for loop in loops for r in loop.reactions)
 
     def outputs(
         self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
@@ -308,4 +308,4 @@ def _at_the_start(scene: Scene) -> list[Problem]:
         return []
     from eomc.model import mobility  # imports NumPy, which few scenes need here
 
-    return mobility.meeting(scene)
+    return mobility.find_coincident_ends(scene)

@@ -388,7 +388,9 @@ class Maker:
                 )
             )
 
-        checked = constraints.Rows(coordinates, ordered, {}, fault, doubt).sorted(declared)
+        checked = constraints.ConstraintChecker(coordinates, ordered, {}, fault, doubt).classify(
+            declared
+        )
         return {"constraints": checked, "warnings": tuple(doubts)} if declared else {}
 
     def _inputs(

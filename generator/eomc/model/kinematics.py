@@ -21,11 +21,8 @@ Pose = tuple[Array, Array]  # of a frame in the world: offset (3,), rotation (3,
 # derivative by coordinate index, "t" or "r", axis and a point on it, in the world
 Motion = tuple[dict[int, float], str, Array, Array]
 
-STEP = 1e-5  # of central differences, whose error is about 1e-10
 ZERO_COLUMN_TOLERANCE = 1e-7  # relative to the longest column
 RANK_TOLERANCE = 1e-6  # of singular values of normalised columns, relative to the largest
-PIVOT_TOLERANCE = 1e-10  # of an inertia, relative to its terms: below it, it may be rounding
-SAMPLES = 3  # random states; the largest rank holds almost everywhere
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Jacobian:
 
 
 @dataclass(frozen=True)
-class Null:
+class NullSpaces:
     """Null spaces of a `Jacobian`, as arrays whose rows are generalized velocities (n, nq).
 
     moves: basis of the generalized velocities at which no body moves. weighs: basis of the
@@ -56,6 +53,10 @@ class Null:
 
 class Kinematics:
     """Numerical kinematics of the bodies of a scene, for the parameter values in the scene."""
+
+    STEP = 1e-5  # of central differences, whose error is about 1e-10
+    SAMPLES = 3  # random configurations; the largest rank holds almost everywhere
+    PIVOT_TOLERANCE = 1e-10  # of an inertia, relative to its terms: below, it may be rounding
 
     def __init__(self, scene: Scene, assembly: Assembly) -> None:
         self.coordinates = [c.name for c in scene.coordinates]
@@ -70,7 +71,7 @@ class Kinematics:
         self.centers = {body.name: self.vector(body.center, self.values) for body in self.tree}
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
 
-    def states(self) -> Iterator[Null]:
+    def sample_null_spaces(self) -> Iterator[NullSpaces]:
         """Yield the null spaces of the Jacobians at up to three random configurations.
 
         The configurations are near the initial one. A configuration is skipped if a formula of the
@@ -78,22 +79,26 @@ class Kinematics:
         mass matrix is regular, so that every motion has kinetic energy.
         """
         random = np.random.default_rng(0)
-        for _ in range(SAMPLES):
+        for _ in range(self.SAMPLES):
             q = self.start + random.uniform(-0.7, 0.7, len(self.start))
-            if null := self.null(q, random.uniform(0, 1)):
+            if null := self.null_spaces(q, random.uniform(0, 1)):
                 yield null
                 if not len(null.weighs):
                     return
 
-    def null(self, q: Array, t: float) -> Null | None:
+    def null_spaces(self, q: Array, t: float) -> NullSpaces | None:
         """Return the null spaces of the Jacobians at coordinates q (nq,) and time t (s).
 
         Returns None if a formula of the scene can't be evaluated there.
         """
         if self.is_regular(q):
-            return Null(*np.zeros((2, 0, len(q))))
+            return NullSpaces(*np.zeros((2, 0, len(q))))
         jacobian = self.jacobian(q, t)
-        return Null(_null(jacobian.moves), _null(jacobian.weighs)) if jacobian else None
+        return (
+            NullSpaces(null_space(jacobian.moves), null_space(jacobian.weighs))
+            if jacobian
+            else None
+        )
 
     def is_regular(self, q: Array) -> bool:
         """Return True if the mass matrix at the coordinates `q` (nq,) is certainly regular.
@@ -120,7 +125,7 @@ class Kinematics:
                 turn = [axis, np.cross(axis, at - point)]  # angular velocity, and velocity at `at`
                 s = np.concatenate(turn if kind == "r" else [np.zeros(3), axis])
                 u = beyond @ s
-                if s @ u <= PIVOT_TOLERANCE * scale:
+                if s @ u <= self.PIVOT_TOLERANCE * scale:
                     return False
                 beyond = beyond - np.outer(u, u) / (s @ u)
             if body.parent != WORLD:
@@ -177,9 +182,10 @@ class Kinematics:
         slopes = {}
         for name in {node.id for node in by.names()} & self.index.keys():
             after, before = (
-                self._number(by, {**known, name: known[name] + step}) for step in (STEP, -STEP)
+                self._number(by, {**known, name: known[name] + step})
+                for step in (self.STEP, -self.STEP)
             )
-            slopes[self.index[name]] = (after - before) / (2 * STEP)
+            slopes[self.index[name]] = (after - before) / (2 * self.STEP)
         return slopes
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
@@ -229,12 +235,12 @@ class Kinematics:
         omega = {name: np.zeros((3, len(q))) for name in here}
         for k in range(len(q)):
             step = np.zeros(len(q))
-            step[k] = STEP
+            step[k] = self.STEP
             after, before = self._placed_at(q + step, t), self._placed_at(q - step, t)
             for name in here:
-                v[name][:, k] = (after[name][0] - before[name][0]) / (2 * STEP)
+                v[name][:, k] = (after[name][0] - before[name][0]) / (2 * self.STEP)
                 # R(q + h) R(q - h)^T = 1 + 2 h [omega] + ..., antisymmetric up to h^3
-                turn = after[name][1] @ before[name][1].T / (4 * STEP)
+                turn = after[name][1] @ before[name][1].T / (4 * self.STEP)
                 skew = turn - turn.T
                 omega[name][:, k] = skew[2, 1], skew[0, 2], skew[1, 0]
         for body in self.placed:
@@ -331,11 +337,15 @@ def _spatial(mass: float, center: Array, root: Array) -> Array:
 
 def _about(axis: Array, angle: float) -> Array:
     """Return the rotation by an angle about a unit axis."""
-    return np.array(spatial.about(axis.tolist(), math.cos(angle), math.sin(angle)))
+    return np.array(spatial.axis_angle_rotation(axis.tolist(), math.cos(angle), math.sin(angle)))
 
 
-def _null(columns: Array) -> Array:
-    """Return a basis of the null space (n - rank, n), made sparse by elimination."""
+def null_space(columns: Array) -> Array:
+    """Return a basis of the null space of a matrix, made sparse by elimination.
+
+    columns: the matrix (m, n). The basis vectors are the rows of the result (n - rank, n), each
+    scaled so that its largest entry in size is 1 or -1.
+    """
     n = columns.shape[1]
     sizes = np.linalg.norm(columns, axis=0)
     there = np.flatnonzero(sizes > ZERO_COLUMN_TOLERANCE * sizes.max(initial=0.0))

@@ -61,7 +61,7 @@ class _Pull:
 
 
 @dataclass
-class Closed:
+class LoopEquations:
     """The constraint equations, reaction and points of a joint that closes a loop.
 
     rows: the constraint equations. reactions: the force and moment on the second body, as a
@@ -74,14 +74,14 @@ class Closed:
     points: tuple[Vector, ...] = ()
 
 
-def close(
+def derive_loop_equations(
     loop: LoopJoint,
     plane: bool,
     ends: tuple[End, End],
     turned: Matrix,
     length: Expr,
     to_world: Matrix,
-) -> Closed:
+) -> LoopEquations:
     """Return the constraint equations and the reaction of a joint that closes a loop.
 
     Parameters
@@ -122,7 +122,7 @@ def close(
         a, b = (apply(end.R, _unit(axis)) for end, axis in zip(ends, loop.axes, strict=True))
         branches.append(dot(a, b))
     reaction = Reaction(loop.name, values, loop.note, tuple(branches))
-    return Closed(rows, [reaction], (first.point, second.point))
+    return LoopEquations(rows, [reaction], (first.point, second.point))
 
 
 def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
@@ -177,7 +177,7 @@ def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterat
 
 
 def _unit(axis: Sequence[float]) -> Vector:
-    x, y, z = rational.unit(axis)
+    x, y, z = rational.unit_vector(axis)
     return x, y, z
 
 
@@ -194,7 +194,7 @@ def perpendicular_axes(axis: Sequence[float], plane: bool) -> tuple[Vector, Vect
     return columns[(k + 1) % 3], columns[(k + 2) % 3], along
 
 
-def gear(loop: LoopJoint, ratio: Expr, offset: Expr) -> Closed:
+def derive_gear_equation(loop: LoopJoint, ratio: Expr, offset: Expr) -> LoopEquations:
     """Return the constraint equation of a gear between two coordinates.
 
     The equation is second coordinate - ratio * first coordinate - offset = 0. loop: the gear in the
@@ -202,7 +202,7 @@ def gear(loop: LoopJoint, ratio: Expr, offset: Expr) -> Closed:
     """
     first, second = (symbol(name) for name in loop.coordinates)
     row = second - ratio * first - offset
-    return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])
+    return LoopEquations([Constraint(loop.name, row, True, "", loop.note, loop.name)])
 
 
 def find_wrong_rotations(
@@ -233,8 +233,8 @@ def find_wrong_rotations(
 
 
 def without_constant_rows(
-    closed: Closed, values: Sequence[float | None]
-) -> tuple[Closed, list[tuple[Constraint, float]]]:
+    closed: LoopEquations, values: Sequence[float | None]
+) -> tuple[LoopEquations, list[tuple[Constraint, float]]]:
     """Return a copy of a loop without its constant constraint equations, and these equations.
 
     values: for each equation of the loop, the value of its left-hand side if that is constant, else

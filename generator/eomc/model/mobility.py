@@ -21,7 +21,7 @@ import numpy as np
 
 from eomc.base.errors import EomcError, Problem
 from eomc.base.texts import listed, plural
-from eomc.model.kinematics import Array, Kinematics, Null
+from eomc.model.kinematics import Array, Kinematics, NullSpaces
 from eomc.scene import formulas
 from eomc.scene.assembly import Assembly, Damper, RigidBody, Spring
 from eomc.scene.formulas import Formula
@@ -108,7 +108,7 @@ class Mobility:
         }  # fmt: skip
 
 
-def count(scene: Scene) -> Mobility:
+def compute_mobility(scene: Scene) -> Mobility:
     """Compute the degrees of freedom of a scene and compare them with its coordinates.
 
     Raises EomcError if the scene has no bodies, or if the formulas of their positions can't be
@@ -130,7 +130,7 @@ def count(scene: Scene) -> Mobility:
     closed = sum(n * (d - _closure_freedoms(kind, d)) for kind, n in loops.items())
     kinematics = Kinematics(scene, assembly)
     names = kinematics.coordinates
-    samples = list(kinematics.states())
+    samples = list(kinematics.sample_null_spaces())
     if not samples:
         raise EomcError(f"{scene.file}: the bodies' positions have no value at the states tried")
     generic = min(samples, key=lambda null: (len(null.moves), len(null.weighs)))
@@ -142,7 +142,7 @@ def count(scene: Scene) -> Mobility:
         *_moves_nothing(generic, names, scene),
         *_in_a_row(assembly, kinematics),
         *_singular_start(kinematics, generic),
-        *(f"{problem.key}: {problem.message}" for problem in meeting(scene)),
+        *(f"{problem.key}: {problem.message}" for problem in find_coincident_ends(scene)),
     ]
     M, rows = tree - closed - len(scene.constraints), len(scene.constraints)
     return Mobility(
@@ -150,7 +150,7 @@ def count(scene: Scene) -> Mobility:
     )
 
 
-def meeting(scene: Scene) -> list[Problem]:
+def find_coincident_ends(scene: Scene) -> list[Problem]:
     """Return a warning for each spring and damper whose two ends coincide at the start.
 
     The direction of its force, along the line between the ends, is then undefined. Springs of rest
@@ -243,7 +243,7 @@ def _formulas_fix(placed: Sequence[RigidBody], d: int, rank: int, M: int) -> Ite
         )
 
 
-def _moves_nothing(at: Null, names: Sequence[str], scene: Scene) -> Iterator[str]:
+def _moves_nothing(at: NullSpaces, names: Sequence[str], scene: Scene) -> Iterator[str]:
     """Report coordinates that move no body, or that move bodies only in combinations."""
     ways = ["[energy] gives it inertia"] if any(scene.kinetic.names()) else []
     ways += ["a constraint decides it"] if scene.constrained else []
@@ -289,8 +289,8 @@ def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
         )
 
 
-def _singular_start(kinematics: Kinematics, generic: Null) -> Iterator[str]:
-    at_start = kinematics.null(kinematics.start, 0.0)
+def _singular_start(kinematics: Kinematics, generic: NullSpaces) -> Iterator[str]:
+    at_start = kinematics.null_spaces(kinematics.start, 0.0)
     names = kinematics.coordinates
     if at_start is None:
         yield "at the start the bodies' positions have no value"

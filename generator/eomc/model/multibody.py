@@ -17,8 +17,8 @@ from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import loops, rational
 from eomc.model.hybrid import Friction
-from eomc.model.loops import Closed
-from eomc.model.rational import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
+from eomc.model.loops import LoopEquations
+from eomc.model.rational import ONE, ZERO, Matrix, Vector, rounded_number, rounded_vector
 from eomc.model.symbols import dot, symbol
 from eomc.model.tree import BodyFrame, Chains, Link, Named, Step, Tree, rotation_about
 from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring
@@ -73,7 +73,7 @@ class Terms:
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
     frames: list[BodyFrame] = field(default_factory=list)
-    closed: list[Closed] = field(default_factory=list)  # one for each loop
+    closed: list[LoopEquations] = field(default_factory=list)  # one for each loop
     frictions: list[tuple[Expr, Friction]] = field(
         default_factory=list
     )  # positions and stick-slip friction
@@ -172,8 +172,8 @@ class Builder:
         R = product(parent.R, rotation)
         place = _Place(
             parent.link,
-            plus(parent.offset, apply(parent.rotation, numeric(offset))),
-            rational.clean(product(parent.rotation, rational.clean(rotation))),
+            plus(parent.offset, apply(parent.rotation, rounded_vector(offset))),
+            rational.rounded_matrix(product(parent.rotation, rational.rounded_matrix(rotation))),
             at,
             R,
             angle,
@@ -210,8 +210,8 @@ class Builder:
         self.moved.setdefault(name, []).append(q)
         terms.tree_kinetic.append(armature * self.terms.rates.get(q, _rate(q)) ** 2 / 2)
         k, aligned = rational.aligned_with(axis)
-        direction = tuple(S(x) for x in rational.unit(axis))
-        rotation = rational.clean(product(place.rotation, aligned))
+        direction = tuple(S(x) for x in rational.unit_vector(axis))
+        rotation = rational.rounded_matrix(product(place.rotation, aligned))
         terms.links.append(
             Link(
                 name, place.link, motion == "r", k, moved, place.offset, rotation, armature=armature
@@ -238,14 +238,14 @@ class Builder:
         center = self._vector(f"{key}.center", body.center)
         middle = plus(place.at, apply(place.R, center))
         position = self._position(body.name, middle)
-        m, c = numeric((mass, S.Zero, S.Zero))[0], numeric(center)
+        m, c = rounded_vector((mass, S.Zero, S.Zero))[0], rounded_vector(center)
         moment = scaled(plus(place.offset, apply(place.rotation, c)), m)
         if place.link < 0:
             terms.fixed_moment = plus(terms.fixed_moment, moment)
         else:
-            about = spatial.rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
+            about = spatial.rotated_inertia(place.rotation, [rounded_number(x) for x in inertia])
             arm = plus(place.offset, apply(place.rotation, c))
-            about = spatial.moved_inertia([numeric_entry(x) for x in about], m, arm)
+            about = spatial.moved_inertia([rounded_number(x) for x in about], m, arm)
             link = terms.links[place.link]
             terms.links[place.link] = replace(
                 link,
@@ -325,11 +325,11 @@ class Builder:
                 applied += ((y, torque[axis] * x) for y, x in zip(row, other, strict=True))
         applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
 
-    def _close(self, key: str, loop: LoopJoint) -> Closed:
+    def _close(self, key: str, loop: LoopJoint) -> LoopEquations:
         """Add a joint that closes a loop, or a gear."""
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
-            return loops.gear(loop, ratio, self.value(f"{key}.offset", loop.offset))
+            return loops.derive_gear_equation(loop, ratio, self.value(f"{key}.offset", loop.offset))
         ends, base = [], self.chains.common(*loop.bodies)
         for name, given in zip(loop.bodies, loop.points, strict=True):
             place, point = self.places[name], self._vector(f"{key}.points", given)
@@ -340,7 +340,9 @@ class Builder:
         length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
         turned = self._rotation(f"{key}.rotation", loop)
         R = self.places[base].R
-        return loops.close(loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R)
+        return loops.derive_loop_equations(
+            loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R
+        )
 
     def _put(self, body: RigidBody) -> None:
         assert body.position is not None

@@ -21,7 +21,7 @@ ZERO: Vector = (S.Zero, S.Zero, S.Zero)
 ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
 
 
-def numeric_entry(e: Expr) -> Expr:
+def rounded_number(e: Expr) -> Expr:
     """Return a number as a fraction that is rounded to 50 digits.
 
     A number within 1e-40 of an integer is rounded to that integer. An expression that is not a
@@ -40,31 +40,31 @@ def numeric_entry(e: Expr) -> Expr:
     return e
 
 
-def numeric(v: Vector) -> Vector:
+def rounded_vector(v: Vector) -> Vector:
     """Return a copy of a vector with its numbers rounded to fractions of 50 digits.
 
     Entries that are not numbers are unchanged.
     """
-    x, y, z = map(numeric_entry, v)
+    x, y, z = map(rounded_number, v)
     return (x, y, z)
 
 
-def clean(matrix: Matrix) -> Matrix:
+def rounded_matrix(matrix: Matrix) -> Matrix:
     """Return a copy of a matrix with its numbers rounded to fractions of 50 digits.
 
     Entries that are not numbers are unchanged.
     """
-    one, two, three = map(numeric, matrix)
+    one, two, three = map(rounded_vector, matrix)
     return (one, two, three)
 
 
-def unit(axis: Sequence[float]) -> list[Expr]:
+def unit_vector(axis: Sequence[float]) -> list[Expr]:
     """Return the unit vector along `axis` as fractions, normalised to 50 digits."""
     entries = [Rational(str(x)) for x in axis]
     with mpmath.workdps(DIGITS + 5):
         long = [mpmath.mpf(x.p) / x.q for x in entries]
         size = mpmath.sqrt(sum(x * x for x in long))
-        return [numeric_entry(Rational(mpmath.nstr(x / size, DIGITS + 5))) for x in long]
+        return [rounded_number(Rational(mpmath.nstr(x / size, DIGITS + 5))) for x in long]
 
 
 def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
@@ -73,15 +73,15 @@ def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
     e_k is the unit vector along the coordinate axis k, and `axis` is normalised. R is exact to 50
     digits. In the frame rotated by R, the direction `axis` is therefore the coordinate axis k.
     """
-    along = unit(axis)
+    along = unit_vector(axis)
     for k, x in enumerate(along):
         if abs(x) == 1:
-            half_turn = spatial.about_axis((k + 1) % 3, S.NegativeOne, S.Zero)
+            half_turn = spatial.elementary_rotation((k + 1) % 3, S.NegativeOne, S.Zero)
             return k, ONE if x == 1 else half_turn
     # Gram-Schmidt, from the coordinate axis that is farthest from the axis
     far = min(range(3), key=lambda i: (abs(along[i]), i))
     first = [-along[far] * x for x in along]
     first[far] += 1
     size = sympy.sqrt(sum(x * x for x in first))
-    a = [numeric_entry((x / size).evalf(DIGITS + 5)) if x != 0 else S.Zero for x in first]
-    return 2, transposed(matrix((a, numeric(cross(along, a)), along)))
+    a = [rounded_number((x / size).evalf(DIGITS + 5)) if x != 0 else S.Zero for x in first]
+    return 2, transposed(matrix((a, rounded_vector(cross(along, a)), along)))

@@ -188,7 +188,7 @@ class Chains:
             for motion, axis, by in step.motions:
                 k, aligned = rational.aligned_with(axis)
                 if motion == "t":
-                    x, y, z = map(S, rational.unit(axis))
+                    x, y, z = map(S, rational.unit_vector(axis))
                     at = plus(at, scaled(apply(R, (x, y, z)), by))
                 elif self.plane:
                     angle = angle + by
@@ -205,4 +205,4 @@ def rotation_about(axis: int, angle: Expr) -> Matrix:
 
     The matrix transforms the components of a vector from the rotated frame to the original one.
     """
-    return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))
+    return spatial.elementary_rotation(axis, sympy.cos(angle), sympy.sin(angle))

@@ -23,7 +23,7 @@ from eomc.model.algebra import compiled
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Between, LoopJoint, RigidBody, Turn
+from eomc.scene.assembly import WORLD, Assembly, LoopJoint, RigidBody, SpringDamper, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 from eomc.scene.scene import Scene, Shape
@@ -386,7 +386,7 @@ class _Sketch:
 
     def _about(self, axis: Sequence[float] | Array, angle: Any) -> Array:
         angle = np.broadcast_to(angle, self.n)
-        rows = spatial.about(tuple(axis), np.cos(angle), np.sin(angle))
+        rows = spatial.axis_angle_rotation(tuple(axis), np.cos(angle), np.sin(angle))
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
 
     # --- bodies ----------------------------------------------------------------------------------
@@ -546,7 +546,7 @@ class _Sketch:
             points = (self.marks.add_point(center + tip) for tip in tips)
             self.marks.add_mark("inertia", self.marks.add_point(center), *points)
 
-    def _between(self, kind: str, end: Between, assembly: Assembly) -> None:
+    def _between(self, kind: str, end: SpringDamper, assembly: Assembly) -> None:
         """Draw a spring or damper if its end points are known."""
         marks = self.marks
         if end.points and end.bodies:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eomc.base import spatial
-from eomc.base.spatial import ENTRIES, six
+from eomc.base.spatial import ENTRIES, as_inertia
 from eomc.robots.rotations import Matrix, Vector
 
 Inertia = spatial.Inertia[float]
@@ -20,7 +20,7 @@ def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
     result.
     """
     size = 1e-15 * max(map(abs, inertia))
-    return six(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
+    return as_inertia(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
 
 
 def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
@@ -99,7 +99,7 @@ def nearest(inertia: Inertia) -> Inertia:
     directions = np.array(axes)
     tensor = (directions.T * best) @ directions
     dust = 1e-12 * max(map(abs, inertia))
-    return six(float(x) if abs(x := tensor[i, j]) > dust else 0.0 for i, j in ENTRIES)
+    return as_inertia(float(x) if abs(x := tensor[i, j]) > dust else 0.0 for i, j in ENTRIES)
 
 
 def shown(inertia: Inertia) -> str:

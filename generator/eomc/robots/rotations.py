@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from eomc.base import spatial
-from eomc.base.spatial import about, matrix, product, transposed
+from eomc.base.spatial import axis_angle_rotation, matrix, product, transposed
 
 Vector = spatial.Vector[float]
 Matrix = spatial.Matrix[float]
@@ -54,7 +54,7 @@ def from_axis_angle(axis: Vector, angle: float) -> Matrix:
 
     The axis may have any nonzero length.
     """
-    return cleaned(about(unit(axis), math.cos(angle), math.sin(angle)))
+    return cleaned(axis_angle_rotation(unit(axis), math.cos(angle), math.sin(angle)))
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:

@@ -90,8 +90,8 @@ class RigidBody:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Between:
-    """The place where a spring or damper acts: a coordinate, two points, or two angles.
+class SpringDamper:
+    """A spring or damper: the place where it acts, a coordinate, two points or two angles.
 
     coordinate: name of the coordinate along which the element acts, "" if it acts between two
     bodies. bodies: names of the two bodies. points: position in m of each end of the element, in
@@ -106,7 +106,7 @@ class Between:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spring(Between):
+class Spring(SpringDamper):
     """A linear spring, whose force is -stiffness times its extension.
 
     stiffness: in N/m, or N m/rad for a spring on an angle. length: the rest length or rest position
@@ -118,7 +118,7 @@ class Spring(Between):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Damper(Between):
+class Damper(SpringDamper):
     """A linear damper, whose force is -damping times the rate of change of its length or angle.
 
     damping: damping constant in N s/m, or N m s/rad for a damper on an angle.

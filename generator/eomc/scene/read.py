@@ -12,7 +12,7 @@ from typing import Any
 import pydantic
 
 from eomc.base import names, texts
-from eomc.base.errors import MOST, EomcError, SceneError
+from eomc.base.errors import EomcError, SceneError
 from eomc.scene import (
     formulas,
     messages,
@@ -354,14 +354,14 @@ class _SceneChecker(Checker):
                 self.kinds[name] = frozenset({UNKNOWN})
 
     def _find_circular(self, definitions: Mapping[str, Formula]) -> set[str]:
-        """Return names that depend on themselves; each cycle is reported, up to MOST of them."""
+        """Return names that depend on themselves; each cycle is reported, at most 50 of them."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
         }
         circular: set[str] = set()
         for count, cycle in enumerate(find_cycles(graph)):
-            if count == MOST:
+            if count == SceneError.MAX_SHOWN:
                 return set(definitions)
             formula = definitions[cycle[0]]
             self.report(
@@ -410,7 +410,7 @@ class _SceneChecker(Checker):
         if INPUT in kinds:
             fault(
                 "an energy can't depend on inputs: let them act through [forces]",
-                self.where(formula, INPUT),
+                self.find_part(formula, INPUT),
             )
         if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
             velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)

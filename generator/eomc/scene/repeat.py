@@ -17,9 +17,6 @@ from eomc.scene.formulas import FormulaError, suggest
 from eomc.scene.scope import Checker, Path, value_of
 from eomc.scene.source_map import ARRAYS
 
-MAX_ENTRIES = 10_000  # produced by repetition
-MAX_TEXT = 5_000_000  # characters produced by repetition
-
 _TABLES = (
     "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
 )  # fmt: skip
@@ -51,6 +48,11 @@ def expand(tree: dict[str, Any], check: Checker) -> bool:
 
 
 class _Expansion:
+    """Expands the repeated entries and indexed names of one scene."""
+
+    MAX_ENTRIES = 10_000  # produced by repetition
+    MAX_TEXT = 5_000_000  # characters produced by repetition
+
     def __init__(self, tree: dict[str, Any], check: Checker) -> None:
         self.tree = tree
         self.check = check
@@ -61,6 +63,7 @@ class _Expansion:
         self.sound = True
 
     def run(self) -> bool:
+        """Expand all entries in place; return True if there were no errors."""
         for written, array_name in _ARRAY_ALIASES.items():
             if isinstance(self.tree.get(written), (dict, list)) and array_name not in self.tree:
                 entries, unknown = self.tree.pop(written), f"unknown table '{written}': "
@@ -188,10 +191,10 @@ class _Expansion:
             why = f"runs from {first} to {last}, and counts up only: exchange the ends"
             raise FormulaError(why, 0, width)
         self.entry_count += last - first + 1
-        if self.entry_count > MAX_ENTRIES:
+        if self.entry_count > self.MAX_ENTRIES:
             raise FormulaError(
                 f"repetition makes {self.entry_count} entries up to here, and "
-                f"{MAX_ENTRIES} are the most: let it end sooner",
+                f"{self.MAX_ENTRIES} are the most: let it end sooner",
                 0,
                 width,
             )
@@ -265,8 +268,8 @@ class _Expansion:
             shown = str(number) if number >= 0 else f"({number})"
             out = re.sub(rf"(?<![\w.]){name}(?!\w)", shown, out, flags=re.ASCII)
         self.characters += len(out) if index else 0
-        if self.characters > MAX_TEXT:
-            raise FormulaError(f"repetition makes more than {MAX_TEXT:,} characters of text")
+        if self.characters > self.MAX_TEXT:
+            raise FormulaError(f"repetition makes more than {self.MAX_TEXT:,} characters of text")
         return out
 
     def _index_value(self, text: str, index: Mapping[str, int]) -> int:

@@ -458,7 +458,7 @@ class PointTable(_Table):
     note: _Note = ""
 
 
-class _Between(_Table):
+class _SpringDamperTable(_Table):
     """Common keys of springs and dampers."""
 
     coordinate: pydantic.StrictStr | None = None
@@ -468,14 +468,14 @@ class _Between(_Table):
     note: _Note = ""
 
 
-class SpringTable(_Between):
+class SpringTable(_SpringDamperTable):
     """A [[spring]] in the file."""
 
     stiffness: _Value
     length: _Value = 0.0
 
 
-class DamperTable(_Between):
+class DamperTable(_SpringDamperTable):
     """A [[damper]] in the file."""
 
     damping: _Value

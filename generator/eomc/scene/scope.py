@@ -261,7 +261,7 @@ class Checker:
             kinds |= {ACCELERATION}
         return kinds | {VELOCITY} if dot and POSITION in kinds else kinds
 
-    def where(self, formula: Formula, kind: str) -> ast.expr:
+    def find_part(self, formula: Formula, kind: str) -> ast.expr:
         """Return the syntax node of the first part of the formula that depends on `kind`.
 
         kind: a kind of quantities, such as VELOCITY.

@@ -11,12 +11,6 @@ from typing import Any
 from eomc.base.errors import Problem
 from eomc.scene.formulas import FormulaError
 
-MAX_STATEMENT = 500  # lines
-MAX_PARSED = 4_000_000  # characters given to tomllib, which takes some seconds
-MAX_SEARCHED = (
-    20_000_000  # characters searched for columns of errors; beyond it only lines are given
-)
-
 # arrays of tables, [[name]]
 ARRAYS = ("body", "point", "spring", "damper", "force", "loop", "event")
 
@@ -29,6 +23,11 @@ class SourceMap:
     A path is the tuple of keys that lead to an entry. The lines are found by parsing one TOML
     statement at a time.
     """
+
+    MAX_STATEMENT = 500  # lines
+    MAX_PARSED = 4_000_000  # characters given to tomllib, which takes some seconds
+    # characters that are searched for columns of errors; beyond, only lines are given
+    MAX_SEARCHED = 20_000_000
 
     def __init__(self, text: str, file: str) -> None:
         self.lines = text.split("\n")
@@ -74,10 +73,10 @@ class SourceMap:
 
         Returns `start` itself if no statement is found.
         """
-        for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
+        for end in range(start + 1, min(start + self.MAX_STATEMENT, len(self.lines)) + 1):
             statement = "\n".join(self.lines[start:end])
             self._tried += len(statement)
-            if end > start + 1 and self._tried > MAX_PARSED:
+            if end > start + 1 and self._tried > self.MAX_PARSED:
                 break
             try:
                 return end, tomllib.loads(statement)
@@ -162,7 +161,7 @@ class SourceMap:
         key_written = self._key.get(known, known[-1])
         self._searched += len(source) + 20_000  # a thousand faults at most
         offset, width = -1, 1
-        if self._searched < MAX_SEARCHED:
+        if self._searched < self.MAX_SEARCHED:
             offset, width = _find_fault(source, key_written, at, text, self._text.get(text or ""))
         line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
         column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1

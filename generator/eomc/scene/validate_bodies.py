@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any
 
 from eomc.base import names
-from eomc.base.errors import MOST
+from eomc.base.errors import SceneError
 from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring, Vector
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import CLOSING_ALIASES, CLOSINGS, JOINT_ALIASES, JOINTS, Z
@@ -267,7 +267,7 @@ class _Bodies:
     def _sorted_bodies(self) -> list[RigidBody]:
         """Return the bodies, parents before children, else in their order; cycles are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
-        for ring in islice(find_cycles(graph), MOST):
+        for ring in islice(find_cycles(graph), SceneError.MAX_SHOWN):
             place = self.values.names[ring[0]]
             self.check.report(
                 (*place, "body" if place[0] == "point" else "parent"),
@@ -587,7 +587,7 @@ def _world_vector(
 
 
 def _between(values: ValueChecker, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
-    """Return where a spring or damper acts, as arguments of `assembly.Between`."""
+    """Return where a spring or damper acts, as arguments of `assembly.SpringDamper`."""
     check, kind = values.check, path[0]
     if (entry.coordinate is None) == (entry.bodies is None):
         if not {(*path, "coordinate"), (*path, "bodies")} & check.repaired:

@@ -127,7 +127,7 @@ def check_constraints(check: Checker, doc: Document) -> Iterator[SceneConstraint
                 path,
                 "a constraint can't depend on inputs, whose rates nobody knows: let them act "
                 "through [forces], or write the motion wanted as a function of t",
-                check.where(formula, INPUT),
+                check.find_part(formula, INPUT),
                 formula.text,
             )
         check.check_smooth(path, formula)
@@ -390,7 +390,7 @@ class _Picture:
         for kind in (INPUT, VELOCITY):
             if kind in kinds:
                 why = f"a picture can't depend on {kind}: it shows where things are"
-                check.report(path, why, check.where(formula, kind), formula.text)
+                check.report(path, why, check.find_part(formula, kind), formula.text)
         return formula
 
     def _size(self, path: Path, value: float | str) -> Formula:

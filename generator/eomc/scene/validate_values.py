@@ -77,7 +77,7 @@ class ValueChecker:
                 path,
                 f"'{path[-1]}' can't depend on inputs, whose rates nobody knows: "
                 "let them act through an actuator or [forces]",
-                check.where(formula, INPUT),
+                check.find_part(formula, INPUT),
                 formula.text,
             )
         elif VELOCITY in kinds or any(formula.calls("dot")):
@@ -85,7 +85,7 @@ class ValueChecker:
                 path,
                 f"'{path[-1]}' can't depend on velocities: it is made of coordinates, "
                 "t, parameters, constants and definitions of these",
-                check.where(formula, VELOCITY),
+                check.find_part(formula, VELOCITY),
                 formula.text,
             )
         check.check_smooth(path, formula)

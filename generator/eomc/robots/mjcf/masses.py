@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from eomc.base.spatial import apply, cross, dot, plus, point_inertia, six, transposed
+from eomc.base.spatial import apply, as_inertia, cross, dot, plus, point_inertia, transposed
 from eomc.robots import rotations
 from eomc.robots.inertias import (
     NO_INERTIA,
@@ -357,7 +357,7 @@ def _sum(masses: Sequence[Mass]) -> Mass:
             i + own + m.mass * d for i, own, d in zip(inertia, m.inertia, about, strict=True)
         ]
     size = max(map(abs, inertia))
-    return Mass(total, (x, y, z), six(rounded(i, size) for i in inertia))
+    return Mass(total, (x, y, z), as_inertia(rounded(i, size) for i in inertia))
 
 
 def rounded(x: float, size: float) -> float:
@@ -380,7 +380,7 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
         a.fault("fullinertia goes with neither diaginertia nor an orientation; leave one")
         return None
     full, along = a.numbers("fullinertia", 6), a.vector("diaginertia") or ORIGIN
-    inertia = six(full) if full else (*along, 0.0, 0.0, 0.0)
+    inertia = as_inertia(full) if full else (*along, 0.0, 0.0, 0.0)
     return Mass(mass, ORIGIN, inertia).in_frame(placed.pose.compose(pose))
 
 
@@ -430,6 +430,6 @@ def scaled_to(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
     now = sum(body.mass for body in bodies)
     k = total / now if now else 1.0
     return [
-        replace(body, mass=k * body.mass, inertia=six(k * v for v in body.inertia))
+        replace(body, mass=k * body.mass, inertia=as_inertia(k * v for v in body.inertia))
         for body in bodies
     ]

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from eomc.base.errors import SceneError
-from eomc.base.spatial import plus, scaled, six
+from eomc.base.spatial import as_inertia, plus, scaled
 from eomc.robots.mjcf import masses
 from eomc.robots.mjcf.actuators import read_actuators, with_key_frame_start
 from eomc.robots.mjcf.equality import read_equalities
@@ -320,7 +320,7 @@ def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[R
             body = replace(
                 body,
                 motions=joint.motions,
-                inertia=six([xx + a, yy + a, zz + a, *rest]),
+                inertia=as_inertia([xx + a, yy + a, zz + a, *rest]),
                 rotor=a,
                 note=joined(body.note, note),
             )
