@@ -101,7 +101,7 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     def made() -> None:
         robot = reader(path)
         for change in (lambda r: r, edit.with_nearest_inertias, stopped):
-            text = scene_text.scene_text(preparation.prepared_for_scene(change(robot)))
+            text = scene_text.scene_text(preparation.prepare_for_scene(change(robot)))
             read_back = parse(text, "fuzz.xml.toml")
             if len(robot.bodies) < SYMPY_FROM:
                 from_scene(read_back)

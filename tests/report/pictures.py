@@ -38,7 +38,7 @@ def scene(name: str) -> Scene:
 def robot(file: Path, free: bool = False) -> Scene:
     """The scene of a URDF, as eomc import writes it."""
     made = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
-    return parse(scene_text.scene_text(preparation.prepared_for_scene(made)))
+    return parse(scene_text.scene_text(preparation.prepare_for_scene(made)))
 
 
 def robot_data(name: str) -> Path:

@@ -28,7 +28,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.interpret import evaluate
 from eomc.program.lower import lower
-from eomc.robots.preparation import prepared_for_scene
+from eomc.robots.preparation import prepare_for_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.slow
@@ -78,7 +78,7 @@ def near(found: Array, expected: Array, what: str, of: float = 0.0) -> None:
 def test_robots(name: str, free: bool, tmp_path: Path) -> None:
     both = from_urdf(f"/{name}.urdf", tmp_path, free, fuse=False)
     model, n = both.model, both.model.nv
-    robot = prepared_for_scene(both.robot)
+    robot = prepare_for_scene(both.robot)
     ours = Ours(both.text())
     names = [b.name for b in sorted(robot.bodies, key=lambda b: b.point)]
     assert [f.name for f in ours.system.output_frames] == names

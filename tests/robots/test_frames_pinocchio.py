@@ -22,7 +22,7 @@ from robots.test_robots_mujoco import (  # noqa: E402
 )
 
 from eomc.derive.lagrange import inverse_dynamics  # noqa: E402
-from eomc.robots.preparation import prepared_for_scene  # noqa: E402
+from eomc.robots.preparation import prepare_for_scene  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +36,7 @@ MORE = """
 @pytest.mark.parametrize("name", [*FIXED, *MORE])
 def test_robots(name: str, tmp_path: Path) -> None:
     both = from_urdf(f"/{name}.urdf", tmp_path, fuse=False)
-    ours, bodies = Ours(both.text()), prepared_for_scene(both.robot).bodies
+    ours, bodies = Ours(both.text()), prepare_for_scene(both.robot).bodies
     order = sorted(range(len(bodies)), key=lambda k: bodies[k].point)
     model = pinocchio.buildModelFromUrdf(str(stripped(robot_data(f"/{name}.urdf"), tmp_path)))
     data, n = model.createData(), model.nv

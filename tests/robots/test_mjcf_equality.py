@@ -13,7 +13,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.symbols import needed
 from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
-from eomc.robots.preparation import prepared_for_scene
+from eomc.robots.preparation import prepare_for_scene
 from eomc.robots.robot import body_pose
 from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
@@ -207,16 +207,16 @@ def test_constraints_that_no_motion_changes_are_left_out(
     flange = '<body name="flange" euler="0 0 90"><geom size="0.1"/></body></body>'
     inside = INSIDE.replace('</body>\n<body name="wheel"', f'{flange}\n<body name="wheel"')
     inside += STILL.format("left", 1) + STILL.format("right", 3)
-    robot = prepared_for_scene(model(tmp_path, inside, after=equality(entry, HARD[0])))
+    robot = prepare_for_scene(model(tmp_path, inside, after=equality(entry, HARD[0])))
     assert [loop.name for loop in robot.loops] == ["pin"]
     assert not robot.couplings
     assert reported(robot, "constraints that no motion changes", said)
-    assert prepared_for_scene(robot) == robot
+    assert prepare_for_scene(robot) == robot
 
 
 def test_a_loop_between_locked_bodies_is_left_out(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[0]))
-    locked = prepared_for_scene(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
+    locked = prepare_for_scene(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
     assert not locked.loops
     assert reported(locked, "constraints that no motion changes", "pin (open by")
 
@@ -275,10 +275,10 @@ def test_a_sum_of_several_joints_keeps_the_locked_one_as_a_constant(tmp_path: Pa
     (whole,) = robot.couplings
     assert row.first == ((2.0, "q1"),)
     rest = {"q1": 0.3, "slip": 0.4}
-    assert row.excess(rest) == pytest.approx(whole.excess({**rest, "g": 0.5}))
+    assert row.residual(rest) == pytest.approx(whole.residual({**rest, "g": 0.5}))
     (row,) = lock(robot, {"slip": 0.5}).couplings
-    assert row.excess({**rest, "g": 1}) == pytest.approx(
-        whole.excess({"q1": 0.3, "slip": 0.5, "g": 1})
+    assert row.residual({**rest, "g": 1}) == pytest.approx(
+        whole.residual({"q1": 0.3, "slip": 0.5, "g": 1})
     )
     scene_of(lock(robot, {"slip": 0.5}))
 

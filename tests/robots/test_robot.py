@@ -51,7 +51,7 @@ def test_turns_make_the_rotation_again_at_a_pitch_of_pi_half_too(
     a: float, b: float, c: float
 ) -> None:
     rotation = rotations.from_rpy(a, b, c)
-    turns = rotations.turns_of(rotation)
+    turns = rotations.axis_rotations(rotation)
     again = rotations.from_euler("".join(x for x, _ in turns), [angle for _, angle in turns])
     # turns below 1e-10 are left out
     assert np.allclose(again, rotation, atol=3e-10, rtol=0)
@@ -59,12 +59,12 @@ def test_turns_make_the_rotation_again_at_a_pitch_of_pi_half_too(
 
 def test_few_turns_where_few_will_do() -> None:
     quarter = math.pi / 2
-    assert rotations.turns_of(rotations.from_rpy(quarter, 0, 0)) == (("x", quarter),)
-    assert rotations.turns_of(rotations.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
-    assert rotations.turns_of(rotations.from_rpy(math.pi, 0.3, math.pi)) == (
+    assert rotations.axis_rotations(rotations.from_rpy(quarter, 0, 0)) == (("x", quarter),)
+    assert rotations.axis_rotations(rotations.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
+    assert rotations.axis_rotations(rotations.from_rpy(math.pi, 0.3, math.pi)) == (
         ("y", pytest.approx(math.pi - 0.3)),
     )
-    assert rotations.turns_of(rotations.IDENTITY) == ()
+    assert rotations.axis_rotations(rotations.IDENTITY) == ()
 
 
 @given(angles, angles, angles)
@@ -92,14 +92,14 @@ def test_a_turned_tensor_keeps_its_energy() -> None:
 
 
 def test_tensors_that_no_body_has_are_reported_with_one_that_would_do() -> None:
-    assert not inertias.unbalanced((1.0, 1.0, 2.0, 0, 0, 0))
-    assert not inertias.indefinite((0.0, 0.0, 0.0, 0, 0, 0))
-    reported = inertias.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
+    assert not inertias.triangle_message((1.0, 1.0, 2.0, 0, 0, 0))
+    assert not inertias.indefinite_message((0.0, 0.0, 0.0, 0, 0, 0))
+    reported = inertias.triangle_message((1.0, 1.0, 2.1, 0, 0, 0))
     assert (
         "1, 1, 2.1 break the triangle inequality" in reported
         and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in reported
     )
-    assert "-1" in inertias.indefinite((1.0, 1.0, -1.0, 0, 0, 0))
+    assert "-1" in inertias.indefinite_message((1.0, 1.0, -1.0, 0, 0, 0))
 
 
 @pytest.mark.parametrize(
@@ -108,8 +108,8 @@ def test_tensors_that_no_body_has_are_reported_with_one_that_would_do() -> None:
      (1e-8, 2e-8, 4e-8, 6e-8, 1e-8, 1e-8), (-1.0, -2.0, -0.5, 0.1, 0, 0)],
 )  # fmt: skip
 def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> None:
-    near = inertias.nearest(inertia)
-    assert not inertias.indefinite(near) and not inertias.unbalanced(near)
+    near = inertias.nearest_valid(inertia)
+    assert not inertias.indefinite_message(near) and not inertias.triangle_message(near)
 
     def off(other: Inertia) -> float:
         """Of all nine entries."""
@@ -127,7 +127,7 @@ def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> N
         other = tuple(part * bodys + (1 - part) * np.array(near))
         assert off(near) <= off(other) + 1e-12 * off((0, 0, 0, 0, 0, 0))
     good = (1.0, 1.1, 1.2, 0.1, 0, 0)
-    assert inertias.nearest(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
+    assert inertias.nearest_valid(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inert
     robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
     assert edit.with_nearest_inertias(robot) == robot
     with pytest.raises(EomcError) as fault:
-        preparation.prepared_for_scene(robot)
+        preparation.prepare_for_scene(robot)
     assert "check the signs of the tensor" in str(fault.value)
     assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
 
@@ -320,9 +320,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
         replace(body, name="y", parent="x" * 60, motions=(JointMotion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
-    robot = preparation.prepared_for_scene(
-        replace(arm(), name="math", bodies=bodies, drives=drives)
-    )
+    robot = preparation.prepare_for_scene(replace(arm(), name="math", bodies=bodies, drives=drives))
     coordinates = [m.name for m in robot.motions]
     taken = [*coordinates, *(f"{c}_dot" for c in coordinates), *(d.name for d in robot.drives)]
     taken += [f"{b.name}_{letter}" for b in robot.bodies for letter in "xyz"]
@@ -331,7 +329,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     assert names.module_fault(robot.name) is None
     assert "'a.b' in the file" in robot.motions[0].note
     assert [d.coordinate for d in robot.drives] == [coordinates[0], coordinates[2]]
-    assert preparation.prepared_for_scene(robot) == robot
+    assert preparation.prepare_for_scene(robot) == robot
 
 
 def test_texts_of_strangers_stay_texts() -> None:
@@ -348,15 +346,15 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
     )  # fmt: skip
     bodies = (*arm().bodies[:6], finger)
     with pytest.raises(EomcError) as fault:
-        preparation.prepared_for_scene(replace(arm(), bodies=bodies))
+        preparation.prepare_for_scene(replace(arm(), bodies=bodies))
     assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(
         fault.value
     )
     assert "--lock f-1=0" in str(fault.value)
     locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
-    assert len(preparation.prepared_for_scene(locked).motions) == 3
+    assert len(preparation.prepare_for_scene(locked).motions) == 3
     with pytest.raises(EomcError, match="nothing moves"):
-        preparation.prepared_for_scene(replace(arm(), bodies=arm().bodies[:1]))
+        preparation.prepare_for_scene(replace(arm(), bodies=arm().bodies[:1]))
 
 
 def test_inertias_that_no_body_has() -> None:
@@ -364,8 +362,8 @@ def test_inertias_that_no_body_has() -> None:
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
     assert any(
         "body column: its principal moments" in w
-        for w in preparation.prepared_for_scene(robot).left_out
+        for w in preparation.prepare_for_scene(robot).left_out
     )
     negative = replace(broken, inertia=(0.1, 0.1, -0.1, 0.0, 0.0, 0.0))
     with pytest.raises(EomcError, match="body column: its smallest principal moment"):
-        preparation.prepared_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))
+        preparation.prepare_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))

@@ -18,7 +18,7 @@ from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.robots.edit import cut, lock
 from eomc.robots.limits import joint_stops
-from eomc.robots.preparation import prepared_for_scene
+from eomc.robots.preparation import prepare_for_scene
 from eomc.robots.robot import Law, Robot
 from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
@@ -200,8 +200,8 @@ def test_a_sum_of_many_weights_is_not_too_deep(tmp_path: Path) -> None:
 
 
 def test_names_are_kept_when_finished_again(tmp_path: Path) -> None:
-    robot = prepared_for_scene(model(tmp_path, ARM, BEFORE, AFTER))
-    assert prepared_for_scene(robot) == robot
+    robot = prepare_for_scene(model(tmp_path, ARM, BEFORE, AFTER))
+    assert prepare_for_scene(robot) == robot
 
 
 def equations(robot: Robot, state: Mapping[str, float]) -> dict[str, np.ndarray]:

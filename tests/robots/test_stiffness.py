@@ -15,7 +15,7 @@ from eomc.derive.lagrange import derive
 from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.robots import edit, stiffness, urdf
-from eomc.robots.preparation import prepared_for_scene
+from eomc.robots.preparation import prepare_for_scene
 from eomc.robots.robot import Robot
 from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
@@ -41,7 +41,7 @@ def wrist(folder: Path, friction: float, kind: str = "continuous", more: str = "
 
 
 def reported(robot: Robot) -> str:
-    return "\n".join(words for words in prepared_for_scene(robot).left_out if "friction" in words)
+    return "\n".join(words for words in prepare_for_scene(robot).left_out if "friction" in words)
 
 
 def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> None:
@@ -51,8 +51,8 @@ def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> 
     assert "stiff: friction of pitch: at the start velocities decay" in reported(robot)
     assert 'friction = "stick"' in reported(robot)
     assert "friction_width" not in scene["body"][2]
-    once = prepared_for_scene(robot)
-    assert prepared_for_scene(once) == once
+    once = prepare_for_scene(robot)
+    assert prepare_for_scene(once) == once
 
 
 @pytest.mark.parametrize("friction", [0.0, 1e-5])
@@ -113,19 +113,19 @@ LIGHT = """<body name="arm">
 
 def test_stiff_servos_and_dampers_ask_for_adaptive_steps(tmp_path: Path) -> None:
     after = '<actuator><position name="lift" joint="light" kp="100" kv="0.5"/></actuator>'
-    robot = prepared_for_scene(model(tmp_path, LIGHT.format(damping=0), after=after))
+    robot = prepare_for_scene(model(tmp_path, LIGHT.format(damping=0), after=after))
     assert robot.method == "auto"
     assert robot.left_out[-1].startswith("stiff: servo lift: ")
     assert "friction" not in robot.left_out[-1]
-    robot = prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1)))
+    robot = prepare_for_scene(model(tmp_path, LIGHT.format(damping=0.1)))
     assert robot.left_out[-1].startswith("stiff: damping of light: ")
 
 
 def test_a_light_body_coupled_to_a_heavy_one_is_not_stiff(tmp_path: Path) -> None:
     after = '<equality><joint joint1="light" joint2="heavy" polycoef="0 2"/></equality>'
-    assert not prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
+    assert not prepare_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
     after = '<equality><weld body1="arm" body2="finger"/></equality>'
-    assert not prepared_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
+    assert not prepare_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
 
 
 @pytest.mark.slow

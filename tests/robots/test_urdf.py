@@ -100,7 +100,7 @@ def test_an_arm_is_read(read: Reader) -> None:
 
 
 def test_what_is_not_modelled_is_reported(read: Reader) -> None:
-    reported = "\n".join(preparation.prepared_for_scene(read(ARM)).left_out)
+    reported = "\n".join(preparation.prepare_for_scene(read(ARM)).left_out)
     for words in (
         "1 mesh (not opened)", "1 box",
         "limits of 2 joints", "<safety_controller>", "<transmission>", "<gazebo>", "<material>",
@@ -109,7 +109,7 @@ def test_what_is_not_modelled_is_reported(read: Reader) -> None:
 
 
 def test_frames_without_mass_are_points(read: Reader) -> None:
-    robot = preparation.prepared_for_scene(read(ARM))
+    robot = preparation.prepare_for_scene(read(ARM))
     (tool,) = [body for body in robot.bodies if body.point]
     text = scene_text.scene_text(read(ARM))
     assert text.endswith(f'[[point]]\nname = "{tool.name}"\nbody = "{tool.parent}"\n')
@@ -291,12 +291,12 @@ def test_a_free_root_without_inertia_is_told(read: Reader) -> None:
     root = robot.bodies[0]
     light = replace(root, mass=0.0, inertia=(0.0,) * 6)
     robot_of_light = replace(robot, bodies=(light, *robot.bodies[1:]))
-    told = preparation.prepared_for_scene(robot_of_light).left_out[-1]
+    told = preparation.prepare_for_scene(robot_of_light).left_out[-1]
     assert told.startswith(f"body {root.name}: it is free and has neither mass nor inertia")
     assert "--base fixed" in told
     heavy = replace(root, mass=1.0)
     for bodies in ((heavy, *robot.bodies[1:]), read(ARM).bodies):
-        said = preparation.prepared_for_scene(replace(robot, bodies=bodies)).left_out
+        said = preparation.prepare_for_scene(replace(robot, bodies=bodies)).left_out
         assert not any("free" in words for words in said)
     with pytest.raises(EomcError, match=r"body\.base: D is not .* 'base' has no inertia"):
         eomc.sources(from_scene(parse(scene_text.scene_text(robot_of_light), "crane.toml")))
@@ -308,7 +308,7 @@ def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> Non
         '<link name="slide"><visual><geometry><mesh filename="s.stl"/></geometry></visual></link>',
     )
     with pytest.raises(EomcError) as fault:
-        preparation.prepared_for_scene(read(text))
+        preparation.prepare_for_scene(read(text))
     assert "joint extend: it moves nothing that has mass" in str(fault.value)
     assert "slide (a mesh only, no <inertial>)" in str(fault.value)
     assert "--lock extend=0" in str(fault.value)

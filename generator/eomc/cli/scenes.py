@@ -202,7 +202,7 @@ def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
             robot = with_input_limits(robot)
         if arguments.parameters:
             robot = edit.with_masses(robot, arguments.tip)
-        return preparation.prepared_for_scene(robot)
+        return preparation.prepare_for_scene(robot)
     except EomcError as fault:
         raise with_left_out_note(fault, robot.left_out) from None
 

@@ -9,7 +9,14 @@ from dataclasses import replace
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
-from eomc.robots.inertias import has_nearest, indefinite, nearest, principal, shown, unbalanced
+from eomc.robots.inertias import (
+    entries_text,
+    has_nearest_valid,
+    indefinite_message,
+    nearest_valid,
+    principal_moments,
+    triangle_message,
+)
 from eomc.robots.limits import joint_stops
 from eomc.robots.robot import (
     COUPLING_TOLERANCE,
@@ -18,9 +25,9 @@ from eomc.robots.robot import (
     body_pose,
     fix_body,
     free_motions,
-    joined,
+    join_notes,
+    significant_inertia,
     with_joints_fixed,
-    without_dust,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
 from eomc.scene.assembly import WORLD
@@ -70,13 +77,13 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
         motion = body.motions[0] if body.motions else None
         if motion and motion.name in values:
             value = values[motion.name]
-            note = joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
+            note = join_notes(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
             body = replace(fix_body(body, *body_pose(body, (value,))), note=note)
         bodies.append(body)
     for c in robot.couplings:
         if (
             c.coordinates <= values.keys()
-            and abs(violation := c.excess(values)) > COUPLING_TOLERANCE
+            and abs(violation := c.residual(values)) > COUPLING_TOLERANCE
         ):
             those = " ".join(f"--lock {q}={values[q]:g}" for q in sorted(c.coordinates))
             raise EomcError(
@@ -159,12 +166,15 @@ def with_nearest_inertias(robot: Robot) -> Robot:
     """
     bodies, words = [], []
     for body in robot.bodies:
-        inertia = without_dust(body)
-        if (indefinite(inertia) or unbalanced(inertia)) and has_nearest(inertia):
-            (low, _, high), new = principal(inertia)[0], nearest(inertia)
+        inertia = significant_inertia(body)
+        if (indefinite_message(inertia) or triangle_message(inertia)) and has_nearest_valid(
+            inertia
+        ):
+            (low, _, high), new = principal_moments(inertia)[0], nearest_valid(inertia)
             words.append(
-                f"body {body.name}: its inertia {shown(inertia)} is that of no body (principal "
-                f"moments {low:.4g} to {high:.4g} kg m^2): {shown(new)} is in its place"
+                f"body {body.name}: its inertia {entries_text(inertia)} is that of no body "
+                f"(principal moments {low:.4g} to {high:.4g} kg m^2): "
+                f"{entries_text(new)} is in its place"
             )
             body = replace(body, inertia=new)
         bodies.append(body)

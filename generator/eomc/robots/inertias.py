@@ -23,7 +23,7 @@ def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
     return as_inertia(x if abs(x) > size else 0.0 for x in spatial.rotated_inertia(a, inertia))
 
 
-def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
+def principal_moments(inertia: Inertia) -> tuple[list[float], list[Vector]]:
     """Return the principal moments of inertia in ascending order (kg m^2), and their axes."""
     import numpy as np
 
@@ -31,15 +31,15 @@ def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
     return moments.tolist(), [(x, y, z) for x, y, z in axes.T.tolist()]
 
 
-def indefinite(inertia: Inertia) -> str:
+def indefinite_message(inertia: Inertia) -> str:
     """Return an error message if a principal moment of inertia is negative, otherwise "".
 
-    The message proposes the nearest valid tensor, unless that tensor is zero (see `has_nearest`).
+    The message proposes the nearest valid tensor, unless that is zero (see `has_nearest_valid`).
     """
-    moments, _ = principal(inertia)
+    moments, _ = principal_moments(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
         return ""
-    if not has_nearest(inertia):
+    if not has_nearest_valid(inertia):
         listed = ", ".join(f"{moment:.4g}" for moment in moments)
         return (
             f"its principal moments of inertia are {listed} kg m^2, and no body has a negative "
@@ -47,37 +47,38 @@ def indefinite(inertia: Inertia) -> str:
         )
     return (
         f"its smallest principal moment of inertia is {moments[0]:.4g} kg m^2, and no body has "
-        f"a negative one: check its signs in the file, {shown(nearest(inertia))} would do"
+        "a negative one: check its signs in the file, "
+        f"{entries_text(nearest_valid(inertia))} would do"
     )
 
 
-def has_nearest(inertia: Inertia) -> bool:
+def has_nearest_valid(inertia: Inertia) -> bool:
     """Return True if the valid inertia tensor nearest to `inertia` differs from zero.
 
     A tensor is valid if a body can have it. The nearest one is zero if one principal moment of
     `inertia` is negative and fewer than two are positive. The signs in the file are then wrong.
     """
-    (small, middle, _), _ = principal(inertia)
+    (small, middle, _), _ = principal_moments(inertia)
     tiny = TRIANGLE * max(map(abs, inertia))
     return small >= -tiny or middle > tiny
 
 
-def unbalanced(inertia: Inertia) -> str:
+def triangle_message(inertia: Inertia) -> str:
     """Return a message if a principal moment of inertia exceeds the sum of the others.
 
     No body has such an inertia. Returns "" for a valid tensor.
     """
-    (small, middle, large), _ = principal(inertia)
+    (small, middle, large), _ = principal_moments(inertia)
     if large <= (small + middle) * (1 + TRIANGLE):
         return ""
     return (
         f"its principal moments of inertia {small:.4g}, {middle:.4g}, {large:.4g} break the "
-        f"triangle inequality, and no body has such: correct it, {shown(nearest(inertia))} would "
-        "do"
+        "triangle inequality, and no body has such: correct it, "
+        f"{entries_text(nearest_valid(inertia))} would do"
     )
 
 
-def nearest(inertia: Inertia) -> Inertia:
+def nearest_valid(inertia: Inertia) -> Inertia:
     """Return the valid inertia tensor that is nearest to `inertia` in the Frobenius norm.
 
     It has the same principal axes. Its principal moments are I = (b + c, a + c, a + b), where
@@ -86,8 +87,8 @@ def nearest(inertia: Inertia) -> Inertia:
     """
     import numpy as np
 
-    principal_moments, axes = principal(inertia)
-    moments = np.array(principal_moments)
+    listed, axes = principal_moments(inertia)
+    moments = np.array(listed)
     sums = 1.0 - np.eye(3)
     best, least = np.zeros(3), float(moments @ moments)
     for kept in ((0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)):
@@ -102,6 +103,6 @@ def nearest(inertia: Inertia) -> Inertia:
     return as_inertia(float(x) if abs(x := tensor[i, j]) > dust else 0.0 for i, j in ENTRIES)
 
 
-def shown(inertia: Inertia) -> str:
+def entries_text(inertia: Inertia) -> str:
     """Return the text of the six different entries of an inertia tensor, for a message."""
     return f"[{', '.join(f'{x:.8g}' for x in inertia)}]"

@@ -50,9 +50,9 @@ def with_input_limits(robot: Robot) -> Robot:
     alone = {d.coordinate for d in robot.drives if on.count(d.coordinate) == 1}
     drives, excluded = [], []
     for d in robot.drives:
-        force_range: Range | None = d.ends
+        force_range: Range | None = d.force_range
         if d.coordinate in driven and d.coordinate in alone:
-            force_range = intersection(d.ends, input_range(driven[d.coordinate], d.gear))
+            force_range = intersection(d.force_range, input_range(driven[d.coordinate], d.gear))
         if force_range is None:
             excluded.append(d.name)
         elif d.law:
@@ -60,7 +60,7 @@ def with_input_limits(robot: Robot) -> Robot:
         else:
             d = replace(d, limits=force_range)
         drives.append(d)
-    free = [d.name for d in drives if d.limits == d.ends == UNLIMITED]
+    free = [d.name for d in drives if d.limits == d.force_range == UNLIMITED]
     if len(free) == len(drives):
         raise EomcError("--limits: no input of this robot has limits")
     many = len(drives) - len(free)

@@ -11,7 +11,7 @@ import numpy as np
 from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import plus, scaled
-from eomc.robots.inertias import has_nearest, indefinite, unbalanced
+from eomc.robots.inertias import has_nearest_valid, indefinite_message, triangle_message
 from eomc.robots.limits import DEPTHS, stop_parameters
 from eomc.robots.robot import (
     BARE,
@@ -20,10 +20,10 @@ from eomc.robots.robot import (
     Robot,
     RobotBody,
     RobotLoop,
-    joined,
-    without_dust,
+    join_notes,
+    significant_inertia,
 )
-from eomc.robots.rotations import SNAP, turns_of
+from eomc.robots.rotations import SNAP, axis_rotations
 from eomc.robots.stiffness import coupling_gradient, loop_jacobian, rigid_bodies, with_stable_steps
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
@@ -36,7 +36,7 @@ ZERO_TOLERANCE = 1e-10  # of an entry of the Jacobian, relative to the bodies' d
 GAP_TOLERANCE = 1e-6  # m: a larger gap is reported
 
 
-def prepared_for_scene(robot: Robot) -> Robot:
+def prepare_for_scene(robot: Robot) -> Robot:
     """Return the robot in the form in which it can be written as a scene (the TOML input).
 
     Its names are valid in a scene, massless frames become points, and constraints without effect
@@ -47,7 +47,7 @@ def prepared_for_scene(robot: Robot) -> Robot:
     is not positive semi-definite.
     """
     robot = without_ineffective_constraints(robot)
-    bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
+    bodies = tuple(replace(body, inertia=significant_inertia(body)) for body in robot.bodies)
     robot = _with_points(replace(robot, bodies=bodies))
     if not robot.motions:
         raise EomcError(
@@ -55,9 +55,9 @@ def prepared_for_scene(robot: Robot) -> Robot:
             "--base free its root does"
         )
     faults = [
-        f"body {b.name}: {why}" + (MENDED if has_nearest(b.inertia) else "")
+        f"body {b.name}: {why}" + (MENDED if has_nearest_valid(b.inertia) else "")
         for b in robot.bodies
-        if (why := indefinite(b.inertia))
+        if (why := indefinite_message(b.inertia))
     ]
     if faults := [*faults, *without_inertia(robot)]:
         raise EomcError("\n".join(faults))
@@ -65,7 +65,7 @@ def prepared_for_scene(robot: Robot) -> Robot:
     notes = tuple(
         f"body {body.name}: {why}{MENDED}; until then the scene is refused"
         for body in robot.bodies
-        if (why := unbalanced(body.inertia))
+        if (why := triangle_message(body.inertia))
     )
     if light := light_root(robot):
         notes += (
@@ -73,7 +73,9 @@ def prepared_for_scene(robot: Robot) -> Robot:
             "carries moves nothing against it: give it both, or import with --base fixed; until "
             "then the scene is refused",
         )
-    rough = [b.name for b in robot.bodies if any(_rough(by) for _, by in turns_of(b.rotation))]
+    rough = [
+        b.name for b in robot.bodies if any(_rough(by) for _, by in axis_rotations(b.rotation))
+    ]
     if rough:
         notes += (
             "quarter turns to five digits or so, as 1.5708, which are kept as they are ("
@@ -188,7 +190,7 @@ def _mimic_in_scene(motion: JointMotion, coordinates: Mapping[str, str]) -> Mimi
 
 
 def _renamed(old: str, new: str, note: str) -> str:
-    return note if old == new else joined(f"'{old}' in the file", note)
+    return note if old == new else join_notes(f"'{old}' in the file", note)
 
 
 # --- constraints without effect -------------------------------------------------------------------

@@ -167,7 +167,7 @@ class Law:
         return "kp" if gain == self.kp else "kv" if gain == self.kv and not self.kp else ""
 
     @property
-    def plain(self) -> bool:
+    def has_constant_gain(self) -> bool:
         """Whether the force is a constant times the input."""
         return not any((*self.gain[1:], *self.bias))
 
@@ -200,14 +200,14 @@ class Drive:
     start: float = 0.0
 
     @property
-    def ends(self) -> Range:
+    def force_range(self) -> Range:
         """The range of the drive's force before it is multiplied by the gear factor."""
         return self.law.force if self.law else self.limits
 
     @property
     def max_force(self) -> float:
         """The largest magnitude of the force along the coordinate (N or N m); inf if unlimited."""
-        return abs(self.gear) * max(map(abs, self.ends)) if self.gear else 0.0
+        return abs(self.gear) * max(map(abs, self.force_range)) if self.gear else 0.0
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class Tendon:
     rest: Range = (0.0, 0.0)
 
     @property
-    def acts(self) -> bool:
+    def has_forces(self) -> bool:
         """Whether the tendon itself has stiffness, damping or armature.
 
         A drive that acts on the tendon does not count.
@@ -295,7 +295,7 @@ class Coupling:
         """The names of the coordinates that occur in the constraint."""
         return {q for _, q in (*self.first, *self.second)}
 
-    def excess(self, values: Mapping[str, float]) -> float:
+    def residual(self, values: Mapping[str, float]) -> float:
         """Return the residual of the constraint: its left side minus its right side.
 
         `values` are the coordinates by name.
@@ -415,7 +415,7 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
         if motion and position is not None:
             note = f"joint {motion.name} stands at {position:g} {motion.unit}"
             body = replace(
-                fix_body(body, *body_pose(body, (position,))), note=joined(body.note, note)
+                fix_body(body, *body_pose(body, (position,))), note=join_notes(body.note, note)
             )
         bodies.append(body)
     tendons = tuple(t for each in robot.tendons if (t := _shortened(each, values)).terms)
@@ -428,7 +428,7 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
     orphaned = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
     orphaned |= {c.name for c in couplings if not free.issuperset(c.coordinates)}
     fully_locked = [c for c in robot.couplings if c.coordinates <= values.keys()]
-    violated = [c.name for c in fully_locked if abs(c.excess(values)) > COUPLING_TOLERANCE]
+    violated = [c.name for c in fully_locked if abs(c.residual(values)) > COUPLING_TOLERANCE]
     notes = [
         ("constraints that the values of locked joints break", violated),
         ("constraints of what is cut off or locked", sorted(orphaned)),
@@ -520,7 +520,7 @@ def free_motions(of: str = "") -> tuple[JointMotion, ...]:
     return (*slides, *turns)
 
 
-def without_dust(body: RobotBody) -> Inertia:
+def significant_inertia(body: RobotBody) -> Inertia:
     """Return a body's inertia tensor, or zero if the tensor is a rounding error.
 
     It is a rounding error if the radii of gyration are below 0.1 um.
@@ -529,6 +529,6 @@ def without_dust(body: RobotBody) -> Inertia:
     return NO_INERTIA if dust else body.inertia
 
 
-def joined(*notes: str) -> str:
+def join_notes(*notes: str) -> str:
     """Return one text with all notes that are not empty, separated by semicolons."""
     return "; ".join(note for note in notes if note)

@@ -103,7 +103,7 @@ def toward(z: Vector) -> Matrix:
     return from_axis_angle(axis, math.atan2(sine, z[2]))
 
 
-def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
+def axis_rotations(a: Matrix) -> tuple[tuple[str, float], ...]:
     """Return the rotations about z, y and x whose product is the rotation matrix `a`.
 
     Each is a pair (axis, angle in rad). Zero rotations are left out. Near a pitch of pi/2 only the

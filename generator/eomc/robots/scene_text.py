@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from eomc.base.texts import line, toml
 from eomc.robots.limits import DAMPING, DEPTHS, Stop, joint_stops, stop_parameters
-from eomc.robots.preparation import prepared_for_scene
+from eomc.robots.preparation import prepare_for_scene
 from eomc.robots.robot import (
     UNLIMITED,
     Coupling,
@@ -19,9 +19,9 @@ from eomc.robots.robot import (
     RobotBody,
     RobotLoop,
     Tendon,
-    joined,
+    join_notes,
 )
-from eomc.robots.rotations import SNAP, Vector, turns_of
+from eomc.robots.rotations import SNAP, Vector, axis_rotations
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
@@ -35,7 +35,7 @@ def scene_text(robot: Robot) -> str:
     Numbers are written exactly, except angles within 1e-10 of a multiple of pi/12. These are
     written as multiples of pi, so that their sines are exact.
     """
-    robot = prepared_for_scene(robot)
+    robot = prepare_for_scene(robot)
     head = [f"# {line(robot.title)}"]
     if robot.left_out:
         head += ["#", "# Not modelled, or to be looked at:"]
@@ -100,7 +100,7 @@ def _loop(loop: RobotLoop) -> dict[str, str]:
         "bodies": _each([toml(body) for body in loop.bodies]),
         "points": _each([vector(point) for point in loop.points]),
     }
-    if turns := turns_of(loop.rotation):
+    if turns := axis_rotations(loop.rotation):
         entry["rotation"] = _turns(turns)
     return entry
 
@@ -127,12 +127,12 @@ def _gear(c: Coupling) -> dict[str, str]:
 
 def _row(c: Coupling) -> str:
     """Return a coupling as an entry of [constraints]."""
-    second = less(total(c.second), c.at)
+    second = difference(linear_combination(c.second), c.at)
     second = second if second.isidentifier() else f"({second})"
     powers = [f"{number(a)}*{second}**{k}" for k, a in enumerate(c.polynomial) if a and k]
     terms = [number(c.polynomial[0])] * bool(c.polynomial[0]) + powers
     right = " + ".join(terms).replace("**1", "").replace("+ -", "- ")
-    text = less(total(c.first), c.zero) + (f" - ({right})" if right else "")
+    text = difference(linear_combination(c.first), c.zero) + (f" - ({right})" if right else "")
     unit = f", unit = {toml(c.unit)}" if c.unit else ""
     return f"{{ formula = {toml(text)}{unit} }}"
 
@@ -157,7 +157,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
         entry["coordinates"] = _each([toml(_moved_by(m)) for m in body.motions])
     if any(body.offset):
         entry["place" if body.point else "offset"] = vector(body.offset)
-    if turns := turns_of(body.rotation):
+    if turns := axis_rotations(body.rotation):
         entry["rotation"] = _turns(turns)
     if body.axes and body.axes != JOINTS[body.joint].defaults:
         entry["axis"] = _each([vector(axis) for axis in body.axes])
@@ -247,8 +247,8 @@ def definitions(robot: Robot) -> dict[str, str]:
     The formulas are the lengths of tendons and the forces of servos.
     """
     driven = {d.coordinate for d in robot.drives}
-    acting = [t for t in robot.tendons if t.acts or t.name in driven]
-    entries = {t.name: toml(less(total(t.terms), -t.offset)) for t in acting}
+    acting = [t for t in robot.tendons if t.has_forces or t.name in driven]
+    entries = {t.name: toml(difference(linear_combination(t.terms), -t.offset)) for t in acting}
     for d in robot.drives:
         if d.law:
             entries[f"{d.name}_force"] = toml(_law(d, d.law, robot))
@@ -272,7 +272,7 @@ def energies(robot: Robot) -> dict[str, str]:
         "potential": [*((t.stiffness, _spring(t)) for t in robot.tendons if t.stiffness), *weights],
         "dissipation": [(t.damping, rate) for t, rate in rates if t.damping],
     }
-    return {key: _long(total(terms)) for key, terms in sums.items() if terms}
+    return {key: _long(linear_combination(terms)) for key, terms in sums.items() if terms}
 
 
 def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
@@ -293,7 +293,7 @@ def force(coordinate: str, robot: Robot) -> str:
         for by, q in robot.coordinate_terms(d.coordinate)
         if q == coordinate
     ]
-    return total(terms)
+    return linear_combination(terms)
 
 
 def _units(robot: Robot) -> Mapping[str, str]:
@@ -307,7 +307,7 @@ def _input(drive: Drive, robot: Robot) -> str:
         at = drive.law.set_point
         unit = unit and {"kp": unit, "kv": f"{unit}/s"}.get(at, "")
         what = {"kp": "set point of", "kv": "set point of the rate of"}.get(at, "control along")
-        note = joined(f"{what} {drive.coordinate}", drive.note)
+        note = join_notes(f"{what} {drive.coordinate}", drive.note)
     elif unit:
         unit = _FORCES[unit]
     of = f"unit = {toml(unit)}, " if unit else ""
@@ -326,7 +326,9 @@ def _law(d: Drive, law: Law, robot: Robot) -> str:
     pulls = {"kp": (law.kp, q), "kv": (law.kv, rate)}
     words = []
     if at := law.set_point:
-        words.append(f"{d.name}_{at}*({total([(1.0, d.name), (-d.gear, pulls.pop(at)[1])])})")
+        words.append(
+            f"{d.name}_{at}*({linear_combination([(1.0, d.name), (-d.gear, pulls.pop(at)[1])])})"
+        )
         gain = 0.0
     terms = [
         (gain, d.name),
@@ -334,7 +336,7 @@ def _law(d: Drive, law: Law, robot: Robot) -> str:
         (by_rate * d.gear, f"{rate}*{d.name}"),
         *((-d.gear * bool(k), f"{d.name}_{key}*{of}") for key, (k, of) in pulls.items()),
     ]
-    words += [total([(by, of)]) for by, of in terms if by]
+    words += [linear_combination([(by, of)]) for by, of in terms if by]
     words += [number(law.bias[0])] if law.bias[0] else []
     text = " + ".join(words).replace("+ -", "- ") or "0"
     if robot.limited and law.force != UNLIMITED:
@@ -347,15 +349,15 @@ def _spring(t: Tendon) -> str:
     """Return the energy of a spring of stiffness 1, which is zero within its range of rest."""
     low, high = t.rest
     if low == high:
-        return f"({less(t.name, low)})**2/2"
-    beyond = f"max(0, {less(t.name, high)})", f"max(0, {less(f'-{t.name}', -low)})"
+        return f"({difference(t.name, low)})**2/2"
+    beyond = f"max(0, {difference(t.name, high)})", f"max(0, {difference(f'-{t.name}', -low)})"
     return f"({beyond[0]}**2 + {beyond[1]}**2)/2"
 
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
     """Return a sum in parentheses; a long one is split into partial sums."""
     if len(terms) <= _MAX_TERMS:
-        return f"({total(terms)})"
+        return f"({linear_combination(terms)})"
     return (
         "("
         + " + ".join(_sum(terms[k : k + _MAX_TERMS]) for k in range(0, len(terms), _MAX_TERMS))
@@ -450,7 +452,7 @@ def vector(v: Vector) -> str:
     return f"[{', '.join(map(number, v))}]"
 
 
-def total(terms: Sequence[tuple[float, str]]) -> str:
+def linear_combination(terms: Sequence[tuple[float, str]]) -> str:
     """Return the formula of a linear combination as text, such as "2*q1 - q2".
 
     `terms` are pairs (factor, name of a coordinate).
@@ -459,6 +461,6 @@ def total(terms: Sequence[tuple[float, str]]) -> str:
     return " + ".join(shown).replace("+ -", "- ") or "0"
 
 
-def less(text: str, x: float) -> str:
+def difference(text: str, x: float) -> str:
     """Return the text of the formula `text` minus the number x, such as "q1 - 0.5"."""
     return f"{text} - {number(x)}".replace("- -", "+ ") if x else text

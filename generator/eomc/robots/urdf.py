@@ -27,7 +27,7 @@ from eomc.robots.robot import (
     Robot,
     RobotBody,
     free_motions,
-    joined,
+    join_notes,
     with_joints_fixed,
     with_left_out_note,
 )
@@ -116,7 +116,7 @@ class _UrdfReader:
         """Return the robot that the file describes. Raises SceneError with all of its faults."""
         links = self._named("link")
         if not links and not self.faults:
-            self.say("", "the robot has no <link>: a URDF has one for each body")
+            self.add_fault("", "the robot has no <link>: a URDF has one for each body")
         bodies = {name: self._link(name, element) for name, element in links.items()}
         elements = self._named("joint")
         read = [self._joint(name, e, bodies) for name, e in elements.items()]
@@ -135,7 +135,7 @@ class _UrdfReader:
         )
         return with_joints_fixed(robot)
 
-    def say(self, key: str, message: str) -> None:
+    def add_fault(self, key: str, message: str) -> None:
         """Add an error message on the link or joint `key`, with its line in the file."""
         self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
@@ -144,7 +144,7 @@ class _UrdfReader:
         for tag in tags:
             parts = [*element.each(tag)]
             if len(parts) > 1:
-                self.say(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
+                self.add_fault(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
 
     # --- links
 
@@ -155,9 +155,11 @@ class _UrdfReader:
             name = element.get("name").strip()
             self.lines.setdefault(f"{tag} {name or k + 1}", element.line)
             if not name:
-                self.say(f"{tag} {k + 1}", f'it has no name: write <{tag} name="...">')
+                self.add_fault(f"{tag} {k + 1}", f'it has no name: write <{tag} name="...">')
             elif name in out:
-                self.say(f"{tag} {name}", f"a second {tag} has this name: rename one of the two")
+                self.add_fault(
+                    f"{tag} {name}", f"a second {tag} has this name: rename one of the two"
+                )
             else:
                 out[name] = element
         return out
@@ -174,11 +176,11 @@ class _UrdfReader:
         mass, tensor = inertial.first("mass"), inertial.first("inertia")
         if mass is None or tensor is None:
             lacks = '<mass value="..."/>' if mass is None else '<inertia ixx="..." .../>'
-            self.say(key, f"its <inertial> has no mass or no inertia: add {lacks}")
+            self.add_fault(key, f"its <inertial> has no mass or no inertia: add {lacks}")
             return RobotBody(name)
         kilograms = self._number(mass, "value", key, required=True)
         if kilograms < 0:
-            self.say(key, f"its mass is negative ({kilograms:g} kg): masses are zero or more")
+            self.add_fault(key, f"its mass is negative ({kilograms:g} kg): masses are zero or more")
         center, turn = self._origin(inertial, key)
         moments = [self._number(tensor, ii, key, required=True) for ii in ("ixx", "iyy", "izz")]
         products = [self._number(tensor, ij, key) for ij in ("ixy", "ixz", "iyz")]
@@ -194,7 +196,7 @@ class _UrdfReader:
         if kind not in _TYPES:
             known = f"known are {', '.join(_TYPES)}"
             message = f"unknown type '{kind}'" if kind else "it has no type"
-            self.say(key, message + (suggest(kind, _TYPES) or f": {known}"))
+            self.add_fault(key, message + (suggest(kind, _TYPES) or f": {known}"))
         self._parts(joint, _JOINT_PARTS, key)
         ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
         offset, rotation = self._origin(joint, key)
@@ -205,7 +207,9 @@ class _UrdfReader:
             try:
                 axis = unit(axis)
             except ValueError:
-                self.say(key, 'its axis has length zero: give it a direction, <axis xyz="0 0 1"/>')
+                self.add_fault(
+                    key, 'its axis has length zero: give it a direction, <axis xyz="0 0 1"/>'
+                )
         motions = self._motions(name, kind, joint, key)
         if kind not in _TYPES or not all(ends):
             return None
@@ -222,10 +226,10 @@ class _UrdfReader:
         tag = joint.first(end)
         link = "" if tag is None else tag.get("link").strip()
         if not link:
-            self.say(key, f'it has no {end} link: add <{end} link="..."/>')
+            self.add_fault(key, f'it has no {end} link: add <{end} link="..."/>')
         elif link not in bodies:
             near = suggest(link, bodies) or f': add <link name="{link}">'
-            self.say(key, f"its {end} link '{link}' is not in the file{near}")
+            self.add_fault(key, f"its {end} link '{link}' is not in the file{near}")
             return ""
         return link
 
@@ -241,7 +245,9 @@ class _UrdfReader:
             friction = self._number(dynamics, "friction", key)
             for what, value in (("damping", damping), ("friction", friction)):
                 if value < 0:
-                    self.say(key, f"its {what} is negative ({value:g}): it would drive the joint")
+                    self.add_fault(
+                        key, f"its {what} is negative ({value:g}): it would drive the joint"
+                    )
         of = "m" if kind == "prismatic" else "rad"
         if kind == "planar":
             slide = JointMotion(f"x_{name}", "m", damping=damping, friction=friction)
@@ -255,7 +261,7 @@ class _UrdfReader:
                 note, ends = f"{lower:g} to {upper:g}", (lower, upper)
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
         speed = 0.0 if limit is None else self._number(limit, "velocity", key)
-        note = joined(note, f"at most {speed:g} {of}/s" if speed > 0 else "")
+        note = join_notes(note, f"at most {speed:g} {of}/s" if speed > 0 else "")
         driven = (-effort, effort) if effort > 0 else UNLIMITED
         return (JointMotion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
@@ -267,7 +273,9 @@ class _UrdfReader:
             if mimic_tag is not None and joint.kind != "fixed":
                 mimics[joint.name] = self._mimic(joint, mimic_tag, elements)
         for ring in find_cycles({name: [mimic.coordinate] for name, mimic in mimics.items()}):
-            self.say(f"joint {ring[0]}", f"joints mimic one another in a ring: {cycle_text(ring)}")
+            self.add_fault(
+                f"joint {ring[0]}", f"joints mimic one another in a ring: {cycle_text(ring)}"
+            )
             for name in ring:
                 mimics.pop(name, None)
         by_name = {joint.name: joint for joint in joints}
@@ -285,10 +293,10 @@ class _UrdfReader:
     def _mimic(self, joint: _Joint, mimic_tag: Tag, elements: Mapping[str, Tag]) -> Mimic:
         key, leader = f"joint {joint.name}", mimic_tag.get("joint").strip()
         if not leader:
-            self.say(key, 'its <mimic> names no joint: add joint="..."')
+            self.add_fault(key, 'its <mimic> names no joint: add joint="..."')
         elif leader not in elements:
             near = suggest(leader, elements) or ": remove the <mimic>, or add that joint"
-            self.say(key, f"it mimics joint '{leader}', which is not in the file{near}")
+            self.add_fault(key, f"it mimics joint '{leader}', which is not in the file{near}")
         numbers = {"multiplier": 1.0, "offset": 0.0}
         for name in numbers:
             if name in mimic_tag.attributes:
@@ -301,7 +309,9 @@ class _UrdfReader:
             if each and len(each.motions) > 1:
                 count = f"a {each.kind} joint, which has {len(each.motions)} coordinates"
                 why = f"it mimics '{mimic.coordinate}'; '{each.name}' is {count}: only joints "
-                self.say(f"joint {joint.name}", why + "with one can mimic: remove the <mimic>")
+                self.add_fault(
+                    f"joint {joint.name}", why + "with one can mimic: remove the <mimic>"
+                )
                 return joint
         leader_start = leader.motions[0].start if leader and leader.motions else 0.0
         (motion,) = joint.motions
@@ -316,7 +326,7 @@ class _UrdfReader:
         child_joints: dict[str, list[_Joint]] = {name: [] for name in bodies}
         for joint in joints:
             if other := parent_joints.get(joint.child):
-                self.say(
+                self.add_fault(
                     f"joint {joint.name}",
                     f"its child link '{joint.child}' is held by joint '{other.name}' already: "
                     "bodies of a URDF hang in a tree, remove one of the two joints and close the "
@@ -332,7 +342,7 @@ class _UrdfReader:
             ends = {e.kind for e in self.root.children if e.kind.lower().endswith("joint")}
             strange = ", ".join(f"<{kind}>" for kind in sorted(ends - {"joint"}))
             why = f"; {strange} is not read, only <joint> is" if strange else ""
-            self.say(
+            self.add_fault(
                 f"link {roots[1]}",
                 f"{len(roots)} links have no parent ({', '.join(roots[:8])}): a robot has one "
                 f"root, connect the others to it by fixed joints{why}",
@@ -347,7 +357,7 @@ class _UrdfReader:
             find_cycles({name: [joint.parent] for name, joint in parent_joints.items()}), []
         )
         if loop and not self.faults:
-            self.say(
+            self.add_fault(
                 f"joint {parent_joints[loop[0]].name}",
                 f"the links hold one another in a loop ({' on '.join(loop)}): "
                 "one of them belongs to the root",
@@ -370,7 +380,7 @@ class _UrdfReader:
             axes=(joint.axis,) if len(joint.motions) == 1 else (),
             offset=joint.offset,
             rotation=joint.rotation,
-            note=joined(
+            note=join_notes(
                 body.note, *(f"joint {_mimic_description(m)}" for m in joint.motions if m.mimics)
             ),
         )
@@ -433,7 +443,7 @@ class _UrdfReader:
         words = written.split()
         if len(words) != 3:
             what = f'{attribute}="{written}" of <{element.kind}> is not three numbers'
-            self.say(key, what + _macro(written))
+            self.add_fault(key, what + _macro(written))
             return default
         x, y, z = (self._value(word, f"{attribute} of <{element.kind}>", key) for word in words)
         return x, y, z
@@ -442,7 +452,7 @@ class _UrdfReader:
         written = element.attributes.get(attribute)
         if written is None:
             if required:
-                self.say(key, f'<{element.kind}> has no {attribute}: add {attribute}="..."')
+                self.add_fault(key, f'<{element.kind}> has no {attribute}: add {attribute}="..."')
             return 0.0
         return self._value(written, f"{attribute} of <{element.kind}>", key)
 
@@ -451,7 +461,7 @@ class _UrdfReader:
         try:
             return xml.number(word)
         except ValueError as why:
-            self.say(key, f"{what}: {why}{_macro(word)}")
+            self.add_fault(key, f"{what}: {why}{_macro(word)}")
             return 0.0
 
 
@@ -463,7 +473,7 @@ def _macro(written: str) -> str:
 def _mimic_description(motion: JointMotion) -> str:
     """Return a description of a joint that mimics another, with its limits."""
     assert motion.mimics
-    return joined(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)
+    return join_notes(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)
 
 
 def _shapes(link: Tag) -> list[str]:

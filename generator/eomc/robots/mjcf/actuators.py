@@ -13,13 +13,22 @@ from eomc.robots.mjcf.file import (
     MEASURES,
     AttributeReader,
     ImportReport,
-    leave_unread,
-    missing,
+    missing_message,
+    note_unread_attributes,
 )
 from eomc.robots.mjcf.joints import MjcfJoint, Tendons, is_limited, unique_name
 from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Placed, Reader
-from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
-from eomc.robots.robot import UNLIMITED, Drive, JointMotion, Law, Range, RobotBody, Tendon, joined
+from eomc.robots.mjcf.ratios import has_ratio, mass_matrix_at_start, servo_damping
+from eomc.robots.robot import (
+    UNLIMITED,
+    Drive,
+    JointMotion,
+    Law,
+    Range,
+    RobotBody,
+    Tendon,
+    join_notes,
+)
 from eomc.robots.rotations import ORIGIN, from_quaternion, yaw_pitch_roll
 from eomc.robots.xml import Tag
 
@@ -74,10 +83,10 @@ def read_actuators(
         law, drive = _law(a), _drive(name, a, by_name, tendons, reader)
         if drive:
             ends = by_name[on].motions[0].limits if "tendon" not in a else UNLIMITED
-            drive = _lawful(drive, law, a, ends, reader)
+            drive = _with_law(drive, law, a, ends, reader)
         actuators.append(Actuator(drive, a.get("dyntype", "none"), bool(drive and law)))
     joints = list(by_name.values())
-    return joints, actuators if reader.report.faults else _damped(
+    return joints, actuators if reader.report.faults else _with_damping_ratios(
         actuators, bodies, joints, tendons
     )
 
@@ -89,7 +98,7 @@ def _drive(
     report = reader.report
     damps, *more = a.numbers("damping", 3, 1) or (0.0,)
     if any(more):
-        report.leave("damping in the square and cube of actuators", name)
+        report.leave_out("damping in the square and cube of actuators", name)
     gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
     disabled = reader.settings.disabled
     load = gear**2 * a.number("armature"), 0.0 if "damper" in disabled else gear**2 * damps
@@ -97,39 +106,39 @@ def _drive(
     on = a.get("joint", a.get("jointinparent"))
     if on:
         if on not in joints:
-            a.fault(missing("joint", on, joints))
+            a.fault(missing_message("joint", on, joints))
             return None
         joint = joints[on]
         if joint.type in {"free", "ball"}:
-            report.leave("actuators on free and ball joints", name)
+            report.leave_out("actuators on free and ball joints", name)
             return None
         (motion,) = joint.motions
-        joints[on] = replace(joint, motions=(_loaded(motion, *load),))
+        joints[on] = replace(joint, motions=(_with_load(motion, *load),))
     elif tendon := a.get("tendon"):
-        if not tendons.known(tendon, a):
+        if not tendons.has_tendon(tendon, a):
             return None
         if tendon not in tendons.fixed:
-            report.leave("actuators on tendons through space", name)
+            report.leave_out("actuators on tendons through space", name)
             return None
-        tendons.fixed[tendon] = _loaded(tendons.fixed[tendon], *load)
-        if off and tendons.fixed[tendon].acts:
-            tendons.reads(tendon)
-        on = tendon if off else tendons.driven(tendon)
+        tendons.fixed[tendon] = _with_load(tendons.fixed[tendon], *load)
+        if off and tendons.fixed[tendon].has_forces:
+            tendons.mark_modelled(tendon)
+        on = tendon if off else tendons.mark_driven(tendon)
     else:
-        report.leave("actuators on sites, bodies and slider-cranks", name)
+        report.leave_out("actuators on sites, bodies and slider-cranks", name)
         return None
     if off:
-        report.leave("actuators that the file disables (<flag>, actuatorgroupdisable)", name)
+        report.leave_out("actuators that the file disables (<flag>, actuatorgroupdisable)", name)
         return None
-    leave_unread(a, "actuator", name)
+    note_unread_attributes(a, "actuator", name)
     return Drive(name, on, gear)
 
 
-def _loaded(of: Loaded, armature: float, damping: float) -> Loaded:
+def _with_load(of: Loaded, armature: float, damping: float) -> Loaded:
     return replace(of, armature=of.armature + armature, damping=of.damping + damping)
 
 
-def _lawful(
+def _with_law(
     drive: Drive, law: Law | None, a: AttributeReader, ends: Range, reader: Reader
 ) -> Drive:
     """Return the drive with the law of an actuator, its limits and its note.
@@ -147,10 +156,10 @@ def _lawful(
             mine = middle - inherits * half, middle + inherits * half
             control, active = (control, mine) if dynamics == "integrator" else (mine, active)
         else:
-            report.leave("ranges of actuators that inherit those of what has none here", name)
+            report.leave_out("ranges of actuators that inherit those of what has none here", name)
     own, other = intersection(control, active) or control, UNLIMITED
     if not law:
-        report.leave(LAWLESS, f"{name} ({a.get(' law', 'general')})")
+        report.leave_out(LAWLESS, f"{name} ({a.get(' law', 'general')})")
         own, other = UNLIMITED, control
     elif dynamics == "integrator":
         own, other = active, control
@@ -158,16 +167,16 @@ def _lawful(
         own, other = (active if dynamics != "none" else UNLIMITED), UNLIMITED
     note = _range_note(a.report, name, own, other, force)
     if law and dynamics != "none":
-        report.leave(ACTIVATIONS, f"{name} ({dynamics})")
-        note = joined("its activation", note)
-    if law and not law.plain:
+        report.leave_out(ACTIVATIONS, f"{name} ({dynamics})")
+        note = join_notes("its activation", note)
+    if law and not law.has_constant_gain:
         gain, follows = 1.0, replace(law, force=intersection(force, UNLIMITED) or UNLIMITED)
         limits = intersection(own, UNLIMITED)
     else:
         gain, follows = law.gain[0] if law else 1.0, None
         limits = intersection(own, input_range(force, gain))
     if limits is None:
-        report.leave("ranges of actuators that exclude each other", name)
+        report.leave_out("ranges of actuators that exclude each other", name)
     limits = limits or UNLIMITED
     return replace(drive, gear=drive.gear * gain, law=follows, limits=limits, note=note)
 
@@ -191,23 +200,23 @@ def _law(a: AttributeReader) -> Law | None:
     )
 
 
-def _damped(
+def _with_damping_ratios(
     actuators: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint],
     tendons: Tendons,
 ) -> list[Actuator]:  # fmt: skip
     """Return the actuators with damping ratios converted to damping."""
     if not any(each.drive and has_ratio(each.drive.law) for each in actuators):
         return list(actuators)
-    masses, rows = masses_at_start(bodies, joints, tendons.fixed.values())
+    masses, rows = mass_matrix_at_start(bodies, joints, tendons.fixed.values())
     terms = {t.name: t.terms for t in tendons.fixed.values()}
     out = []
     for each in actuators:
         d = each.drive
         if d and d.law and has_ratio(d.law):
             along = [(d.gear * by, q) for by, q in terms.get(d.coordinate, ((1.0, d.coordinate),))]
-            kv = damping(d.law, along, masses, rows)
+            kv = servo_damping(d.law, along, masses, rows)
             law = replace(d.law, bias=(*d.law.bias[:2], -kv))
-            note = joined(f"a damping ratio of {d.law.bias[2]:g}", d.note)
+            note = join_notes(f"a damping ratio of {d.law.bias[2]:g}", d.note)
             each = replace(each, drive=replace(d, law=law, note=note))
         out.append(each)
     return out
@@ -227,9 +236,9 @@ def _range_note(report: ImportReport, name: str, own: Range, control: Range, for
     for what, ends in (("input", own), ("control", control), ("force", force)):
         if ends != UNLIMITED:
             kind = "actuators" if what != "control" else "controls that are no inputs here"
-            report.leave(f"limits of {kind}, kept as notes", name)
+            report.leave_out(f"limits of {kind}, kept as notes", name)
             words.append(f"{what} from {ends[0]:.6g} to {ends[1]:.6g}")
-    return joined(*words)
+    return join_notes(*words)
 
 
 def with_key_frame_start(
@@ -244,16 +253,16 @@ def with_key_frame_start(
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
         a = AttributeReader(tag.attributes, tag, report)
         if a.get("name") != "home" or not {"qpos", "ctrl", "act"} & a.attributes.keys():
-            report.leave("key frames", a.get("name"))
+            report.leave_out("key frames", a.get("name"))
             continue
         for key in ("qvel", "mpos", "mquat", "plastic"):
             if any(a.numbers(key, 1_000_000, 0) or ()):
-                report.leave(BESIDES, key)
-        out = _posed(a, joints)
-        drives = _controlled(a, actuators)
+                report.leave_out(BESIDES, key)
+        out = _with_positions(a, joints)
+        drives = _with_controls(a, actuators)
     for joint in out:
         if joint.type in {"ball", "free"} and abs(math.cos(joint.motions[-2].start)) < 1e-6:
-            report.leave(
+            report.leave_out(
                 "to be looked at: yaw, pitch and roll are singular at the start, "
                 "with a pitch of a quarter turn",
                 joint.name,
@@ -261,7 +270,7 @@ def with_key_frame_start(
     return out, tuple(drive for drive in drives if drive)
 
 
-def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
+def _with_positions(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     """Return the joints with the positions of a key frame."""
     sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
     size = sum(sizes[joint.type] for joint in joints)
@@ -269,7 +278,9 @@ def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     if values is None:
         return list(joints)
     if len(values) != size:
-        a.report.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
+        a.report.leave_out(
+            f"the start of the key frame home: it has not the {size} numbers of qpos"
+        )
         return list(joints)
     out, at = [], 0
     for joint in joints:
@@ -286,19 +297,19 @@ def _posed(a: AttributeReader, joints: Sequence[MjcfJoint]) -> list[MjcfJoint]:
     return out
 
 
-def _controlled(a: AttributeReader, actuators: Sequence[Actuator]) -> list[Drive | None]:
+def _with_controls(a: AttributeReader, actuators: Sequence[Actuator]) -> list[Drive | None]:
     """Return the drives with the controls of a key frame, or the activations of integrators."""
     drives = [each.drive for each in actuators]
     active = [k for k, each in enumerate(actuators) if each.dynamics != "none"]
     for key, those in (("ctrl", range(len(drives))), ("act", active)):
         values = a.numbers(key, 1_000_000, 0) or ()
         if len(values) != len(those) and any(values):
-            a.report.leave(f"the {key} of the key frame home: it has not {len(those)} numbers")
+            a.report.leave_out(f"the {key} of the key frame home: it has not {len(those)} numbers")
             continue
         for k, value in zip(those, values, strict=False):
             each, drive = actuators[k], drives[k]
             if drive and each.lawful and (each.dynamics == "integrator") == (key == "act"):
                 drives[k] = replace(drive, start=value)
             elif value:
-                a.report.leave(BESIDES, key)
+                a.report.leave_out(BESIDES, key)
     return drives

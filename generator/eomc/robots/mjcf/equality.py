@@ -11,9 +11,16 @@ from dataclasses import dataclass
 
 from eomc.base.spatial import apply, plus, scaled, transposed
 from eomc.robots import rotations
-from eomc.robots.mjcf.file import AttributeReader, missing
+from eomc.robots.mjcf.file import AttributeReader, missing_message
 from eomc.robots.mjcf.joints import MjcfJoint, Tendons, unique_name
-from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Placed, Reader, Transform, pose_of, rounded
+from eomc.robots.mjcf.masses import (
+    IDENTITY_TRANSFORM,
+    Placed,
+    Reader,
+    Transform,
+    read_pose,
+    rounded,
+)
 from eomc.robots.robot import Coupling, JointMotion, RobotBody, RobotLoop, body_pose
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times
 from eomc.robots.xml import Tag
@@ -37,7 +44,7 @@ class _Ends:
     poses: Mapping[str, Transform]
     anchors: Mapping[str, Vector]
 
-    def of_file(self, body: str) -> Transform:
+    def file_pose(self, body: str) -> Transform:
         """Return the pose in the world of the frame that the file defines for a body.
 
         `body` is the body's name. The frames of the file and of the scene differ by an offset.
@@ -52,7 +59,7 @@ class _Ends:
         """
         pose = self.poses[body]
         x, y, z = apply(transposed(pose.turn), plus(place, scaled(pose.place, -1.0)))
-        return _plain(x), _plain(y), _plain(z)
+        return _rounded_length(x), _rounded_length(y), _rounded_length(z)
 
     def shifted(self, body: str, point: Vector) -> Vector:
         """Return the position of a point in the body's frame of the scene (m).
@@ -63,7 +70,7 @@ class _Ends:
         return plus(point, scaled(self.anchors.get(body, ORIGIN), -1.0))
 
 
-def _plain(x: float) -> float:
+def _rounded_length(x: float) -> float:
     """Return a computed length, m, rounded to 15 digits."""
     return rounded(float(f"{x:.15g}"), 1.0)
 
@@ -119,11 +126,11 @@ class _Reading:
         name = a.get("name") or "_".join([tag.kind, *filter(None, ends)])
         name = unique_name(name, self.taken)
         if tag.kind not in KINDS:
-            report.leave("equality constraints of other kinds", f"{tag.kind} {name}")
+            report.leave_out("equality constraints of other kinds", f"{tag.kind} {name}")
         elif not a.is_true("active", True):
-            report.leave("equality constraints that are not active", name)
+            report.leave_out("equality constraints that are not active", name)
         elif "equality" in self.reader.settings.disabled:
-            report.leave("equality constraints that the file disables (<flag>)", name)
+            report.leave_out("equality constraints that the file disables (<flag>)", name)
         else:
             self.taken.add(name)
             if tag.kind in ("connect", "weld"):
@@ -147,20 +154,20 @@ class _Reading:
         joint = "weld" if kind == "weld" else "spherical"
         loop = RobotLoop(name, joint, (one[0], other[0]), (one[1], other[1]), turn)
         self.loops.append(loop)
-        self.reader.report.leave(SOFT, name)
+        self.reader.report.leave_out(SOFT, name)
 
     def _site(self, name: str, a: AttributeReader) -> tuple[str, Vector, Matrix] | None:
         """Return a site's body, its position there, and the body's axes in the site's frame."""
         placed = self.reader.sites.get(name)
         if placed is None:
-            what = missing("site", name, self.reader.sites)
+            what = missing_message("site", name, self.reader.sites)
             a.fault(what if name else "it needs both site1 and site2")
             return None
-        self.reader.report.read("sites", name)
+        self.reader.report.mark_read("sites", name)
         site = placed.pose.compose(
-            pose_of(self.reader.attributes_with_defaults(placed, "site"), self.reader.settings)
+            read_pose(self.reader.attributes_with_defaults(placed, "site"), self.reader.settings)
         )
-        world = self.ends.of_file(placed.body).compose(site)
+        world = self.ends.file_pose(placed.body).compose(site)
         return placed.body, self.ends.point(placed.body, world.place), transposed(site.turn)
 
     def _anchored(self, kind: str, a: AttributeReader) -> list[tuple[str, Vector, Matrix] | None]:
@@ -168,10 +175,12 @@ class _Reading:
         names = [a.get("body1"), a.get("body2", WORLD)]
         for name in names:
             if name not in self.ends.poses:
-                a.fault(missing("body", name, self.ends.poses) if name else "it needs body1")
+                a.fault(
+                    missing_message("body", name, self.ends.poses) if name else "it needs body1"
+                )
                 return [None, None]
         one, other = names
-        first, second = self.ends.of_file(one), self.ends.of_file(other)
+        first, second = self.ends.file_pose(one), self.ends.file_pose(other)
         anchor = a.vector("anchor")
         if kind == "connect":
             if anchor is None:
@@ -215,16 +224,16 @@ class _Reading:
         self.couplings.append(
             Coupling(name, sides[0], sides[1], zeros[0], zeros[1], polynomial, unit)
         )
-        self.reader.report.leave(SOFT, name)
+        self.reader.report.leave_out(SOFT, name)
 
     def _joint(self, joint: str, name: str, a: AttributeReader) -> Sides | None:
         """Return the coordinate of a joint, as a sum with one term; None if it has none."""
         if joint not in self.joints:
-            a.fault(missing("joint", joint, self.joints) if joint else "it needs joint1")
+            a.fault(missing_message("joint", joint, self.joints) if joint else "it needs joint1")
             return None
         mjcf_joint = self.joints[joint]
         if len(mjcf_joint.motions) > 1:
-            self.reader.report.leave("couplings of free and ball joints", name)
+            self.reader.report.leave_out("couplings of free and ball joints", name)
             return None
         return ((1.0, mjcf_joint.motions[0]),)
 
@@ -233,11 +242,11 @@ class _Reading:
         if not tendon:
             a.fault("it needs tendon1")
             return None
-        if not self.tendons.known(tendon, a):
+        if not self.tendons.has_tendon(tendon, a):
             return None
         if tendon not in self.tendons.fixed:
-            self.reader.report.leave("couplings of tendons through space", name)
+            self.reader.report.leave_out("couplings of tendons through space", name)
             return None
-        self.tendons.reads(tendon)
+        self.tendons.mark_modelled(tendon)
         motions = {m.name: m for joint in self.joints.values() for m in joint.motions}
         return tuple((by, motions[q]) for by, q in self.tendons.fixed[tendon].terms)

@@ -199,14 +199,14 @@ class ImportReport:
     strangers: tuple[str, ...] = ()
     left: dict[str, list[str]] = field(default_factory=dict)
 
-    def leave(self, kind: str, name: str = "") -> None:
+    def leave_out(self, kind: str, name: str = "") -> None:
         """Record that a part of the file is left out of the model.
 
         `kind` describes the kind of part, and `name` is its name, or "" without one.
         """
         self.left.setdefault(kind, []).append(name)
 
-    def read(self, kind: str, name: str) -> None:
+    def mark_read(self, kind: str, name: str) -> None:
         """Remove the record that the part `name` of the given kind is left out of the model."""
         those = self.left.get(kind, [])
         if name in those:
@@ -214,7 +214,7 @@ class ImportReport:
             if not those:
                 del self.left[kind]
 
-    def lines(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[str, ...]:
         """Return the notes on what is left out: one for each kind of part, with number and names.
 
         A name that was recorded twice counts once. Notes on unknown elements come first.
@@ -425,28 +425,28 @@ def element_label(tag: Tag) -> str:
     return f'{tag.kind} "{name}"' if name else tag.kind
 
 
-def missing(kind: str, name: str, known: Iterable[str]) -> str:
+def missing_message(kind: str, name: str, known: Iterable[str]) -> str:
     """Return the error message that there is no `kind` called `name`.
 
-    The message proposes a similar name among `known`, if there is one.
+    The message proposes a similar name among `has_tendon`, if there is one.
     """
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
-def leave_unread(a: AttributeReader, kind: str, name: str) -> None:
+def note_unread_attributes(a: AttributeReader, kind: str, name: str) -> None:
     """Note in the report those attributes of an element that are ignored but affect the motion.
 
     `UNREAD` lists such attributes for each `kind` of element. `name` is that of the element.
     """
     for key, what in UNREAD[kind].items():
         if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):
-            a.report.leave(what, name)
+            a.report.leave_out(what, name)
 
 
 # --- settings and defaults ------------------------------------------------------------------------
 
 
-def settings_of(root: Tag, report: ImportReport) -> Settings:
+def read_settings(root: Tag, report: ImportReport) -> Settings:
     """Return the settings in the elements <compiler> and <option> of a file.
 
     If a setting is repeated, the last value applies. Settings that are not modelled are noted in
@@ -464,19 +464,19 @@ def settings_of(root: Tag, report: ImportReport) -> Settings:
         for key in a.attributes:
             if key in {"density", "viscosity", "wind"}:
                 if any(a.numbers(key, 3, 1) or ()):
-                    report.leave("forces of the surrounding fluid", key)
+                    report.leave_out("forces of the surrounding fluid", key)
             elif key not in {"gravity", "actuatorgroupdisable"} and key in OPTIONS:
-                report.leave("options of MuJoCo's simulation", key)
+                report.leave_out("options of MuJoCo's simulation", key)
         for flag in tag.each("flag"):
             f = AttributeReader(flag.attributes, flag, report)
             for key in f.attributes:
                 if key in EFFECTS:
                     disabled[key] = f.choice(key, ("enable", "disable")) == "disable"
                 elif key in FLAGS:
-                    report.leave("flags of MuJoCo's simulation", f"{key}={f.get(key)}")
+                    report.leave_out("flags of MuJoCo's simulation", f"{key}={f.get(key)}")
     those = [key for key, off in disabled.items() if off]
     for key in those:
-        report.leave("switched off by <flag> of the file", key)
+        report.leave_out("switched off by <flag> of the file", key)
     s = replace(s, disabled=frozenset(e for key in those for e in EFFECTS[key]), off_groups=groups)
     return replace(s, gravity=(0.0, 0.0, 0.0)) if "gravity" in s.disabled else s
 
@@ -508,7 +508,7 @@ def _compiler(s: Settings, a: AttributeReader) -> Settings:
     )
 
 
-def classes_of(root: Tag, report: ImportReport) -> Classes:
+def read_default_classes(root: Tag, report: ImportReport) -> Classes:
     """Return the default classes of a file: attribute values that its elements can inherit.
 
     The result maps the name of each class and the kind of element to the attributes. Attributes
@@ -527,7 +527,7 @@ def classes_of(root: Tag, report: ImportReport) -> Classes:
             for child in tag.children:
                 kind = "actuator" if child.kind in ACTUATORS else child.kind
                 if kind != "default":
-                    own[kind] = merged(own.get(kind, {}), child)
+                    own[kind] = with_defaults(own.get(kind, {}), child)
             for child in tag.each("default"):
                 a = AttributeReader(child.attributes, child, report)
                 inner = a.get("class")
@@ -541,7 +541,7 @@ def classes_of(root: Tag, report: ImportReport) -> Classes:
     return classes
 
 
-def merged(base: Attributes, tag: Tag) -> Attributes:
+def with_defaults(base: Attributes, tag: Tag) -> Attributes:
     """Return the attributes of the element `tag`, completed by those of its default class.
 
     `base` has the attributes of the class. An orientation replaces an inherited one of any kind,
@@ -555,7 +555,7 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
     if "fromto" in own:
         over.pop("pos", None)
     if tag.kind in ACTUATORS and tag.kind != "general":
-        over |= shortcut(tag.kind, over, own) | {" law": tag.kind}
+        over |= expand_shortcut(tag.kind, over, own) | {" law": tag.kind}
     for key, value in own.items():
         words = value.split()
         if key in PARTIAL and key in over:
@@ -571,7 +571,9 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
 MEASURES = ("kp", "kv", "dampratio", "timeconst", "area", "diameter")
 
 
-def shortcut(kind: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+def expand_shortcut(
+    kind: str, inherited: Mapping[str, str], own: Mapping[str, str]
+) -> dict[str, str]:
     """Return the attributes of <general> that an actuator shortcut such as <position> sets.
 
     Parameters

@@ -10,16 +10,22 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.mjcf.file import AttributeReader, ImportReport, Settings, leave_unread, missing
+from eomc.robots.mjcf.file import (
+    AttributeReader,
+    ImportReport,
+    Settings,
+    missing_message,
+    note_unread_attributes,
+)
 from eomc.robots.mjcf.masses import (
     IDENTITY_TRANSFORM,
     Placed,
     Reader,
     Transform,
-    direction,
     rounded,
+    unit_vector,
 )
-from eomc.robots.robot import UNLIMITED, JointMotion, Range, Tendon, free_motions, joined
+from eomc.robots.robot import UNLIMITED, JointMotion, Range, Tendon, free_motions, join_notes
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, unit, yaw_pitch_roll
 from eomc.robots.xml import Tag
 
@@ -62,7 +68,7 @@ LIMITS = "limits of joints, kept as notes"
 TYPES = ("hinge", "slide", "ball", "free")
 
 
-def joint_of(placed: Placed, name: str, pose: Transform, reader: Reader) -> MjcfJoint | None:
+def read_joint(placed: Placed, name: str, pose: Transform, reader: Reader) -> MjcfJoint | None:
     """Return the joint that an element of the file describes, or None if the element has a fault.
 
     `pose` is the pose of the joint's body in the parent's frame. The motions of free and ball
@@ -82,7 +88,7 @@ def joint_of(placed: Placed, name: str, pose: Transform, reader: Reader) -> Mjcf
         """Return the linear coefficient; report quadratic and cubic ones."""
         numbers = a.numbers(key, 3, 1) or (0.0,)
         if any(numbers[1:]):
-            report.leave(f"{key} in the square and cube of joints", name)
+            report.leave_out(f"{key} in the square and cube of joints", name)
         return numbers[0]
 
     own = {
@@ -103,13 +109,13 @@ def joint_of(placed: Placed, name: str, pose: Transform, reader: Reader) -> Mjcf
     for key, effect in DISABLES.items():
         if effect in settings.disabled:
             own[key] = 0.0
-    leave_unread(a, "joint", name)
+    note_unread_attributes(a, "joint", name)
     note, ends, driven = _limits(a, kind, settings, name)
     anchor = plus(placed.pose.place, apply(placed.pose.turn, a.vector("pos") or ORIGIN))
     if kind == "free":
         align = a.get("align", "auto")
         if align == "true" or (align == "auto" and settings.alignfree):
-            report.leave("alignment of free joints with the principal axes (alignfree)", name)
+            report.leave_out("alignment of free joints with the principal axes (alignfree)", name)
         start = (*pose.place, *yaw_pitch_roll(pose.turn))
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
@@ -119,12 +125,12 @@ def joint_of(placed: Placed, name: str, pose: Transform, reader: Reader) -> Mjcf
         )
         return _with_turn_forces(mjcf_joint, own, report)
     if kind == "ball":
-        motions = tuple(replace(m, note=joined(m.note, note)) for m in free_motions()[3:])
+        motions = tuple(replace(m, note=join_notes(m.note, note)) for m in free_motions()[3:])
         mjcf_joint = MjcfJoint(
             name, kind, "spherical", motions, (), anchor, IDENTITY_TRANSFORM, 0.0, spring
         )
         return _with_turn_forces(mjcf_joint, own, report)
-    axis = direction(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
+    axis = unit_vector(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
     if axis is None:
         return None
     x, y, z = (rounded(c, 1.0) for c in apply(placed.pose.turn, axis))
@@ -158,7 +164,7 @@ def _with_turn_forces(joint: MjcfJoint, own: dict[str, float], report: ImportRep
     springs = ("damping", "stiffness") if any(joint.spring) else ()
     keys = [key for key in ("damping", "friction", "stiffness") if own[key] or key in springs]
     if keys:
-        report.leave(
+        report.leave_out(
             f"{' and '.join(keys)} of whole turns: here they act on each of the three angles, "
             "which is the same near zero angles only",
             joint.name,
@@ -189,7 +195,7 @@ def _limits(
     if limits and kind != "free" and is_limited(a, "limited", settings):
         off = "limit" in settings.disabled
         what = "joints whose limits the file disables (<flag>)" if off else LIMITS
-        a.report.leave(what, name)
+        a.report.leave_out(what, name)
         low, high = (settings.angle(v) if kind != "slide" else v for v in limits)
         of = "rad" if kind != "slide" else "m"
         if off:
@@ -201,11 +207,11 @@ def _limits(
             ends = (low, high)
     force = a.numbers("actuatorfrcrange", 2)
     if force and kind in {"hinge", "slide"} and is_limited(a, "actuatorfrclimited", settings):
-        a.report.leave("limits of the actuators' force on joints, kept as notes", name)
+        a.report.leave_out("limits of the actuators' force on joints, kept as notes", name)
         newton = "N m" if kind == "hinge" else "N"
         notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
         driven = (force[0], force[1])
-    return joined(*notes), ends, driven
+    return join_notes(*notes), ends, driven
 
 
 def without_limits(joint: MjcfJoint) -> MjcfJoint:
@@ -274,40 +280,40 @@ class Tendons:
         used_names = {m.name for joint in joints for m in joint.motions}
         for tag in self._tags:
             name = tag.get("name")
-            reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
+            reader.report.leave_out(LEFT, f"{tag.kind} {name}".rstrip())
             terms = self._terms(tag) if tag.kind == "fixed" else None
             if not terms:
                 continue
             tendon = self._read(Tendon(unique_name(name or "tendon", used_names), terms), tag)
             used_names.add(tendon.name)
             self.fixed[name or tendon.name] = tendon
-            if tendon.acts:
-                self.reads(name)
+            if tendon.has_forces:
+                self.mark_modelled(name)
 
     @property
     def acting(self) -> tuple[Tendon, ...]:
         """The fixed tendons that have stiffness, damping, armature or an actuator."""
-        return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
+        return tuple(t for name, t in self.fixed.items() if t.has_forces or name in self._driven)
 
-    def known(self, name: str, a: AttributeReader) -> bool:
+    def has_tendon(self, name: str, a: AttributeReader) -> bool:
         """Return True if the file has a tendon called `name`; otherwise report a fault."""
         names = {tag.get("name") for tag in self._tags}
         if name not in names:
-            a.fault(missing("tendon", name, names))
+            a.fault(missing_message("tendon", name, names))
         return name in names
 
-    def reads(self, name: str) -> None:
+    def mark_modelled(self, name: str) -> None:
         """Record that a fixed tendon is modelled, so that it is not listed as left out."""
-        self._reader.report.read(LEFT, f"fixed {name}".rstrip())
+        self._reader.report.mark_read(LEFT, f"fixed {name}".rstrip())
 
-    def driven(self, name: str) -> str:
+    def mark_driven(self, name: str) -> str:
         """Record that an actuator drives a tendon, and return the unique name of the tendon.
 
         `name` is the tendon's name in the file. It is a fixed tendon: a linear combination of joint
         positions.
         """
         self._driven.add(name)
-        self.reads(name)
+        self.mark_modelled(name)
         return self.fixed[name].name
 
     def _terms(self, tag: Tag) -> tuple[tuple[float, str], ...]:
@@ -317,7 +323,9 @@ class Tendons:
             a = self._reader.own_attributes(each)
             joint = a.get("joint")
             if joint not in self._joints:
-                a.fault(missing("joint", joint, self._joints) if joint else "it needs a joint")
+                a.fault(
+                    missing_message("joint", joint, self._joints) if joint else "it needs a joint"
+                )
                 return ()
             if self._joints[joint].type in {"free", "ball"}:
                 return ()
@@ -331,7 +339,7 @@ class Tendons:
         for key in ("stiffness", "damping"):
             own[key], *more = a.numbers(key, 3, 1) or (0.0,)
             if any(more):
-                report.leave(f"{key} in the square and cube of tendons", name)
+                report.leave_out(f"{key} in the square and cube of tendons", name)
         own["armature"] = a.number("armature")
         for key, value in own.items():
             if value < 0:
@@ -340,8 +348,8 @@ class Tendons:
             if a.numbers(f"{key}range", 2) and is_limited(
                 a, f"{key}limited", self._reader.settings
             ):
-                report.leave(f"limits of {what} of tendons", name)
-        leave_unread(a, "tendon", name)
+                report.leave_out(f"limits of {what} of tendons", name)
+        note_unread_attributes(a, "tendon", name)
         disabled = self._reader.settings.disabled
         for key, effect in (("stiffness", "spring"), ("damping", "damper")):
             own[key] = 0.0 if effect in disabled else own[key]

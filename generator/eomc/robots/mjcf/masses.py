@@ -11,10 +11,10 @@ from eomc.robots import rotations
 from eomc.robots.inertias import (
     NO_INERTIA,
     Inertia,
-    indefinite,
-    principal,
+    indefinite_message,
+    principal_moments,
     rotated_inertia,
-    unbalanced,
+    triangle_message,
 )
 from eomc.robots.mjcf.file import (
     ORIENTATION,
@@ -22,8 +22,8 @@ from eomc.robots.mjcf.file import (
     Classes,
     ImportReport,
     Settings,
-    merged,
-    missing,
+    missing_message,
+    with_defaults,
 )
 from eomc.robots.robot import RobotBody
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
@@ -124,7 +124,7 @@ class Reader:
         """
         tag = placed.tag
         default = self.class_of(tag.get("class", placed.childclass), tag)
-        return AttributeReader(merged(default.get(kind, {}), tag), tag, self.report)
+        return AttributeReader(with_defaults(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
         """Return the default class `name`, which maps each kind of element to its attributes.
@@ -133,7 +133,7 @@ class Reader:
         reported for the element `tag`, and the outermost class is returned.
         """
         if name and name not in self.classes:
-            self.own_attributes(tag).fault(missing("default class", name, self.classes))
+            self.own_attributes(tag).fault(missing_message("default class", name, self.classes))
             name = ""
         return self.classes[name or "main"]
 
@@ -145,7 +145,7 @@ class Reader:
 # --- poses ----------------------------------------------------------------------------------------
 
 
-def direction(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
+def unit_vector(vector: Sequence[float], what: str, a: AttributeReader) -> Vector | None:
     """Return the unit vector along `vector`, or None if its length is zero.
 
     A length of zero is reported as a fault; `what` describes the vector in the message.
@@ -173,7 +173,7 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
             a.fault("quat has the length zero; no turn is 1 0 0 0")
             return IDENTITY
         return rotations.from_quaternion(*v)
-    first = direction(v[:3], key, a)
+    first = unit_vector(v[:3], key, a)
     if first is None:
         return IDENTITY
     if key == "zaxis":
@@ -182,13 +182,13 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
         return rotations.from_axis_angle(first, settings.angle(v[3]))
     along = dot(v[3:], first)
     across = [x - along * y for x, y in zip(v[3:], first, strict=True)]
-    second = direction(across, "the y axis of xyaxes", a)
+    second = unit_vector(across, "the y axis of xyaxes", a)
     if second is None:
         return IDENTITY
     return rotations.cleaned(transposed((first, second, cross(first, second))))
 
 
-def pose_of(a: AttributeReader, settings: Settings) -> Transform:
+def read_pose(a: AttributeReader, settings: Settings) -> Transform:
     """Return the pose of an element's frame in the enclosing frame, from its attributes."""
     return Transform(a.vector("pos") or ORIGIN, _orientation(a, settings))
 
@@ -283,7 +283,7 @@ def _geom_mass(placed: Placed, reader: Reader, is_static: bool) -> Mass | None:
     shell = a.is_true("shellinertia")
     if kind in FORMLESS or "mesh" in a:
         if is_static and reader.settings.totalmass <= 0:
-            reader.report.leave(
+            reader.report.leave_out(
                 "masses of meshes (not opened) on bodies that stand still, taken as zero",
                 placed.body,
             )
@@ -324,14 +324,14 @@ def _form(
             a.fault(f"a {kind} needs a size: {count} positive numbers")
         return None
     if ends is None:
-        pose = pose_of(a, settings)
+        pose = read_pose(a, settings)
     elif kind == "sphere":
         a.fault("a sphere has no fromto; give it pos, or type a capsule")
         return None
     else:
         (ax, ay, az, bx, by, bz) = ends
         between = (bx - ax, by - ay, bz - az)
-        along = direction(between, "fromto", a)
+        along = unit_vector(between, "fromto", a)
         if along is None:
             return None
         half = math.hypot(*between) / 2
@@ -371,7 +371,7 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
     if "mass" not in a or "pos" not in a:
         a.fault(f"the <inertial> of {placed.body} needs pos and mass")
         return None
-    pose = pose_of(a, reader.settings)
+    pose = read_pose(a, reader.settings)
     mass = a.number("mass")
     if mass < 0:
         a.fault(f"the mass of {placed.body}, {mass:g} kg, is negative")
@@ -400,17 +400,17 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, is_static: bool
         mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, is_static)) is not None])
     if inertials and mass.mass < LEAST_MASS:  # of geoms, which then leave <inertial> as it is
         mass, tag = _inertial(inertials[0], reader) or Mass(), inertials[0].tag
-    return _bounded(mass, reader.own_attributes(tag), reader.settings)
+    return _with_bounds(mass, reader.own_attributes(tag), reader.settings)
 
 
-def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
+def _with_bounds(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
     """Apply boundmass, boundinertia and balanceinertia to a mass, and check its inertia."""
     inertia = mass.inertia
     if not all(math.isfinite(x) for x in (mass.mass, *mass.center, *inertia)):
         a.fault("its mass or inertia overflows: check sizes, densities and places")
         return Mass()
     if s.boundinertia > 0 or s.balance:
-        moments, axes = principal(inertia)
+        moments, axes = principal_moments(inertia)
         bounded = [max(m, s.boundinertia) for m in moments] if s.boundinertia > 0 else moments
         small, middle, large = bounded
         if s.balance and small + middle < large:
@@ -418,14 +418,14 @@ def _bounded(mass: Mass, a: AttributeReader, s: Settings) -> Mass:
         if bounded != moments:
             rows = tuple(zip(*axes, strict=True))
             inertia = rotated_inertia((*bounded, 0.0, 0.0, 0.0), rows)  # type: ignore[arg-type]
-    if why := indefinite(inertia):
+    if why := indefinite_message(inertia):
         a.fault(f"{why}; mend it, or set boundinertia in <compiler>")
-    elif why := unbalanced(inertia):
+    elif why := triangle_message(inertia):
         a.fault(f"{why}; so would balanceinertia in <compiler>")
     return Mass(max(mass.mass, s.boundmass), mass.center, inertia)
 
 
-def scaled_to(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
+def scale_masses(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
     """Return the bodies with masses and inertias scaled so that the total mass is `total` (kg)."""
     now = sum(body.mass for body in bodies)
     k = total / now if now else 1.0

@@ -32,7 +32,7 @@ def has_ratio(law: Law | None) -> bool:
     return bool(law and law.bias[2] > 0 and law.set_point == "kp" and law.kp > 0)
 
 
-def damping(
+def servo_damping(
     law: Law, along: Iterable[tuple[float, str]], masses: NDArray[np.float64], rows: Sequence[str]
 ) -> float:
     """Return the damping kv of a servo from its damping ratio: ratio times 2 sqrt(kp m).
@@ -59,7 +59,7 @@ def damping(
     return 2 * law.bias[2] * math.sqrt(law.kp / mobility) if mobility > 0 else 0.0
 
 
-def sprung(
+def with_spring_dampers(
     joints: Sequence[MjcfJoint],
     bodies: Sequence[RobotBody],
     tendons: Iterable[Tendon],
@@ -76,7 +76,7 @@ def sprung(
 
     if not any(any(joint.spring) for joint in joints):
         return list(joints)
-    masses, rows = masses_at_start(bodies, joints, tendons)
+    masses, rows = mass_matrix_at_start(bodies, joints, tendons)
     if not np.isfinite(masses).all():  # masses that overflow
         return list(joints)
     mobilities = np.diag(np.linalg.lstsq(masses, np.eye(len(rows)), rcond=None)[0])
@@ -95,7 +95,7 @@ def sprung(
     return out
 
 
-def masses_at_start(
+def mass_matrix_at_start(
     bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint], tendons: Iterable[Tendon]
 ) -> tuple[NDArray[np.float64], list[str]]:
     """Return the mass matrix in the pose of the file, and the names of the coordinates of its rows.

@@ -16,21 +16,21 @@ from eomc.robots.mjcf.file import (
     SCHEMA,
     AttributeReader,
     ImportReport,
-    classes_of,
     load,
-    settings_of,
+    read_default_classes,
+    read_settings,
 )
 from eomc.robots.mjcf.joints import (
     MjcfJoint,
     Tendons,
-    joint_of,
+    read_joint,
     unique_name,
     with_coordinate_names,
     without_limits,
 )
 from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Mass, Placed, Reader, Transform
-from eomc.robots.mjcf.ratios import sprung
-from eomc.robots.robot import Robot, RobotBody, joined, with_left_out_note
+from eomc.robots.mjcf.ratios import with_spring_dampers
+from eomc.robots.robot import Robot, RobotBody, join_notes, with_left_out_note
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
 from eomc.robots.xml import Tag, unknown_parts
 from eomc.scene.assembly import WORLD
@@ -84,35 +84,35 @@ def read(path: str | Path, include: bool = False) -> Robot:
         )
         raise SceneError(report.faults)
     report.strangers = unknown_parts(root, SCHEMA, "MJCF")
-    settings = settings_of(root, report)
-    reader = Reader(settings, classes_of(root, report), report)
+    settings = read_settings(root, report)
+    reader = Reader(settings, read_default_classes(root, report), report)
     bodies, joints, anchors = _bodies(root, reader)
     if settings.totalmass > 0:
-        bodies = masses.scaled_to(bodies, settings.totalmass)
+        bodies = masses.scale_masses(bodies, settings.totalmass)
     tendons = Tendons(root, joints, reader)
     loops, couplings = read_equalities(
-        root, _moving(bodies, joints), joints, tendons, anchors, reader
+        root, _with_motions(bodies, joints), joints, tendons, anchors, reader
     )
     joints, actuators = read_actuators(root, bodies, joints, tendons, reader)
     if not report.faults:
-        joints = sprung(joints, bodies, tendons.fixed.values(), settings.disabled)
+        joints = with_spring_dampers(joints, bodies, tendons.fixed.values(), settings.disabled)
     if "limit" in settings.disabled:  # after actuators, which may inherit them
         joints = [without_limits(joint) for joint in joints]
     joints, drives = with_key_frame_start(root, joints, actuators, report)
     _sections(root, report)
     if report.faults:
-        raise with_left_out_note(SceneError(report.faults), report.lines())
+        raise with_left_out_note(SceneError(report.faults), report.notes())
     name = root.get("model") or path.stem
     return Robot(
         name=name,
         title=f"{name}, from the MJCF file {path.name}",
         gravity=settings.gravity,
-        bodies=_moving(bodies, joints),
+        bodies=_with_motions(bodies, joints),
         drives=drives,
         tendons=tendons.acting,
         loops=loops,
         couplings=couplings,
-        left_out=report.lines(),
+        left_out=report.notes(),
     )
 
 
@@ -121,7 +121,7 @@ def _geom_left_out(placed: Placed, reader: Reader) -> None:
     a = reader.attributes_with_defaults(placed, "geom")
     touches = a.get("contype", "1") != "0" or a.get("conaffinity", "1") != "0"
     what = "contacts of geoms" if touches else "shapes of geoms without contact"
-    reader.report.leave(what, a.get("name"))
+    reader.report.leave_out(what, a.get("name"))
 
 
 # --- the tree -------------------------------------------------------------------------------------
@@ -175,10 +175,10 @@ def _bodies(
         tag, parent, a = placed.tag, placed.body, reader.own_attributes(placed.tag)
         count += 1
         name = called(tag, "body", f"body{count}")
-        pose = placed.pose.compose(masses.pose_of(a, settings))
+        pose = placed.pose.compose(masses.read_pose(a, settings))
         inner = _contents(tag, name, a.get("childclass", placed.childclass), reader)
         body_joints = [
-            joint_of(p, called(p.tag, "joint", f"{name}_joint"), pose, reader)
+            read_joint(p, called(p.tag, "joint", f"{name}_joint"), pose, reader)
             for p in inner
             if p.tag.kind in {"joint", "freejoint"}
         ]
@@ -189,7 +189,7 @@ def _bodies(
             if len(own) > 1:
                 a.fault("a body with a free joint has no other joints; leave one")
         if a.is_true("mocap"):
-            report.leave("motions of mocap bodies, which stand still here", name)
+            report.leave_out("motions of mocap bodies, which stand still here", name)
         for p in inner:
             if p.tag.kind == "geom":
                 _geom_left_out(p, reader)
@@ -227,7 +227,7 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
         name = inner.get("name", inner.get("prefix"))
         if inner.kind == "frame":
             around = placed.pose.compose(
-                masses.pose_of(reader.own_attributes(inner), reader.settings)
+                masses.read_pose(reader.own_attributes(inner), reader.settings)
             )
             default = inner.get("childclass", placed.childclass)
             waiting += [Placed(child, body, around, default) for child in reversed(inner.children)]
@@ -236,10 +236,10 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
         elif inner.kind in ORNAMENTS:
             if inner.kind == "site" and name:
                 reader.sites[name] = placed
-            report.leave(f"{inner.kind}s", name)
+            report.leave_out(f"{inner.kind}s", name)
         elif inner.kind in GENERATORS:
             what = f"<{inner.kind}> and all that it adds, joints and masses too; {ONE_FILE}"
-            report.leave(what, name or f"in {body}")
+            report.leave_out(what, name or f"in {body}")
     return contents
 
 
@@ -259,7 +259,7 @@ def _chain(
     the last joint, in the frame of <body>.
     """
     if not joints:
-        return [_heavy(body, mass, ORIGIN)], [], ORIGIN
+        return [_with_mass(body, mass, ORIGIN)], [], ORIGIN
     name, pose = body.name, Transform(body.offset, body.rotation)
     bodies: list[RobotBody] = []
     own: list[MjcfJoint] = []
@@ -285,7 +285,7 @@ def _chain(
         anchor = joint.anchor
         # as an inertia of the body it is exact where what carries the joint does not turn
         if joint.armature and not (is_static and all(j.type == "slide" for j in joints[:i])):
-            report.leave(
+            report.leave_out(
                 "exact armature of ball joints: here it acts on each of the three angles, "
                 "which is the same near zero angles only",
                 joint.name,
@@ -293,11 +293,11 @@ def _chain(
             motions = tuple(replace(m, armature=joint.armature) for m in joint.motions)
             joint = replace(joint, motions=motions, armature=0.0)
         own.append(joint)
-    bodies[-1] = _heavy(bodies[-1], mass, anchor)
+    bodies[-1] = _with_mass(bodies[-1], mass, anchor)
     return bodies, own, anchor
 
 
-def _heavy(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
+def _with_mass(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
     """Return the body with a mass; `anchor` is its frame's origin in the frame of the mass."""
     note = ""
     if anchor != ORIGIN:
@@ -307,7 +307,9 @@ def _heavy(body: RobotBody, mass: Mass, anchor: Vector) -> RobotBody:
     return replace(body, mass=mass.mass, center=center, inertia=mass.inertia, note=note)
 
 
-def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[RobotBody, ...]:
+def _with_motions(
+    bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]
+) -> tuple[RobotBody, ...]:
     """Return the bodies with the motions of their joints and the armature of rotations."""
     waiting = iter(joints)
     out = []
@@ -322,7 +324,7 @@ def _moving(bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint]) -> tuple[R
                 motions=joint.motions,
                 inertia=as_inertia([xx + a, yy + a, zz + a, *rest]),
                 rotor=a,
-                note=joined(body.note, note),
+                note=join_notes(body.note, note),
             )
         out.append(body)
     return tuple(out)
@@ -336,9 +338,9 @@ def _sections(root: Tag, report: ImportReport) -> None:
     for section in root.children:
         if section.kind in SECTIONS:
             for tag in section.children:
-                report.leave(SECTIONS[section.kind], _label(tag))
+                report.leave_out(SECTIONS[section.kind], _label(tag))
         elif section.kind in SETTINGS:
-            report.leave("settings of MuJoCo's viewer and memory", section.kind)
+            report.leave_out("settings of MuJoCo's viewer and memory", section.kind)
 
 
 def _label(tag: Tag) -> str:
