@@ -244,8 +244,8 @@ def test_templates_are_given_free_text_only_as_free_text() -> None:
     whole = derived()
     marked = replace(whole, system=with_texts(whole.system, "MARKED"))
     target = Target(marked, DOUBLE)
-    given: list[Any] = [embedding.main(target), package.face(target, "_x")]
-    given += [package.binding(target), selftest.view(target)]
+    given: list[Any] = [embedding.main_view(target), package.face_view(target, "_x")]
+    given += [package.binding_view(target), selftest.selftest_view(target)]
 
     def show(view: Any) -> str:
         given.append(view)

@@ -135,7 +135,7 @@ class CostsView:
     steps: tuple[StepCost, ...]
 
 
-def main(target: Target) -> MainView:
+def main_view(target: Target) -> MainView:
     """Return the data for main.c, an example program that simulates the scene.
 
     The program prints about 200 lines.
@@ -183,17 +183,17 @@ def main(target: Target) -> MainView:
     )  # fmt: skip
 
 
-def cmake(target: Target) -> CMakeView:
+def cmake_view(target: Target) -> CMakeView:
     """Return the data for CMakeLists.txt, which builds the generated C as a library."""
     return CMakeView(tuple(stamp(target)), target.prefix, target.PREFIX, __version__)
 
 
-def pkg_config(target: Target) -> PkgConfigView:
+def pkg_config_view(target: Target) -> PkgConfigView:
     """Return the data for NAME.pc.in, a pkg-config file of the generated C library."""
     return PkgConfigView(tuple(stamp(target)), target.prefix, __version__)
 
 
-def costs(target: Target) -> CostsView:
+def costs_view(target: Target) -> CostsView:
     """Return the data for costs.txt, a table of operation counts of the C functions.
 
     Each count is for one call. The functions are in the order of the header; the steps of the

@@ -294,7 +294,7 @@ class CompiledView:
 _OF_STEPS = ("Phi", "Gamma")
 
 
-def binding(target: Target) -> BindingView:
+def binding_view(target: Target) -> BindingView:
     """Return the data for the Python binding, C functions that Python calls.
 
     All functions have the same signature, and each evaluates many states in one call.
@@ -429,7 +429,7 @@ def _linearized(target: Target) -> bool:
     return bool({"linearization", "linearization_column"} & set(target.program.functions))
 
 
-def declarations(bound: BindingView) -> DeclarationsView:
+def declarations_view(bound: BindingView) -> DeclarationsView:
     """Return the data for the C declarations from which cffi makes the Python binding."""
     return DeclarationsView(
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
@@ -437,7 +437,7 @@ def declarations(bound: BindingView) -> DeclarationsView:
     )  # fmt: skip
 
 
-def face(target: Target, extension: str) -> FaceView:
+def face_view(target: Target, extension: str) -> FaceView:
     """Return the data for the __init__.py of the Python package.
 
     extension: name of the compiled extension module, which it imports.
@@ -505,7 +505,7 @@ def start_formulas(target: Target) -> dict[str, str]:
     }
 
 
-def stub(target: Target) -> StubView:
+def stub_view(target: Target) -> StubView:
     """Return the data for the type stubs of the Python package."""
     return StubView(tuple(stamp(target)), target.system.run.batch, _functions(target))
 

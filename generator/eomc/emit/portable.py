@@ -171,7 +171,7 @@ class PortableGaussView(NameFields, TableauFields):
 
 @dataclass(frozen=True)
 class PortableStagesView(NameFields):
-    """Data for c/portable/nodes.c: one fixed-point iteration over all stages of a step.
+    """Data for c/portable/stages.c: one fixed-point iteration over all stages of a step.
 
     Adaptive steps in portable C call the C function of this template.
 
@@ -189,7 +189,7 @@ class PortableStagesView(NameFields):
         C call that projects stage i onto the constraints; "" without constraints.
     """
 
-    TEMPLATE: ClassVar[str] = "c/portable/nodes.c"
+    TEMPLATE: ClassVar[str] = "c/portable/stages.c"
     title: str
     name: str
     stages: int
@@ -248,7 +248,7 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(functions)
     texts = (
-        show(sources.header(functions, slopes, handshake(functions))),
+        show(sources.header_view(functions, slopes, handshake(functions))),
         show(
             PortableSourceView(
                 **sources.source_fields(functions, handshake(functions), slopes, show),

@@ -121,7 +121,7 @@ def render(program: Program, extension: str) -> Sources:
     program, written = rename_for_c(program)
     run = program.system.run
     target = Target(program, REALS[run.real], written)
-    binding = package.binding(target)
+    binding = package.binding_view(target)
     name = program.system.name
     methods = optimised.steppers(target)
     return Sources(
@@ -129,17 +129,17 @@ def render(program: Program, extension: str) -> Sources:
         files={
             **portable.files(program, show),
             **{f"{FAST}/{file}": text for file, text in optimised.files(methods, show).items()},
-            "main.c": break_comments(show(embedding.main(target))),
-            "selftest.c": break_comments(show(selftest.view(target))),
-            "CMakeLists.txt": show(embedding.cmake(target)),
-            f"{name}.pc.in": show(embedding.pkg_config(target)),
-            "costs.txt": show(embedding.costs(target)),
-            "__init__.py": show(package.face(target, extension)),
+            "main.c": break_comments(show(embedding.main_view(target))),
+            "selftest.c": break_comments(show(selftest.selftest_view(target))),
+            "CMakeLists.txt": show(embedding.cmake_view(target)),
+            f"{name}.pc.in": show(embedding.pkg_config_view(target)),
+            "costs.txt": show(embedding.costs_view(target)),
+            "__init__.py": show(package.face_view(target, extension)),
             **resources.runtime(run.batch),
         },
         binding=show(binding),
-        cdef=show(package.declarations(binding)),
-        stub=show(package.stub(target)),
+        cdef=show(package.declarations_view(binding)),
+        stub=show(package.stub_view(target)),
         operations=sum(map(weight, program.functions.values())),
     )
 

@@ -29,34 +29,35 @@ from eomc.program.outline import weight
 from eomc.program.program import TIME
 from eomc.program.two_point import separate_angles
 
-# by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
-LIMIT = {True: 2.0**20, False: 2.0**13}
-# error limit besides the effect of perturbing the arguments by one ulp, relative to the largest
-# entry: some thousand rounding errors, for libraries and orders of summation
-ROUNDING = {True: 1e-12, False: 1e-4}
-UNITS = 1000  # times the effect of a perturbation by one ulp, as in `eomc check`
-# largest error limit of a case
-LOOSEST = {True: 1e-6, False: 1e-2}
-# error limits at large angles, where sines are less accurate if a multiply-add rounds twice
-LARGE = {True: 1e-12, False: 1e-5}
-USUAL = {True: 1e-9, False: 1e-3}  # of accelerations where angles are large
-# what projections, differences and sums over steps may leave
-ITERATED = {True: 1e-11, False: 1e-3}
-# what the iteration of implicit methods may leave, and sweeps of a fixed number
-IMPLICIT = {True: 1e-9, False: 1e-3}
-SWEPT = {True: 1e-6, False: 1e-3}
-FAR = 3  # states with large angles
-GRID = 16  # large angles are multiples of 1/GRID: so are their sums and multiples, exactly
-STEPS = 3  # of a run
-GROWTH = 30  # of a state in them: beyond it steps are too long, and rounding grows as well
-SWEEPS = 60  # over the stages of an implicit method
-LONGEST = 4000  # operations of accelerations: of more there are few cases, explicit steps only
-START = 0.4  # s, the time of the first state: signals are not at their start
-# central differences of order 8: at which multiples of a width, and their weights
+# Each dictionary has a value for double precision (True) and one for single precision (False).
+ANGLE_LIMIT = {True: 2.0**20, False: 2.0**13}  # rad, of sincos.h and of sincosf.h
+# Error limits are relative to the largest expected number. This one is some thousand rounding
+# errors; it covers differences between C libraries and orders of summation.
+ROUNDING_TOLERANCE = {True: 1e-12, False: 1e-4}
+PERTURBATION_FACTOR = (
+    1000  # error limit over the effect of one ulp in the state, as in `eomc check`
+)
+MAX_TOLERANCE = {True: 1e-6, False: 1e-2}  # cases with a larger error limit are left out
+# At large angles sines are less accurate if a multiply-add rounds twice.
+LARGE_ANGLE_TOLERANCE = {True: 1e-12, False: 1e-5}
+ACCELERATION_TOLERANCE = {True: 1e-9, False: 1e-3}  # of accelerations at large angles
+ITERATION_TOLERANCE = {True: 1e-11, False: 1e-3}  # of projections, differences and sums over steps
+IMPLICIT_TOLERANCE = {True: 1e-9, False: 1e-3}  # of the iteration of implicit methods
+SWEEP_TOLERANCE = {True: 1e-6, False: 1e-3}  # of a fixed number of fixed-point iterations
+MAX_LARGE_STATES = 3  # tested states with large angles
+# Large angles are multiples of 1/ANGLES_PER_RADIAN, so that sums and multiples of them are exact.
+ANGLES_PER_RADIAN = 16
+RUN_STEPS = 3  # steps of a tested run
+MAX_GROWTH = 30  # of a state in a run: if it grows more, the steps are too long to be tested
+MAX_SWEEPS = 60  # iterations over the stages of an implicit method
+MAX_OPERATIONS = 4000  # of accelerations; above it, few cases and explicit steps only
+START_TIME = 0.4  # s, the time of the first state; signals often are special at t = 0
+# Central differences of order 8: multiples of the width, and their weights
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+
 Vector = list[float]
 Values = dict[str, float]
-Happening = tuple[float, int]  # when, and which event
+TriggeredEvent = tuple[float, int]  # when, and which event
 
 
 class NoCaseError(Exception):
@@ -201,11 +202,11 @@ class TestPoint:
     span: float = 0.0
 
 
-def view(target: Target) -> SelfTestView:
+def selftest_view(target: Target) -> SelfTestView:
     """Return the data for selftest.c: test calls, their expected results and error limits."""
     cases = _Cases(target)
     double = target.real is DOUBLE
-    tested = tuple(t for t in cases.tested() if t.cases)
+    tested = tuple(t for t in cases.test_functions() if t.cases)
     other = cases.other_parameters if cases.uses_other else ()
     return SelfTestView(
         title=FreeText(target.system.title),
@@ -292,9 +293,11 @@ class _Cases:
         """
         if name != "linearization":
             return values
-        return self.split([values[k : k + self.width] for k in range(0, len(values), self.width)])
+        return self.linearization_order(
+            [values[k : k + self.width] for k in range(0, len(values), self.width)]
+        )
 
-    def split(self, rows: Sequence[Sequence[float]]) -> Vector:
+    def linearization_order(self, rows: Sequence[Sequence[float]]) -> Vector:
         """Return the entries of A_q, then of A_qd, then of B, each by rows.
 
         rows: the rows of the matrix [A_q, A_qd, B].
@@ -316,7 +319,11 @@ class _Cases:
             self.evaluate(f"{name}_column", {**values, **zero, f"{n}{ALONG}": 1.0}) for n in own
         ]
         rows = [list(row) for row in zip(*columns, strict=True)]
-        return self.split(rows) if name == "linearization" else [x for row in rows for x in row]
+        return (
+            self.linearization_order(rows)
+            if name == "linearization"
+            else [x for row in rows for x in row]
+        )
 
     def complete(self, point: TestPoint) -> Values:
         """Return the values of a point by name, including the inputs.
@@ -347,15 +354,15 @@ class _Cases:
 
         `point` supplies the inputs and the parameters.
         """
-        return self.evaluate("acceleration", self.complete(self.shifted(point, x, t)))
+        return self.evaluate("acceleration", self.complete(self.at_state(point, x, t)))
 
-    def shifted(self, point: TestPoint, x: Vector, t: float) -> TestPoint:
+    def at_state(self, point: TestPoint, x: Vector, t: float) -> TestPoint:
         """Return a copy of the point with the state x = [q; qd] and the time t (s)."""
         names = (s.name for s in (*self.system.q, *self.system.qd))
         values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
         return TestPoint(values, point.signals, point.other, point.span)
 
-    def states(self, point: TestPoint) -> Vector:
+    def state_of(self, point: TestPoint) -> Vector:
         """Return the state [q; qd] in a point's values as one list."""
         return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
 
@@ -383,7 +390,7 @@ class _Cases:
         else:
             first, last = self.acceleration(point, x, t), math.inf
             a[:] = [first] * m.stages
-            for _ in range(SWEEPS):
+            for _ in range(MAX_SWEEPS):
                 new = [stage(i) for i in range(m.stages)]
                 change = max(
                     abs(p - q)
@@ -403,9 +410,9 @@ class _Cases:
             of_qd = sum(w * s[k] for w, s in zip(b, a, strict=True))
             end[k] += h * (x[n + k] + h * of_q)
             end[n + k] += h * of_qd
-        return self.projected(point, end, t + h)
+        return self.project(point, end, t + h)
 
-    def projected(self, point: TestPoint, x: Vector, t: float) -> Vector:
+    def project(self, point: TestPoint, x: Vector, t: float) -> Vector:
         """Return the state x = [q; qd], projected onto the constraints at time t (s).
 
         The projection iterates. `point` supplies the parameters. Without constraints, x is returned
@@ -414,13 +421,15 @@ class _Cases:
         if not self.system.constraints:
             return x
         for _ in range(12):
-            d = self.evaluate("projection", self.complete(self.shifted(point, x, t)))
+            d = self.evaluate("projection", self.complete(self.at_state(point, x, t)))
             x = [a + b for a, b in zip(x, d, strict=False)]
             if max(map(abs, d[: self.nq])) <= 1e-12 * max(1e-3, *map(abs, x)):
                 return x
         raise NoCaseError
 
-    def flow(self, point: TestPoint, x: Vector, t: float, span: float, steps: int = 4) -> Vector:
+    def integrate(
+        self, point: TestPoint, x: Vector, t: float, span: float, steps: int = 4
+    ) -> Vector:
         """Return the state [q; qd] at time t + span (s), by integration from the state x at time t.
 
         The integration takes `steps` equal steps of order 8; `span` may be negative. `point`
@@ -436,32 +445,34 @@ class _Cases:
     def other_parameters(self) -> tuple[Any, ...]:
         """The parameters with a second set of values, each 1 to 7 percent larger in magnitude."""
         return tuple(
-            replace(p, value=self.short(p.value * (1 + 0.01 * (k % 7 + 1))))
+            replace(p, value=self.round_short(p.value * (1 + 0.01 * (k % 7 + 1))))
             for k, p in enumerate(self.system.parameters)
         )
 
-    def short(self, x: float) -> float:
+    def round_short(self, x: float) -> float:
         """Return a number rounded to six significant digits and to the C type of numbers."""
         x = float(f"{x:.6g}")
         return x if self.double else _single(x)
 
     @cached_property
-    def near(self) -> tuple[TestPoint, ...]:
+    def near_points(self) -> tuple[TestPoint, ...]:
         """About three points near the initial state, at which functions are tested.
 
         In the last ones, the inputs are specified; otherwise the scene's signals supply them. One
         point has the second set of parameters. Expensive systems have two points only.
         """
-        points = [self.point(k, START + 0.37 * k) for k in range(1, 4)]
+        points = [self.point(k, START_TIME + 0.37 * k) for k in range(1, 4)]
         if self.other_parameters:
             points[1] = replace(
                 points[1], other=True,
                 values={**points[1].values, **{p.name: p.value for p in self.other_parameters}},
             )  # fmt: skip
         if self.system.inputs:
-            points[2] = self.driven(points[2], 0.0)
+            points[2] = self.with_inputs(points[2], 0.0)
         if "applied" in self.program:
-            points += [self.driven(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))]
+            points += [
+                self.with_inputs(self.point(k, 0.9), part) for k, part in ((4, 1.0), (5, -1.0))
+            ]
         return tuple(points) if self.is_short else (points[1], points[2])
 
     def point(self, k: int, t: float) -> TestPoint:
@@ -474,11 +485,16 @@ class _Cases:
         more = [x.name for x in (*self.system.qdd, *self.target.wrenches)]
         more += self.target.multipliers
         values |= {name: 0.4 + 0.3 * math.sin(1.7 * k + 2.1 * i) for i, name in enumerate(more)}
-        return TestPoint({name: self.short(x) if name in self.moving else x if self.double
-                      else _single(x) for name, x in values.items()})  # fmt: skip
+        exact = (lambda x: x) if self.double else _single
+        return TestPoint(
+            {
+                name: self.round_short(x) if name in self.varied_names else exact(x)
+                for name, x in values.items()
+            }
+        )
 
     @cached_property
-    def moving(self) -> frozenset[str]:
+    def varied_names(self) -> frozenset[str]:
         """Names of the values of a point other than parameters."""
         return (
             frozenset(nearby(self.system, 0)) - {p.name for p in self.system.parameters}
@@ -486,7 +502,7 @@ class _Cases:
             | {*self.target.multipliers}
         )
 
-    def driven(self, point: TestPoint, beyond: float) -> TestPoint:
+    def with_inputs(self, point: TestPoint, beyond: float) -> TestPoint:
         """Return a copy of the point in which the inputs are specified.
 
         In other points the scene's signals supply them. beyond: 0 for inputs within their
@@ -507,10 +523,10 @@ class _Cases:
                     low, high = max(least, most - 2), min(most, least + 2)
                     low, high = (low, high) if low <= high else (least, most)
                     u[i] = low + 0.7 * (high - low)
-        values = {n: self.short(x) for n, x in zip(names, u, strict=True)}
+        values = {n: self.round_short(x) for n, x in zip(names, u, strict=True)}
         return replace(point, values={**point.values, **values}, signals=False)
 
-    def index(self, point: TestPoint) -> int:
+    def index_of(self, point: TestPoint) -> int:
         """Return the index of a point in the list of all test points.
 
         A point that is not yet in the list is appended to it.
@@ -563,20 +579,22 @@ class _Cases:
         """
         try:
             expected = compute(point)
-            limit = allowed if sharp else max(allowed, ROUNDING[self.double])
+            limit = allowed if sharp else max(allowed, ROUNDING_TOLERANCE[self.double])
             scale = max(map(abs, expected), default=0.0)
             for turn in () if sharp else range(2 if self.is_short else 1):
-                limit = max(limit, UNITS * _off(compute(self.nudged(point, turn)), expected))
+                limit = max(
+                    limit, PERTURBATION_FACTOR * _off(compute(self.perturb(point, turn)), expected)
+                )
         except (NoCaseError, ArithmeticError, ValueError, IndexError):
             return None
-        if not scale < 1e12 or limit > max(LOOSEST[self.double], allowed):
+        if not scale < 1e12 or limit > max(MAX_TOLERANCE[self.double], allowed):
             return None
         literal = self.target.literal
         return TestCase(
-            self.index(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}")
+            self.index_of(point), tuple(literal(x) for x in expected), float(f"{limit:.2g}")
         )
 
-    def nudged(self, point: TestPoint, turn: int) -> TestPoint:
+    def perturb(self, point: TestPoint, turn: int) -> TestPoint:
         """Return a copy of the point with each coordinate and velocity changed by about one ulp.
 
         An ulp is the distance to the next floating-point number. turn: 0 or 1, for two different
@@ -590,29 +608,29 @@ class _Cases:
             moved[name] = x + sign * ulp * max(abs(x), 0.1)
         return replace(point, values={**point.values, **moved})
 
-    def tested(self) -> Iterator[TestFunction]:
+    def test_functions(self) -> Iterator[TestFunction]:
         """Yield a test of each function of the generated C header, in the order of the header."""
         for function in self.public.evaluations():
             name = function.name.removeprefix(f"{self.target.prefix}_")
-            cases = [self.case(p, partial(self.value, name)) for p in self.near]
+            cases = [self.case(p, partial(self.value, name)) for p in self.near_points]
             if name in ("D", "bias"):
-                cases += self.far(name)
+                cases += self.large_angle_cases(name)
             out = KINDS[name].out
             kind = "status" if refuses(self.target, name) else "values" if out else "number"
             call = self.call(function, **({out: "out"} if out else {}))
-            yield self.written(name, kind, call, cases)
-        cases = [self.case(p, partial(self.value, "acceleration")) for p in self.near]
-        cases += self.far("acceleration")
+            yield self.test_function(name, kind, call, cases)
+        cases = [self.case(p, partial(self.value, "acceleration")) for p in self.near_points]
+        cases += self.large_angle_cases("acceleration")
         call = self.call(self.public.acceleration, qdd="out")
-        yield self.written("acceleration", "status", call, cases)
+        yield self.test_function("acceleration", "status", call, cases)
         if {"linearization", "linearization_column"} & {*self.program.functions}:
             f = self.public.linearization
             at = {"A_q": "out", "A_qd": "out + NQ*NQ", "B": "out + 2*NQ*NQ"}
-            cases = [self.case(p, partial(self.value, "linearization")) for p in self.near]
-            yield self.written("linearization", "status", self.call(f, **at), cases)
-        yield from self.moves()
+            cases = [self.case(p, partial(self.value, "linearization")) for p in self.near_points]
+            yield self.test_function("linearization", "status", self.call(f, **at), cases)
+        yield from self.test_motions()
 
-    def written(
+    def test_function(
         self, name: str, kind: str, call: str, cases: Sequence[TestCase | None], type: str = ""
     ) -> TestFunction:
         """Return the data of a test of the C function `name`; cases that are None are left out.
@@ -632,11 +650,13 @@ class _Cases:
         at |= {"t0": member("s", "t"), "h": member("s", "span")}
         return f.call(**at | passed)
 
-    def far(self, name: str) -> list[TestCase | None]:
+    def large_angle_cases(self, name: str) -> list[TestCase | None]:
         """Return up to three test cases of function `name` with large angles."""
         cases: list[TestCase | None] = []
-        for values in islice(self.large, FAR):
-            allowed = (USUAL if name == "acceleration" else LARGE)[self.double]
+        for values in islice(self.large_states, MAX_LARGE_STATES):
+            allowed = (ACCELERATION_TOLERANCE if name == "acceleration" else LARGE_ANGLE_TOLERANCE)[
+                self.double
+            ]
             point = TestPoint({n: x if self.double else _single(x) for n, x in values.items()})
             point = replace(point, values={**self.point(1, 0.0).values, **point.values})
             case = self.case(point, partial(self.value, name), allowed, sharp=True)
@@ -645,7 +665,7 @@ class _Cases:
         return cases
 
     @cached_property
-    def large(self) -> list[dict[str, float]]:
+    def large_states(self) -> list[dict[str, float]]:
         """States with large angles, each as values by name, that are suitable for tests.
 
         At these states, bias and accelerations computed in doubles agree with the exact results.
@@ -660,8 +680,8 @@ class _Cases:
         known = self.complete(
             TestPoint({n: v if self.double else _single(v) for n, v in x.items()})
         )
-        room, usual = (64 if self.double else 4 * 2**29), USUAL[self.double]
-        for name, limit in (("bias", LARGE[self.double]), ("acceleration", usual)):
+        room, usual = (64 if self.double else 4 * 2**29), ACCELERATION_TOLERANCE[self.double]
+        for name, limit in (("bias", LARGE_ANGLE_TOLERANCE[self.double]), ("acceleration", usual)):
             try:
                 results = self.evaluate(name, known)
                 exact, _ = evaluator(self.program[name], exact=True)(known)
@@ -673,60 +693,65 @@ class _Cases:
 
     # steps, runs, events
 
-    def moves(self) -> Iterator[TestFunction]:
+    def test_motions(self) -> Iterator[TestFunction]:
         """Yield the tests of steps, derivatives, runs, projections, adaptive runs and events."""
         run = self.system.run
         if self.system.constraints:
             f = self.public.project
             call = self.call(f, q="out", qd="out + NQ", fixed="NULL")
-            cases = [self.case(p, self.projection, ITERATED[self.double]) for p in self.starts]
-            yield self.written("project", "moved", call, cases)
+            cases = [
+                self.case(p, self.projection, ITERATION_TOLERANCE[self.double])
+                for p in self.start_points
+            ]
+            yield self.test_function("project", "moved", call, cases)
         short = self.is_short
         for name in run.methods:
             m = METHODS[name]
             if m.implicit and not short:
                 continue
-            starts = self.starts if short else self.starts[:1]
-            points = [p for x in starts if (p := self.spanned(m, x))]
-            allowed = ITERATED[self.double] if self.system.constraints else 0.0
-            allowed = IMPLICIT[self.double] if m.implicit else allowed
+            starts = self.start_points if short else self.start_points[:1]
+            points = [p for x in starts if (p := self.with_span(m, x))]
+            allowed = ITERATION_TOLERANCE[self.double] if self.system.constraints else 0.0
+            allowed = IMPLICIT_TOLERANCE[self.double] if m.implicit else allowed
             call = self.call(self.public.step(name), q="out", qd="out + NQ")
-            cases = [self.case(p, partial(self.stepped, m, 1), allowed) for p in points]
-            yield self.written(f"{name}_step", "moved", call, cases)
-            allowed = SWEPT[self.double] if m.sweeps else allowed
-            # and of the scene's own steps, which the fast form may take in other ways
-            own = [replace(p, span=self.short(self.system.run.h)) for p in points[:1] if short]
+            cases = [self.case(p, partial(self.after_steps, m, 1), allowed) for p in points]
+            yield self.test_function(f"{name}_step", "moved", call, cases)
+            allowed = SWEEP_TOLERANCE[self.double] if m.sweeps else allowed
+            # steps of the scene's own size, for which optimised C may use other code
+            own = [
+                replace(p, span=self.round_short(self.system.run.h)) for p in points[:1] if short
+            ]
             more = [*points, *own]
             cases = [self.case(p, partial(self.rows, m), allowed) for p in more]
-            yield self.written(f"{name}_run", "run", self.run_call(name), cases)
+            yield self.test_function(f"{name}_run", "run", self.run_call(name), cases)
             if run.batch:
                 cases = [self.case(p, partial(self.twice, m), allowed) for p in more]
-                yield self.written(f"{name}_batch", "batch", self.batch_call(name), cases)
+                yield self.test_function(f"{name}_batch", "batch", self.batch_call(name), cases)
             if run.discretize:
                 cases = [self.derivative(m, p) for p in points]
                 call = self.call(self.public.derivative(name), Phi="Phi", Gamma="Gamma")
-                yield self.written(f"{name}_derivative", "derivative", call, cases)
+                yield self.test_function(f"{name}_derivative", "derivative", call, cases)
         if run.tolerance is not None and short:
             yield from self.adaptive_runs()
 
     @cached_property
     def is_short(self) -> bool:
         """Whether the accelerations are cheap enough for many evaluations in Python."""
-        return weight(self.program["acceleration"]) <= LONGEST
+        return weight(self.program["acceleration"]) <= MAX_OPERATIONS
 
     @cached_property
-    def starts(self) -> tuple[TestPoint, ...]:
+    def start_points(self) -> tuple[TestPoint, ...]:
         """Points near the initial state at which tested steps begin.
 
         With constraints, the only point is the initial state itself, which satisfies them.
         """
         if not self.system.constraints:
-            return tuple(replace(p, span=1.0) for p in self.near if not p.other)
-        point = self.point(0, START)
-        point = replace(point, values={**point.values, **nearby(self.system, 0), TIME: START})
+            return tuple(replace(p, span=1.0) for p in self.near_points if not p.other)
+        point = self.point(0, START_TIME)
+        point = replace(point, values={**point.values, **nearby(self.system, 0), TIME: START_TIME})
         return (replace(point, span=1.0),)
 
-    def spanned(self, m: Method, point: TestPoint) -> TestPoint | None:
+    def with_span(self, m: Method, point: TestPoint) -> TestPoint | None:
         """Return a copy of the point with a step size for the integration method m as its `span`.
 
         It is the largest of some step sizes with which a few steps can be tested accurately and the
@@ -735,19 +760,21 @@ class _Cases:
         h = self.system.run.h
         most = 1 if m.sweeps else 2 if m.implicit else 4
         for factor in (4.0**k for k in range(most, -5, -1)):
-            tried = replace(point, span=self.short(factor * h))
-            if self.case(tried, partial(self.stepped, m, STEPS), ITERATED[self.double]):
-                end, start = self.stepped(m, STEPS, tried), self.states(tried)
-                if max(map(abs, end)) <= GROWTH * max(1.0, *map(abs, start)):
+            tried = replace(point, span=self.round_short(factor * h))
+            if self.case(
+                tried, partial(self.after_steps, m, RUN_STEPS), ITERATION_TOLERANCE[self.double]
+            ):
+                end, start = self.after_steps(m, RUN_STEPS, tried), self.state_of(tried)
+                if max(map(abs, end)) <= MAX_GROWTH * max(1.0, *map(abs, start)):
                     return tried
         return None
 
-    def stepped(self, m: Method, steps: int, point: TestPoint) -> Vector:
+    def after_steps(self, m: Method, steps: int, point: TestPoint) -> Vector:
         """Return, in one list, the state [q; qd] after each of several steps of method m.
 
         The first step begins at `point`. There are `steps` steps of size `point.span` (s).
         """
-        x, found, t, h = self.states(point), Vector(), point.values[TIME], point.span
+        x, found, t, h = self.state_of(point), Vector(), point.values[TIME], point.span
         for n in range(steps):
             x = self.step(m, point, x, t + n * h, h)
             found += x
@@ -758,7 +785,7 @@ class _Cases:
 
         These are the last state [q; qd], then q after each step, then qd after each step.
         """
-        n, found = self.nq, self.stepped(m, STEPS, point)
+        n, found = self.nq, self.after_steps(m, RUN_STEPS, point)
         states = [found[k : k + 2 * n] for k in range(0, len(found), 2 * n)]
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
@@ -769,18 +796,18 @@ class _Cases:
         Both instances start at `point`. The order is that of C: q of both instances, then qd of
         both.
         """
-        end = self.stepped(m, STEPS, point)[-2 * self.nq :]
+        end = self.after_steps(m, RUN_STEPS, point)[-2 * self.nq :]
         return [*end[: self.nq] * 2, *end[self.nq :] * 2]
 
     def projection(self, point: TestPoint) -> Vector:
         """Return the state [q; qd] of a point, projected onto the constraints."""
-        return self.projected(point, self.states(point), point.values[TIME])
+        return self.project(point, self.state_of(point), point.values[TIME])
 
     def run_call(self, name: str) -> str:
         """Return the C call of a run of three steps of method `name`; it stores each state."""
         return self.call(
-            self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(STEPS),
-            u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + STEPS}*NQ",
+            self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(RUN_STEPS),
+            u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + RUN_STEPS}*NQ",
             memory="NULL", status="&status",
         )  # fmt: skip
 
@@ -791,7 +818,7 @@ class _Cases:
         """
         return self.call(
             self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
-            steps=str(STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
+            steps=str(RUN_STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
             qd_rows="NULL", row_count="0", p_instance="0", completed="completed", status="status",
         )  # fmt: skip
 
@@ -822,7 +849,7 @@ class _Cases:
                 for sign in (-1, 1):
                     moved = {n: x.values[n] + sign * k * width * (1 + i % 3)
                              for i, n in enumerate(names)}  # fmt: skip
-                    end = self.stepped(m, 1, replace(x, values={**x.values, **moved}))
+                    end = self.after_steps(m, 1, replace(x, values={**x.values, **moved}))
                     part = sign * w / width
                     derivative = [d + part * e for d, e in zip(derivative, end, strict=True)]
             return derivative
@@ -831,8 +858,8 @@ class _Cases:
             wide, close = difference(point, 0.01), difference(point, 0.0025)
         except NoCaseError:
             return None
-        allowed = 10 * _off(wide, close) + ITERATED[self.double]
-        if not allowed < LOOSEST[self.double]:
+        allowed = 10 * _off(wide, close) + ITERATION_TOLERANCE[self.double]
+        if not allowed < MAX_TOLERANCE[self.double]:
             return None
         return self.case(point, lambda _: close, allowed)
 
@@ -845,18 +872,18 @@ class _Cases:
         each event in both directions. With constraints or friction modes, there are only the runs
         without events.
         """
-        cases = [self.quiet(p) for p in self.starts]
+        cases = [self.run_without_event(p) for p in self.start_points]
         if not (self.system.constraints or self.system.modes):
             for k in range(len(self.system.own_events)):
                 cases += self.crossings(k)
         memory = f"{self.public.adaptive(adaptive.METHOD.name).name}_memory"
-        yield self.written("adaptive", "adaptive", self.adaptive_call(), cases, memory)
+        yield self.test_function("adaptive", "adaptive", self.adaptive_call(), cases, memory)
 
     def spans(self) -> tuple[float, ...]:
         """Return the lengths (s) of adaptive runs to try, from the longest to the shortest."""
-        return tuple(self.short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
+        return tuple(self.round_short(f * self.system.run.h) for f in (128.0, 32.0, 8.0, 2.0, 0.5))
 
-    def quiet(self, point: TestPoint) -> TestCase | None:
+    def run_without_event(self, point: TestPoint) -> TestCase | None:
         """Return the case of an adaptive run that starts at a point and in which no event occurs.
 
         The longest suitable run is used. Returns None if no run is suitable.
@@ -864,11 +891,11 @@ class _Cases:
         for span in self.spans():
             tried = replace(point, span=span)
             try:
-                x, t = self.states(tried), tried.values[TIME]
+                x, t = self.state_of(tried), tried.values[TIME]
                 self.refuse_events(tried, x, t, span)
             except NoCaseError:
                 continue
-            case = self.case(tried, partial(self.ended, None), self.of_runs)
+            case = self.case(tried, partial(self.adaptive_results, None), self.of_runs)
             if case:
                 return case
         return None
@@ -878,34 +905,34 @@ class _Cases:
         """The error limit of test cases for adaptive runs, relative to the largest result."""
         return 1e-8 if self.double else 2e-3
 
-    def ended(self, event: Happening | None, point: TestPoint) -> Vector:
+    def adaptive_results(self, event: TriggeredEvent | None, point: TestPoint) -> Vector:
         """Return the results of an adaptive run from a point, as C stores them.
 
         These are the final [q; qd] and time. If the scene has events, the number of events follows,
         and then the number (from 1), time and state of the first event. event: time and index of
         the event in this run; None for none.
         """
-        x, t, span = self.states(point), point.values[TIME], point.span
+        x, t, span = self.state_of(point), point.values[TIME], point.span
         none = [0.0] * (3 + 2 * self.nq) if self.system.events else []
         if event is None:
-            return [*self.sure(point, x, t, span), t + span, *none]
+            return [*self.integrate_accurately(point, x, t, span), t + span, *none]
         at, first = event
-        x = self.sure(point, x, t, at - t)
+        x = self.integrate_accurately(point, x, t, at - t)
         numbers = [1.0, first + 1.0, at, *x]
         e = self.system.own_events[first]
         if e.action == "stop":
             return [*x, at, *numbers]
         if e.action == "jump":
-            after = self.value("jumps", self.shifted(point, x, at))
+            after = self.value("jumps", self.at_state(point, x, at))
             x = after[2 * self.nq * first : 2 * self.nq * (first + 1)]
-        return [*self.sure(point, x, at, t + span - at), t + span, *numbers]
+        return [*self.integrate_accurately(point, x, at, t + span - at), t + span, *numbers]
 
-    def sure(self, point: TestPoint, x: Vector, t: float, span: float) -> Vector:
+    def integrate_accurately(self, point: TestPoint, x: Vector, t: float, span: float) -> Vector:
         """Return the state at time t + span (s), by integration from the state x at time t.
 
         Raises NoCaseError if integration with shorter steps gives a different result.
         """
-        found, finer = (self.flow(point, x, t, span, n) for n in (4, 6))
+        found, finer = (self.integrate(point, x, t, span, n) for n in (4, 6))
         if _off(found, finer) > self.of_runs / 10:
             raise NoCaseError
         return finer
@@ -915,7 +942,7 @@ class _Cases:
 
         `point` supplies the inputs and the parameters.
         """
-        return self.value("events", self.shifted(point, x, t))
+        return self.value("events", self.at_state(point, x, t))
 
     def refuse_events(self, point: TestPoint, x: Vector, t: float, span: float) -> None:
         """Raise NoCaseError if an event function changes sign, or nearly does, in a run.
@@ -925,7 +952,7 @@ class _Cases:
         """
         first = self.events(point, x, t) if self.system.events else []
         for k in range(8) if first else ():
-            x = self.flow(point, x, t + span * k / 8, span / 8, 1)
+            x = self.integrate(point, x, t + span * k / 8, span / 8, 1)
             events = self.events(point, x, t + span * (k + 1) / 8)
             for a, b in zip(first, events, strict=True):
                 if a * b <= 0 or abs(b) < 0.02 * abs(a):
@@ -963,11 +990,11 @@ class _Cases:
                 point = replace(point, values={**point.values, **moved})
                 for name in (TIME, *names):
                     try:
-                        yield self.solved(k, point, name)
+                        yield self.solve_event(k, point, name)
                     except NoCaseError:
                         continue
 
-    def solved(self, k: int, point: TestPoint, name: str) -> TestPoint:
+    def solve_event(self, k: int, point: TestPoint, name: str) -> TestPoint:
         """Return a copy of the point at which the event function k is zero.
 
         The value of `name` (the time, a coordinate or a velocity) is changed by the secant method.
@@ -988,7 +1015,7 @@ class _Cases:
                 break
         else:
             raise NoCaseError
-        if abs(b) > 20 or (name == TIME and b <= START):
+        if abs(b) > 20 or (name == TIME and b <= START_TIME):
             raise NoCaseError
         return replace(point, values={**point.values, name: b})
 
@@ -998,12 +1025,12 @@ class _Cases:
         on: a point at which the function is zero. The run starts half a `span` (s) before this
         point. Raises NoCaseError if other events occur in the run.
         """
-        x, t, half = self.states(on), on.values[TIME], span / 2
+        x, t, half = self.state_of(on), on.values[TIME], span / 2
         others = [i for i in range(len(self.system.events)) if i != k]
-        begin = self.flow(on, x, t, -half)
+        begin = self.integrate(on, x, t, -half)
         sides = []
         for part in (-1.0, -0.5, 0.5, 1.0):
-            values = self.events(on, self.flow(on, x, t, part * half), t + part * half)
+            values = self.events(on, self.integrate(on, x, t, part * half), t + part * half)
             sides.append([v > 0 for v in values])
         if any(len({s[i] for s in sides}) > 1 for i in others):
             raise NoCaseError
@@ -1012,14 +1039,16 @@ class _Cases:
             raise NoCaseError
         e = self.system.own_events[k]
         is_detected = e.direction in ("both", "rising" if rising else "falling")
-        start = self.shifted(on, [self.short(v) if not self.double else v for v in begin], t - half)
+        start = self.at_state(
+            on, [self.round_short(v) if not self.double else v for v in begin], t - half
+        )
         start = replace(start, span=span)
         if is_detected and e.action == "jump":
             after = self.value("jumps", on)[2 * self.nq * k : 2 * self.nq * (k + 1)]
-            near = self.flow(on, after, t, half / 8, 1)
+            near = self.integrate(on, after, t, half / 8, 1)
             self.refuse_events(on, near, t + half / 8, half * 7 / 8)
         event = (t, k) if is_detected else None
-        return rising, self.case(start, partial(self.ended, event), self.of_runs)
+        return rising, self.case(start, partial(self.adaptive_results, event), self.of_runs)
 
 
 @cache
@@ -1039,12 +1068,16 @@ def _off(values: list[float], exact: list[float]) -> float:
 
 def _large(target: Target) -> Iterator[dict[str, float]]:
     """States in which every angle of coordinates alone is large, up to the limit of sincos.h."""
-    program, limit = target.program, LIMIT[target.real is DOUBLE]
+    program, limit = target.program, ANGLE_LIMIT[target.real is DOUBLE]
     coordinates = {c.name: i for i, c in enumerate(program.system.coordinates)}
     groups = chain.from_iterable(
         separate_angles(program[name], coordinates)[0] for name in ("bias", "acceleration")
     )
-    angles = [a for a in groups if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)]
+    angles = [
+        a
+        for a in groups
+        if a.offset == 0 and all((ANGLES_PER_RADIAN * c).is_integer for c, _ in a.terms)
+    ]
     if not angles:
         return
     most = limit / max(float(sum(abs(c) for c, _ in a.terms)) for a in angles)
@@ -1054,7 +1087,7 @@ def _large(target: Target) -> Iterator[dict[str, float]]:
         for name in turning:
             inward = -1.3 if part > 0 else 1.3
             some = (part * most + inward * (coordinates[name] + k + j) for j in range(12))
-            on_grid = (round(GRID * angle) / GRID for angle in some)
+            on_grid = (round(ANGLES_PER_RADIAN * angle) / ANGLES_PER_RADIAN for angle in some)
             x[name] = max(on_grid, key=lambda angle: _rounding_error(angle, target.real is DOUBLE))
         # faster than nearby, so that gravity does not cover what the angles bring
         yield x | {v.name: 8 * x[v.name] for v in program.system.qd}

@@ -185,11 +185,11 @@ class SourceFields:
     steppers: tuple[str, ...]
 
 
-def header(
+def header_view(
     functions: SceneFunctions,
     slopes: LinearizationView | None,
     stamp: str,
-    rooms: Sequence[int] = (),
+    workspace_sizes: Sequence[int] = (),
     fast: bool = False,
 ) -> HeaderView:
     """Return the data for the template of the C header, of portable or of optimised C.
@@ -202,7 +202,7 @@ def header(
         Template data of the derivatives of the accelerations; None if the scene does not need them.
     stamp
         Number that the source compares with its own, to detect a header of another build.
-    rooms
+    workspace_sizes
         Length of the workspace, as a count of numbers, for each integration method in optimised C,
         and then for adaptive steps. Empty for portable C, whose runs with fixed steps need none.
     fast
@@ -210,7 +210,7 @@ def header(
     """
     target, s = functions.target, functions.target.system
     methods = [METHODS[name] for name in s.run.methods]
-    *fixed_rooms, adaptive_room = rooms or [
+    *fixed_sizes, adaptive_size = workspace_sizes or [
         *(0 for _ in methods),
         adaptive.workspace_size(s, len(s.coordinates)),
     ]
@@ -222,13 +222,13 @@ def header(
         **functions.names,
         handshake=stamp,
         fast=fast,
-        coordinates=indexed(functions, s.coordinates),
-        inputs=indexed(functions, s.inputs),
-        outputs=indexed(functions, s.outputs, "OUT_"),
-        constraints=indexed(functions, s.constraints, "CONSTRAINT_"),
-        events=indexed(functions, s.events, "EVENT_"),
+        coordinates=enumerators(functions, s.coordinates),
+        inputs=enumerators(functions, s.inputs),
+        outputs=enumerators(functions, s.outputs, "OUT_"),
+        constraints=enumerators(functions, s.constraints, "CONSTRAINT_"),
+        events=enumerators(functions, s.events, "EVENT_"),
         frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.output_frames),
-        parameters=parameters(functions),
+        parameters=parameter_members(functions),
         implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
         timed=target.driven,
         functions=tuple(x.function for x in (*functions.evaluations, functions.acceleration)),
@@ -236,15 +236,15 @@ def header(
         project=functions.public.project if s.constraints else None,
         methods=tuple(
             MethodDeclarations(
-                m.name, method_title(m), m.implicit, room, functions.public.step(m.name),
+                m.name, method_title(m), m.implicit, size, functions.public.step(m.name),
                 functions.public.run(m.name),
                 functions.public.batch(m.name) if s.run.batch else None,
                 functions.public.derivative(m.name) if s.run.discretize else None,
             )
-            for m, room in zip(methods, fixed_rooms, strict=True)
+            for m, size in zip(methods, fixed_sizes, strict=True)
         ),
         adaptive=AdaptiveDeclarations(
-            adaptive.TITLE, adaptive.workspace_type(functions), adaptive_room,
+            adaptive.TITLE, adaptive.workspace_type(functions), adaptive_size,
             functions.public.adaptive(adaptive.METHOD.name),
             functions.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.steps_in_parallel(target),
@@ -260,7 +260,7 @@ def source_fields(
     """Return the template fields that the sources of portable and optimised C share, by name.
 
     These are all fields of `SourceFields` except `steppers`. functions: the C functions of the
-    scene. stamp, slopes: as in `header`. show: function that renders template data as text.
+    scene. stamp, slopes: as in `header_view`. show: function that renders template data as text.
     """
     target, s = functions.target, functions.target.system
     return {
@@ -268,7 +268,7 @@ def source_fields(
         "stamp": tuple(views.stamp(target)),
         **functions.names,
         "handshake": stamp,
-        "parameters": parameters(functions),
+        "parameters": parameter_members(functions),
         "q0": tuple(target.literal(x.start) for x in s.coordinates),
         "qd0": tuple(target.literal(x.rate) for x in s.coordinates),
         "evaluations": functions.evaluations,
@@ -279,7 +279,7 @@ def source_fields(
     }
 
 
-def indexed(
+def enumerators(
     functions: SceneFunctions,
     items: Sequence[Constraint | Coordinate | Event | Input | Output],
     prefix: str = "",
@@ -295,7 +295,7 @@ def indexed(
     )
 
 
-def parameters(functions: SceneFunctions) -> tuple[ParameterMember, ...]:
+def parameter_members(functions: SceneFunctions) -> tuple[ParameterMember, ...]:
     """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
     return tuple(
         ParameterMember(

@@ -238,8 +238,8 @@ def workspace_sizes(steppers: Steppers) -> list[int]:
     adaptive steps.
     """
     system = steppers.one.target.system
-    room = adaptive.workspace_size(system, steppers.one.width)
-    return [*(runs.state_size(steppers, m) for m in steppers.methods), room]
+    size = adaptive.workspace_size(system, steppers.one.width)
+    return [*(runs.state_size(steppers, m) for m in steppers.methods), size]
 
 
 def files(steppers: Steppers, show: Show) -> dict[str, str]:
@@ -249,7 +249,9 @@ def files(steppers: Steppers, show: Show) -> dict[str, str]:
     """
     functions, slopes, target = steppers.functions, steppers.slopes, steppers.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    header = show(sources.header(functions, slopes, stamp, workspace_sizes(steppers), fast=True))
+    header = show(
+        sources.header_view(functions, slopes, stamp, workspace_sizes(steppers), fast=True)
+    )
     source = show(
         OptimisedSourceView(
             **sources.source_fields(functions, stamp, slopes, show),
@@ -462,24 +464,24 @@ def _steppers(steppers: Steppers, show: Show) -> Iterator[str]:
     for m in steppers.methods:
         lanes = [steppers.one, *([steppers.wide] if run.batch else [])]
         if m is RK4:
-            yield from (show(steppers.rk4(lane)) for lane in lanes)
+            yield from (show(steppers.rk4_view(lane)) for lane in lanes)
         elif not m.implicit:
-            yield from (show(steppers.explicit(lane, m)) for lane in lanes)
+            yield from (show(steppers.explicit_view(lane, m)) for lane in lanes)
         if runs.predicts(steppers, m):
-            yield show(steppers.predictions())
+            yield show(steppers.predictions_view())
         yield show(runs.state_view(steppers, m))
         if runs.predicts(steppers, m):
-            yield show(steppers.prediction())
+            yield show(steppers.predicted_steps_view())
         if m.sweeps:
-            yield show(steppers.stages(m)) + "\n" + show(steppers.sweeps(m)).rstrip("\n")
+            yield show(steppers.stages_view(m)) + "\n" + show(steppers.sweeps_view(m)).rstrip("\n")
         elif m.implicit:
-            yield show(steppers.gauss(m))
+            yield show(steppers.gauss_view(m))
         yield show(runs.runs_view(steppers, m))
         if run.batch:
             yield show(runs.batch_view(steppers, m))
     if run.tolerance is not None:
         if adaptive.METHOD not in steppers.methods:
-            yield show(steppers.stages(adaptive.METHOD))
+            yield show(steppers.stages_view(adaptive.METHOD))
         yield from map(show, events.adaptive_views(steppers.functions, _adaptive(steppers)))
         if run.batch:
             side_by_side = adaptive.steps_in_parallel(steppers.accelerations.target)

@@ -540,7 +540,7 @@ class Steppers:
 
     # methods
 
-    def rk4(self, lane: Lane) -> OptimisedRK4View:
+    def rk4_view(self, lane: Lane) -> OptimisedRK4View:
         """Return the template data of one step of RK4, the classical Runge-Kutta method.
 
         lane: the C type that the step computes with, one number or a vector register.
@@ -577,7 +577,7 @@ class Steppers:
             corrected=self.passes_sines_to_projection(RK4),
         )
 
-    def predictions(self) -> PredictionsView:
+    def predictions_view(self) -> PredictionsView:
         """Return the template data of the C functions that extrapolate angles to the next RK4 step.
 
         They compute the sines and cosines of these angles in advance.
@@ -588,7 +588,7 @@ class Steppers:
             inline=lane.qualifiers[INLINE], angles=angles,
         )  # fmt: skip
 
-    def prediction(self) -> PredictedStepsView:
+    def predicted_steps_view(self) -> PredictedStepsView:
         """Return the template data of the C loop over steps of RK4 that use predicted angles.
 
         Predicted angles are extrapolated from the step before.
@@ -619,11 +619,11 @@ class Steppers:
             stage=tuple(map(stage, range(4))),
         )
 
-    def explicit(self, lane: Lane, m: Method) -> OptimisedExplicitView:
+    def explicit_view(self, lane: Lane, m: Method) -> OptimisedExplicitView:
         """Return the template data of a step of an explicit Runge-Kutta method `m`.
 
-        For RK4, `rk4` is used instead. lane: the C type that the step computes with, one number or
-        a vector register with values of several instances.
+        For RK4, `rk4_view` is used instead. lane: the C type that the step computes with, one
+        number or a vector register with values of several instances.
         """
         real = self.accelerations.target.real
 
@@ -685,7 +685,7 @@ class Steppers:
         """Whether the scene's signals (formulas for its inputs) depend on the state."""
         return self.accelerations.target.signal_state
 
-    def gauss(self, m: Method) -> OptimisedGaussView:
+    def gauss_view(self, m: Method) -> OptimisedGaussView:
         """Return the template data of a step of a Gauss method that uses Newton's method."""
         lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
         assert slopes is not None
@@ -754,7 +754,7 @@ class Steppers:
         others = (*self.step_arguments(self.one), *self.functions.onto_argument)
         return c.static_prototype(f"{P}_sweep", "int", out, *arguments, *others)
 
-    def stages(self, m: Method) -> StagesView:
+    def stages_view(self, m: Method) -> StagesView:
         """Return the template data of the C function whose prototype `sweep_prototype` returns.
 
         It makes one fixed-point iteration over all stages of a step by the implicit method `m`.
@@ -787,7 +787,7 @@ class Steppers:
             else "",
         )
 
-    def sweeps(self, m: Method) -> SweepsView:
+    def sweeps_view(self, m: Method) -> SweepsView:
         """Return the template data of a step of an implicit method `m` by fixed-point iteration.
 
         The number of iterations is fixed; if they do not converge, the step iterates further.
