@@ -37,13 +37,8 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import NUDGE, State, simulate
 
-ERROR_LIMIT, ERROR_UNIT = 0.1, "tolerances a step, times growth"
-STEP_COUNTS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
-MIN_TOLERANCE = {"float64": 1e-15, "float32": 5e-7}  # tolerance
-TIME_ROUNDINGS = 4  # roundings of a time
-# roundings of time in a step: C refuses steps of TICKS, and begins with a part of the step it takes
-MIN_STEP_ROUNDINGS = 16 * TIME_ROUNDINGS
-ROUNDING = 1e3  # in a tolerance's place, where that is smaller
+TIME_ROUNDINGS = 4  # error of the time of a stored state, in units of rounding
+TOLERANCE_ROUNDINGS = 1e3  # error in units of rounding that is permitted besides the tolerance
 
 
 def report_runs(check: Comparison) -> None:
@@ -55,7 +50,8 @@ def report_runs(check: Comparison) -> None:
         for tol, stiff in ((10 * tight**0.5, False), (tight, False), (tight**0.5, True)):
             measure = partial(_largest_error, check, module, tol, stiff)
             how = "stiff" if stiff else f"{tol:g}"
-            check.add_check(f"{form}adaptive steps, {how}", ERROR_LIMIT, ERROR_UNIT, measure)
+            unit = "tolerances a step, times growth"
+            check.add_check(f"{form}adaptive steps, {how}", 0.1, unit, measure)
 
 
 def resolves_steps(check: Comparison, s: State, h: float) -> bool:
@@ -63,7 +59,8 @@ def resolves_steps(check: Comparison, s: State, h: float) -> bool:
 
     In single precision, for instance, times have only 7 digits.
     """
-    return h > MIN_STEP_ROUNDINGS * check.eps * (abs(s.t) + h)
+    # the C function refuses steps of a few roundings, and begins with a fraction of the first step
+    return h > 16 * TIME_ROUNDINGS * check.eps * (abs(s.t) + h)
 
 
 def _largest_error(check: Comparison, module: Any, tol: float, stiff: bool) -> float | Measurement:
@@ -113,7 +110,8 @@ def _run_error(check: Comparison, module: Any, tol: float, stiff: bool, s: State
     moved = x + NUDGE * spread
     neighbour = check.sampler.project(replace(s, q=moved[: len(s.q)], qd=moved[len(s.q) :]))
     nudged = np.concatenate([neighbour.q, neighbour.qd])
-    for steps in STEP_COUNTS:
+    min_tolerance = 1e-15 if check.dtype == np.float64 else 5e-7
+    for steps in (12, 6, 3):  # fewer if a difference grows too much
         T = min(float(first.t[min(steps, len(first) - 1)]), first_end) - s.t
         T *= 1 if s.t + T < first_end else 0.9  # the reference knows of no events
         run = _simulate(module, s, x, T, tol, stiff=stiff)
@@ -125,17 +123,16 @@ def _run_error(check: Comparison, module: Any, tol: float, stiff: bool, s: State
             continue
         times = s.t + T * np.array([0.31, 0.77, 1.0])
         rows = _simulate(module, s, x, T, tol, times=times, stiff=stiff)
-        finer = _simulate(module, s, x, T, max(tol / 1000, MIN_TOLERANCE[check.dtype.name]))
+        finer = _simulate(module, s, x, T, max(tol / 1000, min_tolerance))
         expected, rates = _reference_states(check, s, x, times, finer.t)
         if not np.isfinite(expected).all():
             continue
-        late = (
-            TIME_ROUNDINGS * check.eps * (abs(s.t) + T) * np.abs(rates)
-        )  # by what rounding of t makes of it
+        # effect of the rounding of times
+        late = TIME_ROUNDINGS * check.eps * (abs(s.t) + T) * np.abs(rates)
         off = np.abs(np.vstack([rows.x - expected, run.x[-1:] - expected[-1:]]).astype(float))
         off = np.maximum(0.0, off - np.vstack([late, late[-1:]]))
         off /= np.abs(expected).max(axis=0) + max(growth, 1.0) * spread
-        allowed = (tol + ROUNDING * check.eps) * (run.steps + 1)
+        allowed = (tol + TOLERANCE_ROUNDINGS * check.eps) * (run.steps + 1)
         return float(np.nan_to_num(off.max(), nan=math.inf) / allowed)
     return None
 
@@ -166,10 +163,10 @@ def _reference_states(
     return np.array(rows), np.array(rates)
 
 
-SINGULAR_STATE_COUNT, MAX_STEPS = 8, 40  # states; steps of a run
-STEP_LIMIT_PARTS = 7  # steps of a span in which one would do
-COARSE_TOLERANCE = 1e-3  # tolerance
-LARGE_ANGLE = 1e7  # rad: sines of several angles at once come to their limit before
+# --- refusals and step sizes ----------------------------------------------------------------------
+
+MAX_STEPS = 40  # of a run
+COARSE_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -251,9 +248,7 @@ class AdaptiveRefusalChecks:
         """
         h, tol = self.check.system.run.h, COARSE_TOLERANCE
         wrong = 0
-        for s in self.refusals.singular[
-            :: max(1, len(self.refusals.singular) // SINGULAR_STATE_COUNT)
-        ]:
+        for s in _every_nth(self.refusals.singular, 8):
             for stiff in (False, True):
                 run = self.drive(s, 10 * h, tol, stiff=stiff)
                 wrong += not (run.refuses_cleanly and run.status == SINGULAR)
@@ -270,7 +265,7 @@ class AdaptiveRefusalChecks:
         """
         wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
         for unit in np.eye(len(self.state.q)):
-            for size in (LARGE_ANGLE, huge):
+            for size in (1e7, huge):  # the vectorised sines are for angles below 1e7 rad
                 for stiff in (False, True):
                     far = replace(self.state, q=size * unit, qd=1.01 * size * unit)
                     run = self.drive(far, 1.0, COARSE_TOLERANCE, stiff=stiff)
@@ -294,18 +289,16 @@ class AdaptiveRefusalChecks:
         first = self.drive(s, self.check.system.run.duration, COARSE_TOLERANCE)
         later = first.times[first.times > s.t]  # the state may jump at once
         span = float(later[0]) - s.t if len(later) else 0.0
-        if not resolves_steps(self.check, s, span / STEP_LIMIT_PARTS):
+        parts = 7  # steps in place of the first one, because of the limit
+        if not resolves_steps(self.check, s, span / parts):
             return None
         run, cut = (
-            self.drive(s, span, COARSE_TOLERANCE, h_most=span / STEP_LIMIT_PARTS, each=n)
+            self.drive(s, span, COARSE_TOLERANCE, h_most=span / parts, each=n)
             for n in (MAX_STEPS, 1)
         )
         sizes = np.diff(np.concatenate([[s.t], run.times]))
         rounding = TIME_ROUNDINGS * self.check.eps * (abs(s.t) + span)
-        late = (
-            bool(np.any(sizes > span / STEP_LIMIT_PARTS + rounding))
-            or len(run.times) < STEP_LIMIT_PARTS
-        )
+        late = bool(np.any(sizes > span / parts + rounding)) or len(run.times) < parts
         end = np.asarray(s.t + span, run.times.dtype)
         there = run.status == OK and run.times[-1] == end
         return float(late) + float(not there) + float(not np.array_equal(run.rows, cut.rows))
@@ -314,12 +307,8 @@ class AdaptiveRefusalChecks:
 # --- batches --------------------------------------------------------------------------------------
 
 INSTANCES = 19  # more than twice the lanes of any register
-BATCH_SINGULAR_STATES = 4  # singular states
 BATCH_STEPS = 4  # of a run that is compared with the run of a single instance
-BATCH_TOLERANCE = {8: 1e-12, 4: 1e-6}  # by the bytes of a number
-MAX_STEP_FRACTION = 0.3  # limit of the step size, relative to the duration of the run
 BATCH_LIMIT, BATCH_UNIT = 1.0, "tolerances a step"
-EVENTS_PER_CALL = 64  # room for the events of an instance, besides those of a step
 
 
 @dataclass
@@ -385,7 +374,7 @@ class EventRecorder:
         self.room: tuple[Any, ...] = ()
         if not model.events:
             return
-        each = EVENTS_PER_CALL + len(model.events)
+        each = 64 + len(model.events)  # room for the events of an instance in one call
         self.counts, self.which = np.zeros(count, "l"), np.zeros((count, each), "i")
         self.rows = np.zeros((count, each, 1 + 2 * model.nq), model.dtype)
         address, (long, integer) = model._c[0], model._whole
@@ -411,7 +400,7 @@ class AdaptiveBatchChecks:
     def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
         self.check, self.module, self.singular = check, module or check.module, singular
         self.model = self.module._model
-        self.tol = BATCH_TOLERANCE[self.model.dtype.itemsize]
+        self.tol = 1e-12 if self.model.dtype == np.float64 else 1e-6
         states = [e.state for e in reversed(check.few(2))]
         self.state = s = next(filter(self.resolves_steps, states), states[0])
         random, sampler = np.random.default_rng(3), check.sampler
@@ -473,7 +462,7 @@ class AdaptiveBatchChecks:
             return None
         x = np.hstack([many.q[k], many.qd[k]]).astype(float)
         scale = np.abs(one.x).max(axis=0) + self.check.sampler.scale.ravel()
-        allowed = (self.tol + ROUNDING * self.check.eps) * (one.steps + 1)
+        allowed = (self.tol + TOLERANCE_ROUNDINGS * self.check.eps) * (one.steps + 1)
         return float(np.nan_to_num(np.max(np.abs(x - one.x) / scale) / allowed, nan=math.inf))
 
     def drive(
@@ -526,7 +515,7 @@ class AdaptiveBatchChecks:
         and, for some instances, without others. All of these runs must give the same bits.
         """
         wrong, T = 0, self.span(self.state)
-        for stiff, longest in ((False, MAX_STEP_FRACTION * T), (False, 0.0), (True, 0.0)):
+        for stiff, longest in ((False, 0.3 * T), (False, 0.0), (True, 0.0)):
             how: Any = {"stiff": stiff, "longest": longest}
             whole, few = (self.drive(self.starts, T, n, **how) for n in (1000, 1))
             back = self.drive(self.starts[::-1], T, 3, **how)
@@ -548,7 +537,7 @@ class AdaptiveBatchChecks:
         """
         T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
-        known = self.singular[:: max(1, len(self.singular) // BATCH_SINGULAR_STATES)]
+        known = _every_nth(self.singular, 4)
         odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]
         result, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
         wrong = sum(
@@ -557,6 +546,11 @@ class AdaptiveBatchChecks:
         wrong += int(result.status[0] != NOT_FINITE) + int(result.status[1] == 0)
         wrong += sum(code not in (SINGULAR, NOT_FINITE) for code in result.status[2 : len(odd)])
         return float(wrong)
+
+
+def _every_nth(states: list[State], count: int) -> list[State]:
+    """Return about `count` of the states, evenly spaced in the list."""
+    return states[:: max(1, len(states) // count)]
 
 
 def _have_different_bits(one: list[Vector], other: list[Vector]) -> bool:

@@ -1,4 +1,4 @@
-"""Rows of `check` about batches: order, size, shared and own parameters, instances that fail.
+"""Checks of batches: order, size, shared and own parameters, instances that fail.
 
 A batch is a run of many instances side by side. No bit of an instance's motion depends on the other
 instances. So batches are compared with one another bit by bit, and with single runs, from which
@@ -22,12 +22,9 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import State
 
-COUNT = 150  # instances: a whole tile or two, and one that is not full
-SUBSET_SIZES = (1, 3, 9)  # the first so many of them, alone
+COUNT = 150  # instances: at least one full tile, and one that is not full
 STEPS = 7
-ALIKE = 1e3  # units between a batch and single runs
-ROUNDED = 10.0  # times what roundings of the start make of a row that has no digits
-DRAWS = 2  # of starts that are a rounding off
+ALIKE = 1e3  # largest difference of a batch and single runs, in units of rounding
 
 
 class BatchChecks:
@@ -184,7 +181,7 @@ class BatchChecks:
         for u in self.tables():
             whole = self.simulate(method, self.instances, u)
             order = self.random.permutation(COUNT)
-            parts = [order, *(order[:n] for n in SUBSET_SIZES)]
+            parts = [order, *(order[:n] for n in (1, 3, 9))]
             for part in parts:
                 other = self.simulate(
                     method, [self.instances[k] for k in part], None if u is None else u[part]
@@ -198,7 +195,7 @@ class BatchChecks:
             alike = [replace(s, params=self.instances[0].params) for s in self.instances]
             alike = [self.projected(s, self.instances[0]) for s in alike]
             one, other = (self.simulate(method, alike, u, own=own) for own in (False, True))
-            by = [self.simulate(method, self.rounded(alike), u) for _ in range(DRAWS)]
+            by = [self.simulate(method, self.rounded(alike), u) for _ in range(2)]
             wrong += not self.near(one, other, by)
             wrong += not self.first_step_agrees(method, whole, u)
         if self.check.system.constraints:
@@ -370,7 +367,7 @@ class BatchChecks:
         with np.errstate(all="ignore"):  # of runs that end before
             rounded = np.max([np.abs(x.rows[:, stored.shape[1] - 1] - known) for x in near], axis=0)
             off = np.abs(stored[:, -1] - known)
-            return bool(np.any(off > far * np.abs(known) + ROUNDED * rounded))
+            return bool(np.any(off > far * np.abs(known) + 10 * rounded))
 
 
 def _are_permuted(one: Any, other: Any, order: Any) -> bool:

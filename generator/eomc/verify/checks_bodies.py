@@ -27,12 +27,8 @@ from eomc.verify.reference import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import Expected, State
 
-RELATIVE_LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
-UNITS = 1e3  # of rounding, which are more in single precision
-BODY_STATES = 8  # at most
-INTERPOLATION_NODES = 16  # of the interpolating polynomials
-WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
-WIDENING_FACTOR = 3.0  # times as wide, where things hardly move
+RELATIVE_LIMIT = 1e-10  # largest relative error; derivatives are exact to 1e-13
+UNITS = 1e3  # largest error in units of rounding, if that is more, as in single precision
 
 _X, _Y, _Z = np.eye(3)
 
@@ -65,10 +61,10 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
         return float(np.max([np.abs(qd) / far, np.sqrt(np.abs(qdd) / far)])) or 1.0
 
     typical, least = rate(spread), rate(np.maximum(spread, 1))
-    yield from (width / typical for width in WIDTHS)
-    width = WIDTHS[0] / typical
-    while 0 < WIDENING_FACTOR * width < 1 / least:
-        width *= WIDENING_FACTOR
+    yield from (width / typical for width in (0.1, 0.01, 1e-3))
+    width = 0.1 / typical
+    while 0 < 3 * width < 1 / least:
+        width *= 3
         yield width
 
 
@@ -96,7 +92,7 @@ class BodyChecks:
         name: "kinetic_energy", "potential_energy" or "power" (the power of the forces). The
         expected value is recomputed from the scene's bodies.
         """
-        return self.check.largest(partial(self.off, name), BODY_STATES)
+        return self.check.largest(partial(self.off, name), 8)
 
     def off(self, name: str, e: Expected) -> float:
         """Return the relative error of the module's quantity `name` at the state of `e`.
@@ -200,7 +196,7 @@ class MotionLine:
     known: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        s, n = self.state, INTERPOLATION_NODES
+        s, n = self.state, 16  # degree of the interpolating polynomials
         nodes, rate = _interpolation(n)
         self.nodes, self.rate = nodes * self.width, rate / self.width
         zero = np.zeros(n + 1)
@@ -561,8 +557,9 @@ _ALGEBRA: Mapping[str, Any] = {
 }
 
 
-FRAME_STATES = 4
-ACCELERATION_LIMIT = 1e-8  # of accelerations: two derivatives are good to 1e-10
+# --- frames, inverse dynamics and momenta ---------------------------------------------------------
+
+FRAME_STATES = 4  # states at which frames are compared
 
 
 def report_frames(check: Comparison, scene: Scene) -> None:
@@ -582,7 +579,8 @@ def report_frames(check: Comparison, scene: Scene) -> None:
         if check.system.output_frames:
             add("poses of frames", RELATIVE_LIMIT, frames.poses)
             add("velocities of frames", RELATIVE_LIMIT, frames.velocities)
-            add("accelerations of frames", ACCELERATION_LIMIT, frames.accelerations)
+            # second derivatives are exact to 1e-10
+            add("accelerations of frames", 1e-8, frames.accelerations)
             add("Jacobians of frames", RELATIVE_LIMIT, frames.jacobians)
             add("forces at frames", RELATIVE_LIMIT, frames.forces)
         if run.momentum:

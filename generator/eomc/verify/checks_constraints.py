@@ -40,14 +40,9 @@ from eomc.verify.sampling import (
 )
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
-WORK_TOLERANCE = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
-WORK_ROUNDINGS = 30  # of multipliers and forces, if these are more: in single precision
-STATES = 4
-STEPS = 200  # of a run that is to stay on the rows
-STEP_SHARE = 0.02  # of how far things go, in a step of it
-MAX_RESIDUAL = 450.0  # units: what rows may be along it, 1e-13 of their terms
-SLOPE_LIMIT = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
-DIFFERENCE_STEP = 1e-4  # of how far things go: a difference for the size of a slope
+WORK_TOLERANCE = 1e-9  # relative error of virtual work; velocities of bodies are exact to 1e-12
+MAX_RESIDUAL = 450.0  # units of rounding: residual of constraints in a run, 1e-13 of their terms
+SLOPE_LIMIT = 1e-7  # relative error of A, by differences of order 8; a wrong sign makes 1
 UNITS = "units of rounding"
 
 
@@ -65,7 +60,7 @@ def report(check: Comparison) -> None:
             check.add_check("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent)
     check.add_check("power of multipliers", LIMIT, UNITS, checks.power)
     if check.system.reactions:
-        limit = max(WORK_TOLERANCE, WORK_ROUNDINGS * check.eps)
+        limit = max(WORK_TOLERANCE, 30 * check.eps)  # the latter in single precision
         check.add_check("reactions: virtual work", limit, "of its size", checks.reactions)
     for module, form in check.forms:
         own = ConstraintChecks(check, module)
@@ -199,7 +194,7 @@ class ConstraintChecks:
         equal that of the loop's multipliers, λ·A. Velocities of the bodies are computed from the
         scene file.
         """
-        return self.check.largest(self._work, STATES)
+        return self.check.largest(self._work, 4)
 
     def _work(self, e: Expected) -> float:
         s, scene = e.state, self.system.scene
@@ -256,11 +251,13 @@ class ConstraintChecks:
         errors: list[float | None] = []
         for e in check.few(3):
             s = replace(e.state, u=None)
-            with np.errstate(divide="ignore"):  # no longer than a stepper follows
-                longest = STEP_SHARE * float(np.min(check.sampler.spread / np.abs(s.qd)))
-            how = {"h": min(check.system.run.h, longest), "steps": STEPS, "every": STEPS // 40}
+            with np.errstate(
+                divide="ignore"
+            ):  # steps in which coordinates move by 2 % of their range
+                longest = 0.02 * float(np.min(check.sampler.spread / np.abs(s.qd)))
+            how = {"h": min(check.system.run.h, longest), "steps": 200, "every": 5}
             run = simulate(self.module, s, t0=s.t, method=method, **how)
-            for at in states_of_run(run, s)[1:]:  # of a run that stops early the rows up to there
+            for at in states_of_run(run, s)[1:]:  # fewer if the run stops early
                 far = np.abs([at.q - s.q, at.qd - s.qd])
                 if np.any(far >= MAX_DISTANCE * check.sampler.scale):  # as h is too long
                     break
@@ -306,7 +303,7 @@ class ConstraintChecks:
         """
         total = np.zeros(len(self.system.constraints))
         for i, q in enumerate(s.q):
-            step, x = DIFFERENCE_STEP * self.check.sampler.spread[i], s.q.copy()
+            step, x = 1e-4 * self.check.sampler.spread[i], s.q.copy()
             x[i] += step
             change = evaluate_module(self.module, "constraint_rates", replace(s, q=x))
             change = change - evaluate_module(self.module, "constraint_rates", s)
@@ -316,11 +313,7 @@ class ConstraintChecks:
 
 # --- projection onto the constraints --------------------------------------------------------------
 
-DISPLACEMENTS = (1e-6, 1e-3, 1e-2)  # of a state from the constraints, relative to its scale
-FAR_FACTORS = (3.0, 30.0, 300.0)  # times the scale: the projection may not converge
-VIOLATION = 0.1  # relative to the scale, of states that are fixed as a whole
-MIN_SINGULAR_VALUE = 1e-4  # of the scaled KKT matrix without what is held: its least singular value
-RESIDUAL_TOLERANCE = 1e-9  # of the terms of a row: single precision apart
+VIOLATION = 0.1  # displacement of fixed states from the constraints, relative to the scale
 
 
 def report_projection(check: Comparison, module: Any, form: str) -> None:
@@ -396,7 +389,8 @@ class ProjectionChecks:
             error = check.units(result, np.array([expected_state.q, expected_state.qd]), size)
             return error if unchanged else np.inf
 
-        errors = [error(e, part) for e in check.few(6) for part in DISPLACEMENTS]
+        # displacements from the constraints, relative to the scale of the states
+        errors = [error(e, part) for e in check.few(6) for part in (1e-6, 1e-3, 1e-2)]
         why = "no state that is moved away has a place nearby"
         return largest(errors, "nothing can be held" if with_fixed else why)
 
@@ -415,7 +409,7 @@ class ProjectionChecks:
         D = self.check.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         A = self.check.sampler.rows("constraint_jacobian", s)
         for i in random.permutation(len(s.q)).tolist():
-            if kkt.is_regular(*kkt.with_fixed_coordinates(D, A, (i,)), MIN_SINGULAR_VALUE):
+            if kkt.is_regular(*kkt.with_fixed_coordinates(D, A, (i,)), 1e-4):
                 return (i,)
         return None
 
@@ -437,7 +431,7 @@ class ProjectionChecks:
                 self._fails_to_refuse(s, fixed)
                 for s, fixed in self._unreachable_states(e.state, scale)
             )
-            for part in FAR_FACTORS:
+            for part in (3.0, 30.0, 300.0):  # times the scale: projections may not converge
                 offset = part * scale * random.uniform(-1, 1, scale.shape)
                 wrong += not self._is_projected_or_refused(
                     replace(e.state, q=e.state.q + offset[0], qd=offset[1])
@@ -477,7 +471,7 @@ class ProjectionChecks:
         status, unchanged, projected = self._project_in_c(s, (0, 0))
         if status:
             return unchanged
-        holds = 1e-3 if self.check.dtype == np.float32 else RESIDUAL_TOLERANCE
+        holds = 1e-3 if self.check.dtype == np.float32 else 1e-9  # of the terms of a constraint
         A = np.abs(evaluate_module(self.module, "constraint_jacobian", projected))
         rows = np.array([c.holonomic for c in self.check.system.constraints])
         off = np.abs(evaluate_module(self.module, "constraints", projected))[rows]

@@ -28,7 +28,7 @@ from eomc.verify.sampling import (
     perturb_each_input,
 )
 
-WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
+WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of differences, relative to the scale of a variable
 
 
 def differentiate(
@@ -185,11 +185,6 @@ def _rounding_growth(check: Comparison, name: str, e: Expected, derivatives: Vec
 
 # --- derivatives of steps -------------------------------------------------------------------------
 
-# relative to the scales: inputs may change a coordinate so little in a step; less is not judged
-SMALL_CHANGE = 1e-4
-# times the scene's h, until the iteration for the stages of an implicit method converges
-STEP_SIZE_FACTORS = (1.0, 0.1, 0.01)
-
 Differences = Callable[[str, int, float], list[Vector]]  # of a method, state and step
 
 
@@ -243,13 +238,15 @@ def _step_error(
     None if there are no finite differences.
     """
     n, scales = len(s.q), _variable_scales(check, s)
-    for h in (part * check.system.run.h for part in STEP_SIZE_FACTORS):
+    # shorter steps if the iteration for the stages of an implicit method does not converge
+    for h in (part * check.system.run.h for part in (1.0, 0.1, 0.01)):
         near = exact(h)
         if not any(np.isfinite(J).all() for J in near) or _moves_far(check, method, s, h):
             continue
         arguments = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
         derivatives = [np.asarray(x, float) for x in module.discretize(s.q, s.qd, **arguments)]
-        parts, size = (slice(0, 2 * n), slice(2 * n, None)), SMALL_CHANGE * scales[: 2 * n]
+        # inputs may change a coordinate by 1e-4 of its scale in a step; less is not judged
+        parts, size = (slice(0, 2 * n), slice(2 * n, None)), 1e-4 * scales[: 2 * n]
         off = [
             np.hstack(
                 [

@@ -59,12 +59,6 @@ def _function_error(check: Comparison, module: Any, name: str, system: System) -
     return compare_outputs(check, module, Formulas(system), module_values)
 
 
-STEPS = 250  # of a run
-MAX_RELATIVE_MOVE = 10.0  # of its size: how far a state may go in a step that is compared
-SIGN_TOLERANCE = 1e-6  # of what an event watches: more is on one side of zero
-SIGNS_AFTER = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
-
-
 def report_fixed_steps(check: Comparison) -> None:
     """Append checks of events in fixed steps to the report of `eomc check`, for each method."""
     for module, form in check.forms:
@@ -87,7 +81,7 @@ def _largest_error(check: Comparison, module: Any, method: str) -> float | Measu
 
 def _run_error(check: Comparison, module: Any, method: str, s: State) -> float | None:
     """Return the largest error of a run from one state; inf if an event is missing."""
-    run = simulate(module, s, t0=s.t, h=check.system.run.h, steps=STEPS, method=method)
+    run = simulate(module, s, t0=s.t, h=check.system.run.h, steps=250, method=method)
     if len(run) < 2:
         return None
     if _misses_event(check, module, run, s):
@@ -96,9 +90,7 @@ def _run_error(check: Comparison, module: Any, method: str, s: State) -> float |
     worst = 0.0
     for k, t, end in _steps(run):
         h, size = t - run.t[k], np.abs(run.x[k]) + scale
-        if (
-            np.abs(end - run.x[k]) > MAX_RELATIVE_MOVE * size
-        ).any():  # it grows without bounds, rounding too
+        if (np.abs(end - run.x[k]) > 10 * size).any():  # the run diverges, and rounding with it
             continue
         try:
             step_end = module.step(run.q[k], run.qd[k], h, run.t[k], s.u, s.params, method)
@@ -130,12 +122,13 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 def _misses_event(check: Comparison, module: Any, run: Any, s: State) -> bool:
     """Return whether an event function changes sign clearly without a detected event."""
     events = check.system.events
+    signs_after = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
     values = module._model._evaluate("events", run.q, run.qd, run.t, s.u, s.params)
     for event, g in zip(events, values.T, strict=True):
-        sides = np.where(np.abs(g) > SIGN_TOLERANCE * np.abs(g).max(), np.sign(g), 0)
+        sides = np.where(np.abs(g) > 1e-6 * np.abs(g).max(), np.sign(g), 0)  # 0 if not clear
         recorded = run.events[event.name].t
         for k in np.flatnonzero((sides[1:] * sides[:-1] < 0) & (np.diff(run.t) > 0)):
             here = (recorded > run.t[k]) & (recorded <= run.t[k + 1])
-            if sides[k + 1] in SIGNS_AFTER[event.direction] and not here.any():
+            if sides[k + 1] in signs_after[event.direction] and not here.any():
                 return True
     return False

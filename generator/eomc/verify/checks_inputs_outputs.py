@@ -30,11 +30,10 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import NUDGE, Expected, State, evaluate_module, perturb_each_input
 
-DIGITS = 80  # three differences leave some thirty
-WIDTH = mpmath.mpf(10) ** -15  # of differences
-SLOPE_LIMIT = 1e-9  # of a row's largest derivative
-MULTIPLIER_SLOPE_LIMIT = 1e-6  # likewise, where an output reads multipliers
-STATES = 4
+DIGITS = 80  # about 30 of them remain correct after three nested differences
+WIDTH = mpmath.mpf(10) ** -15  # step of differences
+SLOPE_LIMIT = 1e-9  # error relative to the largest derivative of the same output
+STATES = 4  # states at which values are compared
 _NONE: Vector = np.zeros(0)
 
 _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
@@ -46,7 +45,8 @@ def report_outputs(check: Comparison) -> None:
     Outputs are quantities that the scene defines by formulas.
     """
     formulas = Formulas(check.system)
-    limit = max(MULTIPLIER_SLOPE_LIMIT if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
+    # derivatives of multipliers are differences of the reference's
+    limit = max(1e-6 if formulas.multipliers else SLOPE_LIMIT, LIMIT * check.eps)
     for module, form in check.forms:
         check.add_check(
             f"{form}outputs", LIMIT, "units of rounding", partial(_values, check, module, formulas)
@@ -340,9 +340,6 @@ def _closed_loop_error(check: Comparison, module: Any, formulas: Formulas) -> fl
     return check.largest(error, 2)
 
 
-BEYOND_FACTOR = 3.0  # times what lies between limits
-
-
 def report_limits(check: Comparison) -> None:
     """Append checks of limits of inputs to the report of `eomc check`, if the scene has limits."""
     if all(x is None for i in check.system.inputs for x in i.limits):
@@ -393,9 +390,7 @@ def _beyond(least: Vector, most: Vector) -> Iterator[Vector]:
     high = np.where(np.isfinite(most), most, low + 2 * width)
     for turn in range(3):
         where = (np.arange(len(low)) + turn) % 3
-        yield np.choose(
-            where, [low - BEYOND_FACTOR * width, high + BEYOND_FACTOR * width, (low + high) / 2]
-        )
+        yield np.choose(where, [low - 3 * width, high + 3 * width, (low + high) / 2])
 
 
 def _results_with_inputs(module: Any, s: State, u: Vector) -> Iterator[Vector]:

@@ -1,4 +1,4 @@
-"""Rows of `check` about refusals: a singular D, states that are not finite, no convergence.
+"""Checks of refusals: a singular D, states that are not finite, no convergence.
 
 Parameters and states are sought at which the reference's D is not positive definite. There each
 function of the module must return an error and leave its outputs unchanged.
@@ -24,22 +24,8 @@ from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
 REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)
-FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
-MIXED = 60  # changes of all parameters at random
-SINGLE_SIGN_CHANGES = 8  # changes of all at random, of which one alone is negative
-SPREAD = 3.0  # of their logarithms
-MAX_STATES, MAX_STATES_IF_LARGE = (
-    1200,
-    240,
-)  # states that the reference is asked for; where it takes long
-PRECISION_LOSS = (
-    1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
-)
-ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
-# of how far a coordinate goes: from a singular state to a regular one
-DISPLACEMENTS = (-0.1, 0.1, -0.4, 0.4)
-STEP_POINTS = np.linspace(0, 1, 9)  # of a step: where its stages may lie
-MARK = -7.0  # what is to be left alone
+FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # by which one parameter is multiplied
+MARK = -7.0  # content of output arrays that must stay unchanged
 
 
 def with_nonfinite_entries(s: State) -> Iterator[tuple[str, int, float, State]]:
@@ -163,7 +149,7 @@ class RefusalChecks:
         is 2^60 times another, the smaller one is lost in sums.
         """
         sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
-        return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)
+        return all(x == 0 or 2.0**-30 < x < 2.0**30 for x in sizes)
 
     def natural(self, s: State) -> bool:
         """Return whether all parameters of a state have the signs of their defaults.
@@ -182,7 +168,7 @@ class RefusalChecks:
         """
         size = np.sqrt(np.abs(np.diag(D)))
         off = np.abs(self.check.ask("D", s) - D)
-        return bool(np.any(off > PRECISION_LOSS * np.outer(size, size)))
+        return bool(np.any(off > 1e-6 * np.outer(size, size)))
 
     def suspects(self) -> list[State]:
         """Return states at which D may be singular since their parameters are changed.
@@ -199,9 +185,9 @@ class RefusalChecks:
             changes.append({name: scale * value for name, value in self.defaults.items()})
         n = len(self.defaults)
         # one negative eigenvalue makes one negative pivot, whatever the order of elimination
-        alone = np.repeat(1 - 2 * np.eye(n), SINGLE_SIGN_CHANGES, axis=0)
-        for signs in (*alone, *self.random.choice([-1, 1, 1], (MIXED, n))):
-            sizes = np.exp(self.random.uniform(-SPREAD, SPREAD, n))
+        alone = np.repeat(1 - 2 * np.eye(n), 8, axis=0)
+        for signs in (*alone, *self.random.choice([-1, 1, 1], (60, n))):
+            sizes = np.exp(self.random.uniform(-3, 3, n))
             changes.append({
                 name: (value or 1.0) * sign * size
                 for (name, value), sign, size in zip(
@@ -209,7 +195,7 @@ class RefusalChecks:
             })  # fmt: skip
         for change in changes:
             suspects_ += [replace(s, params={**self.defaults, **change}) for s in states]
-        most = MAX_STATES_IF_LARGE if self.check.large else MAX_STATES
+        most = 240 if self.check.large else 1200
         order = self.random.permutation(len(suspects_))[:most]
         return [suspects_[k] for k in sorted(order)]
 
@@ -328,7 +314,7 @@ class RefusalChecks:
         D.
         """
         i = turn % len(s.q)
-        for by in DISPLACEMENTS:
+        for by in (-0.1, 0.1, -0.4, 0.4):
             q = s.q.copy()
             q[i] += by * self.check.sampler.spread[i]
             at = replace(s, q=q, qd=np.zeros_like(q))
@@ -362,13 +348,13 @@ class RefusalChecks:
     def positions_along_step(self, starts: Vector, ends: Vector) -> list[Vector]:
         """Return positions within n steps, by cubic interpolation, as one array (n, nq) per point.
 
-        The points are the fractions STEP_POINTS of a step. starts, ends: q and q̇ before and after
+        The points are nine equidistant fractions of a step. starts, ends: q and q̇ before and after
         the steps, (2, n, nq).
         """
         (q, qd), (r, v), h = starts, ends, self.check.system.run.h
         return [
             q + (r - q) * x**2 * (3 - 2 * x) + h * x * (1 - x) * (qd * (1 - x) - v * x)
-            for x in STEP_POINTS.tolist()
+            for x in np.linspace(0, 1, 9).tolist()
         ]
 
     def least_eigenvalues(self, q: Vector, s: State) -> Vector:
