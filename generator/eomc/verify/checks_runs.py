@@ -32,31 +32,22 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State
 
-STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
-CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
+STEPS = (
+    200  # of a divided run: more than the C code waits after a long step to predict angles again
+)
+CUTS = (1, 2, 5, 38, 129, 130, 131, 177)  # steps after which a call ends
 EVERY = 3  # no divisor of STEPS
-# The largest move of a step that is long, in parts of how far things go (half a turn): too far for
-# an angle to be predicted, and then too far for its sine to be rotated.
+# Largest move of a coordinate in a long step, relative to its range (half a turn for an angle): too
+# far to predict the sine of an angle, and then too far to update it by a rotation.
 LONG = (0.02, 0.2, 0.7)
-TURNED = 0.3  # radians: where a polynomial for rotations by 2^-6 is off by millions of roundings
-# radians: nearly the most that sines are rotated by, at half of a step and from there on
-ANGLE_PER_STEP, VELOCITY_PER_STEP = 0.11, 0.012
-SHORT = 2.0**-14  # radians: of steps whose angles are predicted
-SPEEDS = (0.1, 1.0, 4.0)  # times a state's own: at which the one or the other is what bounds a step
-LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
-ANGLES = 48  # around the circle, at which sines are looked at
-SHORT_LIMIT = 20.0  # units; wrong terms of predicted sines make hundreds
-SINES = 20.0  # units; their last terms make hundreds
-# number of long steps, or of steps with inputs of their own; fewer if the reference is expensive
-LONG_STEP_COUNT, LONG_STEP_COUNT_IF_LARGE = 6, 3
-TURNS = 2.0**22  # radians: beyond what the inlined sine takes
-LATE = 2.0**24  # seconds: the same, of signals and driven supports
-FARTHEST_ANGLE = 2.0**26  # radians: beyond it roundings of an angle hide all else
-FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
-# parts of h, of runs that differ by rounding alone; the second where the first are too long
+SHORT = 2.0**-14  # rad in half a step: the C code predicts the sines of such angles
+SHORT_LIMIT = 20.0  # units of rounding; wrong terms of predicted sines make hundreds
+LONG_STEP_COUNT = 6  # number of long steps, or of steps with inputs of their own
+TURNS = 2.0**22  # rad: beyond the range of the inlined sine
+# numbers of steps in one step of the scene, for two runs that differ by rounding only; the second
+# pair if the steps of the first are too long
 FINE = ((1024, 8192), (8192, 65536))
-EXACT = 4  # order from which on their steps are short enough
-ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
+ROUNDED = 8.0  # units of rounding: compensated sums lose 0 or 1, uncompensated ones about 40
 
 
 @dataclass(frozen=True)
@@ -179,9 +170,11 @@ class RunChecks:
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
         self.starts = check.few(2)
         self.states = [e.state for e in self.starts]
-        self.few = LONG_STEP_COUNT_IF_LARGE if check.large else LONG_STEP_COUNT
+        self.few = 3 if check.large else LONG_STEP_COUNT  # the reference is expensive
+        # the accelerations limit a turning step at low speed, the velocities at high speed
+        speeds = (0.1, 1.0, 4.0)
         faster = [
-            self.sampler.project(replace(s, qd=k * s.qd)) for s in self.states for k in SPEEDS
+            self.sampler.project(replace(s, qd=k * s.qd)) for s in self.states for k in speeds
         ]
         self.turning = [
             e for s in faster if check.has_finite_accelerations(s) and (e := self._expected(s))
@@ -199,7 +192,7 @@ class RunChecks:
             add("long steps", self.limit, unit, self.long)
             add("short steps", SHORT_LIMIT, unit, self.short)
         if np.any(self.sampler.angles):
-            add("sines around the circle", SINES, rounding, self.sines)
+            add("sines around the circle", 20, rounding, self.sines)  # wrong terms make hundreds
         if np.any(self.sampler.angles) or _reads_time(self.check.system):
             add("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
         if self.model.nu and self.check.methods[0] == "rk4":
@@ -207,7 +200,7 @@ class RunChecks:
         add("every entry written", 0, "values with entries left", self.written)
         for method in self.check.methods:
             add(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
-            if self.check.dtype == np.float64 and METHODS[method].order >= EXACT:
+            if self.check.dtype == np.float64 and METHODS[method].order >= 4:
                 add(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
 
     limit = 1e3
@@ -234,7 +227,7 @@ class RunChecks:
             h = np.minimum(spread / np.abs(s.qd), np.sqrt(spread / np.abs(a)))
         return float(min(np.min(h), 100 * self.h)) or self.h
 
-    def turning_step(self, s: State, turned: float = TURNED, moved: float = math.inf) -> float:
+    def turning_step(self, s: State, turned: float = 0.3, moved: float = math.inf) -> float:
         """Return a step size h, in s, with which angles turn by a given amount in half a step.
 
         h is the shorter of two step sizes: the one with which the accelerations at `s` turn some
@@ -255,7 +248,9 @@ class RunChecks:
         In such steps angles move so far that the C code can't update their sines from the previous
         ones and computes them anew. The runs are compared with runs of the reference.
         """
-        parts = ((), LONG) if self.check.large else (LONG, LADDER)
+        # between the values of LONG, rotations by all angles that the C code uses
+        ladder = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)
+        parts = ((), LONG) if self.check.large else (LONG, ladder)
         pairs = [
             (e, h)
             for e, some in zip(self.starts, parts, strict=False)
@@ -264,9 +259,8 @@ class RunChecks:
                 *(self.large_step(e.state, part) for part in some),
             )
         ]
-        pairs += [
-            (e, self.turning_step(e.state, VELOCITY_PER_STEP, ANGLE_PER_STEP)) for e in self.turning
-        ]
+        # almost the largest angles by which the C code rotates sines
+        pairs += [(e, self.turning_step(e.state, 0.012, 0.11)) for e in self.turning]
         errors = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
         return largest(errors, "a difference grows too much in one long step")
 
@@ -287,7 +281,7 @@ class RunChecks:
         """
         e = self.check.few(2)[-1]
         s, n = e.state, len(e.state.q)
-        around = np.linspace(-np.pi, np.pi, ANGLES, endpoint=False)[:, None] + 0.01
+        around = np.linspace(-np.pi, np.pi, 48, endpoint=False)[:, None] + 0.01
         steps = self.random.permutation(n)  # so that angles are not all alike
         q = np.where(self.sampler.angles, s.q + around * (1 + steps % 3), s.q)
         errors = []
@@ -333,9 +327,10 @@ class RunChecks:
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
             constrained = bool(self.check.system.constraints)  # which do not hold at another time
-            t = LATE if _reads_time(self.check.system) and not constrained else 0.0
+            t = 2.0**24 if _reads_time(self.check.system) and not constrained else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
-            while t > 1 and (angle(at) > FARTHEST_ANGLE or not self.resolves_steps(at.t)):
+            # beyond 2^26 rad, rounding errors of an angle hide all others
+            while t > 1 and (angle(at) > 2.0**26 or not self.resolves_steps(at.t)):
                 t /= 2
                 at = replace(at, t=s.t + t)
             if angle(at) > 2 / EPS:
@@ -350,7 +345,8 @@ class RunChecks:
             # accelerate is as exact as the sums of angles in D, not in what it is without them
             wound = 10 * np.max(e.size["acceleration"]) < np.max(np.abs(far.value["acceleration"]))
             wide = max(TURNS, t, angle(at))
-            for name in FAR:
+            energies = ("kinetic_energy", "potential_energy")
+            for name in ("D", "g", "bias", "tau", *energies, "acceleration"):
                 near = far if wound and name == "acceleration" else e
                 size = wide * near.size[name] + far.size[name]
                 errors.append(self.check.units(self.check.ask(name, at), far.value[name], size))
@@ -551,11 +547,12 @@ class RunChecks:
         return float(median(errors)) if errors else 0.0
 
 
-VANISHING_LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
-QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
-# doubles beside each; some far, as from one to the next what a sum rounds may hardly change
+# --- sines near their zeros -----------------------------------------------------------------------
+
+VANISHING_LIMIT = 100.0  # units of rounding; a wrong constant of the reduction makes 1e9
+# doubles next to a multiple of a quarter turn, counted from it; some are far, since the rounding of
+# a sum may hardly change from one double to the next
 NEIGHBOURS = (-613, -2, -1, 0, 1, 2, 389)
-PROPORTION_TOLERANCE = 1e-6  # an entry over its sine, at neighbours
 CONSTANT_TOLERANCE = (
     0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
 )
@@ -590,7 +587,8 @@ def largest_error_near_zeros(check: Comparison) -> float | Measurement:
     e, errors = check.few(2)[-1], list[float]()
     for i in map(int, np.flatnonzero(check.sampler.angles)):
         for odd in (0, 1):
-            places = [n for n in QUARTERS if n % 2 == odd]
+            quarter_turns = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # up to 2^20 rad
+            places = [n for n in quarter_turns if n % 2 == odd]
             error_tables = [dict(_entry_errors(check, i, n, e)) for n in places]
             common = set.intersection(*map(set, error_tables))
             for quarters, here in zip(places, error_tables, strict=True):
@@ -635,9 +633,7 @@ def _entry_errors(
             for k, (part, entry, value) in enumerate(
                 zip(parts.T, expected.T, values.T, strict=True)
             ):
-                if np.all(np.abs(part) > least[k]) and np.ptp(
-                    part
-                ) <= PROPORTION_TOLERANCE * np.max(np.abs(part)):
+                if np.all(np.abs(part) > least[k]) and np.ptp(part) <= 1e-6 * np.max(np.abs(part)):
                     yield (name, k), _relative_error(value - entry, entry, check.eps)
 
 
@@ -653,9 +649,6 @@ def _relative_error(off: Vector, entry: Vector, eps: float) -> float:
     ]
     small = float(np.max(np.abs(off / entry)))
     return small / eps if small <= VANISHING_LIMIT * eps else max(errors) / eps
-
-
-PERIODIC = (sympy.sin, sympy.cos, sympy.tan)
 
 
 def largest_angle(system: System) -> Callable[[State], float]:
@@ -677,7 +670,7 @@ def largest_angle(system: System) -> Callable[[State], float]:
         else:
             free.add(name)
         formulas.append(e)
-    angles = {f.args[0] for e in formulas for f in e.atoms(*PERIODIC)}
+    angles = {f.args[0] for e in formulas for f in e.atoms(sympy.sin, sympy.cos, sympy.tan)}
     angles = {e for e in angles if not e.has(dot) and not e.free_symbols & free}
     if not angles:
         return lambda s: 0.0

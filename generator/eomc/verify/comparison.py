@@ -41,9 +41,10 @@ from eomc.verify.sampling import (
 from eomc.verify.symbolic import reference_for
 from eomc.verify.taylor import TaylorReference
 
-GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-LONG_STEP = 16.0  # times the scene's h: a long step
-STEP_FRACTIONS = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
+GROWTH_LIMIT = 1e4  # a run is compared until an initial difference has grown by this factor
+LONG_STEP = 16.0  # a long step, as a multiple of the scene's h
+# fractions of a step that are tried until the iteration for its stages converges
+STEP_FRACTIONS = tuple(4.0**-k for k in range(7))
 
 
 def _corrected(e: Expected) -> Vector | float:

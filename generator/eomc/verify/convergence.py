@@ -32,6 +32,7 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement
 from eomc.verify.sampling import (
     MAX_DISTANCE,
+    NUDGE,
     State,
     evaluate_module,
     projected_start,
@@ -40,25 +41,13 @@ from eomc.verify.sampling import (
 )
 
 EPS = 2.0**-52
-MAX_OBSERVABLE_ORDER = (
-    8  # higher orders go from errors of a hundredth to rounding in two halvings of h
-)
-ORDER_MARGIN = 0.5  # below the order of a method: half way to the next lower one
-MAX_DIFFERENCE = 1e-2  # of the motion: differences below are in proportion to a power of h
-NOISE_FACTOR = 30.0  # times what rounding does to a run: differences above are the method's own
+MAX_OBSERVABLE_ORDER = 8  # with higher orders, two halvings of h lead from 1e-2 to rounding
+ORDER_MARGIN = 0.5  # an observed order may be lower than the order of the method by this
+NOISE_FACTOR = 30.0  # differences above this multiple of rounding errors are due to the method
 ORDER_TOLERANCE = 0.3  # orders that differ by less are the same
-COUNTS = (6, 12, 24, 48, 96)  # steps of a span
-FIRST_SPANS = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
+COUNTS = (6, 12, 24, 48, 96)  # numbers of steps over one time span
 # log2 of spans over 48 h, down to where all differences are rounding error
 START_POWERS = (-2, -4, -7, -10, -14, -20)
-BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
-NEARBY_FACTORS = (
-    1 - 1e-3,
-    1 + 1e-3,
-)  # times a state: hardly changes what is smooth, but its roundings
-CLOSED_TOLERANCE = 1e3  # roundings of the energy: a balance is closed
-CONVERGED_CHANGE = 1e-3  # of the motion: two methods are compared where halving h changes no more
-DRAWS = 2  # of starts moved by a rounding
 
 
 class _End(Protocol):
@@ -98,7 +87,8 @@ class _Ladder:
         out. The order is a lower bound if the finer difference is mere rounding.
         """
         for a, b in pairwise(self.differences):
-            if NOISE_FACTOR * self.noise < a < MAX_DIFFERENCE:
+            # above 1e-2 of the motion, differences are not yet proportional to a power of h
+            if NOISE_FACTOR * self.noise < a < 1e-2:
                 yield math.log2(a / max(b, self.noise)), b > NOISE_FACTOR * self.noise
 
     @property
@@ -198,7 +188,7 @@ class Convergence:
         size = np.abs(np.array([s.q, s.qd])) + np.abs(there) * self.scale
         least = EPS * float(np.max(size / self.scale))
         random = np.random.default_rng(steps)
-        for _ in range(DRAWS):
+        for _ in range(2):
             by = random.choice([-EPS, EPS], size.shape) * size
             near = end(replace(s, q=s.q + by[0], qd=s.qd + by[1]), span=span, steps=steps)
             if near is not None:
@@ -237,7 +227,7 @@ class Convergence:
                 ladders[power] = self._ladder(at, end, 48 * self.h * 2.0**power)
             return ladders[power]
 
-        for power in FIRST_SPANS:
+        for power in (0, -1, 1, -2, 2):  # log2 of spans over 48 h
             if (one := ladder(power)) and not math.isnan(best := one.best(least)):
                 return best
         low = next((k for k in START_POWERS if (one := ladder(k)) and one.exact), START_POWERS[-1])
@@ -322,7 +312,7 @@ class Convergence:
                 continue
             one, two, far, other = (np.asarray(end) for end in ends)
             change = np.abs(two - one) + np.abs(other - far)
-            if float(np.max(change)) > CONVERGED_CHANGE:
+            if float(np.max(change)) > 1e-3:  # the methods have not converged
                 continue
             noise = self.noise(at, partial(self.end, method=method), span, 48, other)
             ratios.append(
@@ -362,7 +352,7 @@ class Convergence:
         power (order 0), or rounding within formulas, which differs near the state.
         """
         rest, closed = 0.0, False
-        for power in BALANCE_SPANS:
+        for power in (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11):  # log2 of spans over h
             gaps, exact = self._gaps(at, self.h * 2.0**power)
             if exact:
                 closed, rest = True, 0.0
@@ -384,7 +374,9 @@ class Convergence:
     def _gap_persists(self, at: Place, span: float, rest: float) -> bool:
         """Return whether the balance has the same residual near that state."""
         s = at.state
-        near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in NEARBY_FACTORS)
+        # a change by 1e-3 hardly changes smooth functions, but it changes their rounding errors
+        factors = (1 - 1e-3, 1 + 1e-3)
+        near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in factors)
         gaps = [self._gaps(x, span)[0][-1:] for x in near]
         return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in gaps)
 
@@ -403,7 +395,7 @@ class Convergence:
             names = ("kinetic_energy", "potential_energy")
             sizes = [np.abs(self.ask(name, states[i])) for name in names for i in (0, -1)]
             energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
-            if abs(gaps[-1]) <= CLOSED_TOLERANCE * EPS * energy:
+            if abs(gaps[-1]) <= 1e3 * EPS * energy:
                 return gaps, True
         return (gaps if np.all(np.isfinite(gaps)) else []), False
 
@@ -423,22 +415,17 @@ def _pick_order(
     return Measurement(math.inf) if known else Measurement(math.nan, why)
 
 
-NUDGE = 1e-6  # relative change at the start, from which growth is estimated
-# An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
-# limit is that of the motion as it is linear at one place, and the motion goes on from there.
-FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
-UNSTABLE_GROWTH = 1e3  # times what a difference grows by in fine steps: unstable
-MAX_END_ERROR = (
-    0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
-)
-SMALL_PERTURBATION = (
-    1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
-)
-MAX_EIGENVALUE_RATIO = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
-DIFFERENCE_STEP = 1e-5  # of the motion: differences of rates of rows, which are smooth
-ZERO_TOLERANCE = 1e-9  # of the largest singular value of a constraint's slopes: none
-MAX_PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
-MAX_PREDICTION_STEPS = 2000  # steps of the scene's h in which these lie
+# --- advised step sizes ---------------------------------------------------------------------------
+
+# Step sizes of the runs with which an advised h is compared, as multiples of that h. The advice is
+# for the motion linearised at one state, and the motion leaves that state.
+PARTS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
+UNSTABLE_GROWTH = 1e3  # growth of a difference, relative to that with fine steps: unstable
+MAX_END_ERROR = 0.1  # relative to the motion: a run with longer steps than advised is wrong
+# change of the initial state, relative to the motion; so small that it grows linearly with stiff
+# forces too
+SMALL_PERTURBATION = 1e-9
+ZERO_TOLERANCE = 1e-9  # relative to the largest singular value: smaller ones are 0
 
 
 class Advice:
@@ -475,14 +462,10 @@ class Advice:
         eigen = self._step_by_eigenvalues(method)
         ratio = max(longest / eigen, eigen / longest)
         unit = "times the eigenvalues' h; runs leave where it holds"
-        near = (
-            Measurement(ratio, unit=unit, limit=MAX_EIGENVALUE_RATIO)
-            if ratio <= MAX_EIGENVALUE_RATIO
-            else None
-        )
+        near = Measurement(ratio, unit=unit, limit=2) if ratio <= 2 else None
         if near and longest > self.duration:
             return near
-        fine, grown = self._ends(method, longest, FINE)
+        fine, grown = self._ends(method, longest, 1 / 64)
         if not math.isfinite(grown):
             return Measurement(math.inf, "the motion does not go on")
         failing = math.nan
@@ -503,8 +486,8 @@ class Advice:
         """
         start = self.start
         method = next(m for m in self.runs.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(MAX_PREDICTION_STEPS, math.ceil(self.duration / self.h))
-        every = max(1, steps * max(1, len(start.q) // 8) // MAX_PLACES)
+        steps = min(2000, math.ceil(self.duration / self.h))
+        every = max(1, steps * max(1, len(start.q) // 8) // 256)  # at most 256 states
         stiffest, longest = start, 1e3 * self.duration
         run = self.runs.run(start, method, steps=steps, every=every)
         for s in states_of_run(run, start):
@@ -540,18 +523,17 @@ class Advice:
         return message is not None
 
     def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """Return the scaled final state of a run over SPAN times `longest` seconds, and the growth.
+        """Return the scaled final state of a run over 8 times `longest` seconds, and the growth.
 
         The growth is the larger of that of a small difference of the initial state and of a tiny
         one, for which stiff forces, which are soon at their bounds, are linear.
         """
         s = self.stiffest_state
         signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
-        directions = self._constrained_directions(
-            s
-        )  # off the constraints there may be no start near singular positions
+        # near singular positions, a state off the constraints may have no projection
+        directions = self._constrained_directions(s)
         signs = (directions @ (directions.T @ signs.ravel())).reshape(signs.shape)
-        steps, ends = round(SPAN / part), []
+        steps, ends = round(8 / part), []
         for by in (0.0, NUDGE, SMALL_PERTURBATION):
             q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
             how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
@@ -616,9 +598,9 @@ class Advice:
                 evaluate_module(
                     self.runs.module, "constraint_rates", replace(s, q=s.q + by * far * direction)
                 )
-                for by in (DIFFERENCE_STEP, -DIFFERENCE_STEP)
+                for by in (1e-5, -1e-5)
             )
-            rates[:, k] = (next(ends) - next(ends)) / (2 * DIFFERENCE_STEP)
+            rates[:, k] = (next(ends) - next(ends)) / 2e-5
         follow = -np.linalg.pinv(A * fast, rcond=ZERO_TOLERANCE) @ rates
         whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
         return np.asarray(np.linalg.qr(whole)[0])

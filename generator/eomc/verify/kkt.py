@@ -18,14 +18,9 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-EIGENVALUE_TOLERANCE = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
-RANK_TOLERANCE = 1e-9  # of the largest singular value: a row that is none here
-MAX_ITERATIONS = 60  # sweeps of Newton's method
-NEARER = 200  # sweeps towards the nearest place
-RESIDUAL_TOLERANCE = 1e-10  # of the terms of a row: what it may still be
-CONVERGENCE_TOLERANCE = (
-    16 * 2.0**-52
-)  # of the state: what a correction may still be when it is rounding
+EIGENVALUE_TOLERANCE = 1e-6  # smaller eigenvalues of the scaled D may have either sign
+RANK_TOLERANCE = 1e-9  # relative to the largest singular value: a smaller one is zero
+CONVERGENCE_TOLERANCE = 16 * 2.0**-52  # relative size of a correction that is rounding only
 
 
 def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
@@ -163,7 +158,7 @@ def project_to_nearest(
     part, before = 1.0, np.inf
     if not last < 1e-10:
         return x, last
-    for _ in range(NEARER):
+    for _ in range(200):
         D, A, residual = rows(x)
         correction, _ = solve(D, A, np.zeros(len(q)), -(residual + A @ (q - x)))
         correction += q - x
@@ -190,16 +185,14 @@ def project(
     """
     D, A, residual = rows(q)
     last = np.inf
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(60):
         correction, _ = solve(D, A, np.zeros(len(q)), -residual)
         size = float(np.max(np.abs(correction) / (np.abs(q) + np.max(np.abs(q)) + 1), initial=0))
         if not np.isfinite(size):
             return q, np.inf
         if size <= CONVERGENCE_TOLERANCE or (size < 1e-12 and size > last / 2):
             level = np.abs(A) @ (np.abs(q) + np.max(np.abs(q)) + 1)
-            return q + correction, size if np.all(
-                np.abs(residual) <= RESIDUAL_TOLERANCE * level
-            ) else np.inf
+            return q + correction, size if np.all(np.abs(residual) <= 1e-10 * level) else np.inf
         last, part = size, 1.0
         weight = scales(D, A)[len(q) :]
         before = np.linalg.norm(weight * residual)

@@ -14,10 +14,8 @@ import numpy as np
 from eomc.integrators.tableaux import Method
 from eomc.verify.reference import Vector
 
-MAX_SWEEPS = 20  # over the stages of an implicit method: they are to contract to a seventh
-CONVERGENCE_TOLERANCE = 4 * 2.0**-52  # of a velocity: the stages are found
-STAGNATION_TOLERANCE = 1e-10  # the same, where corrections are rounding and get no smaller
-WIDTH = 1e-5  # of differences
+MAX_SWEEPS = 20  # iterations for the stages of an implicit method, with a contraction by 1/7
+CONVERGENCE_TOLERANCE = 4 * 2.0**-52  # relative change of the stages by the last iteration
 
 Acceleration = Callable[[Vector, Vector, Any], Vector]
 
@@ -54,7 +52,7 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
             change = float(np.max(np.abs(new - a)))
             size = np.abs(qd) / h + np.max(np.abs(new), axis=0)
             a = new
-            if not np.isfinite(change):  # a row has overflowed: others may be on their way
+            if not np.isfinite(change):  # one stage has overflowed, and others may follow
                 a[:] = np.nan
             if not change > CONVERGENCE_TOLERANCE * float(np.max(size)):
                 break
@@ -67,10 +65,10 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
     """Return the derivatives of the accelerations with respect to q and q̇ at one state, (nq, 2 nq).
 
     a: a function of q, q̇ and t that returns the accelerations. The derivatives are central
-    differences with steps of WIDTH times `scale` (2, nq), the typical sizes of q and q̇.
+    differences with steps of 1e-5 times `scale` (2, nq), the typical sizes of q and q̇.
     """
     n = len(q)
-    by = np.diag(WIDTH * np.ravel(scale))
+    by = np.diag(1e-5 * np.ravel(scale))
     moved = np.concatenate([by, -by]) + np.concatenate([q, qd])
     f = a(moved[:, :n], moved[:, n:], np.full(4 * n, t))
     return np.asarray(((f[: 2 * n] - f[2 * n :]) / (2 * np.diag(by)[:, None])).T)
@@ -119,7 +117,7 @@ def step_by_newton(
         change = float(np.max(np.abs(d)))
         size = np.max(np.abs(qd)) / h + np.max(np.abs(q)) / h**2 + np.max(np.abs(a))
         if change <= CONVERGENCE_TOLERANCE * float(size) or (
-            change <= STAGNATION_TOLERANCE * float(size) and change > last / 2
+            change <= 1e-10 * float(size) and change > last / 2  # rounding only
         ):
             ends = [q + h * qd + h**2 * b_a @ a, qd + h * b @ a]
             return np.array(ends), count

@@ -24,11 +24,9 @@ from eomc.scene.formulas import suggest
 from eomc.verify import kkt
 
 ROWS, RATES = ("D", "constraint_jacobian", "constraints"), "constraint_rates"
-MAX_CORRECTIONS = 12  # of a step, at most
-CORRECTION_TOLERANCE = 1e-8  # of a coordinate: a correction whose square is rounding
-# central differences of order 8 (Fornberg, 1988): at which multiples of a width, and their weights
+# multiples of the width, and weights, of central differences of order 8 (Fornberg, 1988)
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-DIFFERENCE_STEP = 0.02  # of a coordinate, in the differences of one
+DIFFERENCE_STEP = 0.02  # largest change of a coordinate in differences, m or rad
 
 Vector = NDArray[np.float64]
 Params = Mapping[str, Any] | None  # values in place of defaults
@@ -334,13 +332,14 @@ class ReferenceModel(ABC):
             q, qd = self._corrected(q[None], qd[None], t, values)
             return q[0], qd[0]
         ends = np.full((2, *q.shape), np.nan)
-        remaining = np.arange(len(q))  # those that are not there yet
+        remaining = np.arange(len(q))  # states that have not converged
         t, *each = (np.broadcast_to(x, len(q)) for x in (t, *values))
-        for _ in range(MAX_CORRECTIONS):
+        for _ in range(12):
             dq, dqd = self._correction(q, qd, t, tuple(each))
             q, qd = q + dq, qd + dqd
             size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
-            small = np.all(np.abs(dq) <= CORRECTION_TOLERANCE * size, axis=-1)
+            # the square of such a correction is rounding only
+            small = np.all(np.abs(dq) <= 1e-8 * size, axis=-1)
             ends[:, remaining[small]] = q[small], qd[small]
             going_on = ~small & np.all(np.isfinite(q), axis=-1)
             if not np.any(going_on):

@@ -23,22 +23,13 @@ from eomc.verify import kkt
 from eomc.verify.reference import ReferenceModel, Vector
 
 EPS = 2.0**-52
-CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
-MIN_SINGULAR_VALUE = 1e-6  # singular values of the scaled KKT matrix: the least of a state
-TINY = 1e-12  # the same, of a row without terms
-CONSTRAINT_TOLERANCE = 1e-9  # of the terms of a row: what it may be at a state, redundant rows too
-NUDGE = 1e-6  # relative change of an input from which its influence is estimated
-MAX_DISTANCE = 100.0  # of the spread: steps that lead further are not compared
-MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
-NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
-MAX_HALVINGS, CONVERGED_CHANGE = (
-    5,
-    0.1,
-)  # of steps ahead, until how far things go changes by so little
-FAR_FACTOR = 8.0  # times as far from the start, where a term that is small near it counts
-STICKING_SHARE = 1 / 2  # in so many states something does, of what may stick so much
-SLOW_FACTORS = (2.0**-6, 2.0**-10)  # times as fast
-DRAWS = 8  # how often: the influence is known to a quarter of itself
+NUDGE = 1e-6  # relative change of an input by which its influence is estimated
+MAX_DISTANCE = 100.0  # times the spread: steps that lead further are not compared
+MOST_NUDGES = 32  # number of inputs up to which each one is changed separately
+NOISE = 1e-12  # m or rad: smaller motions are rounding
+FAR_FACTOR = 8.0  # distance of far states, relative to that of other random states
+STICKING_SHARE = 1 / 2  # probability that something sticks, and that each such coordinate does
+DRAWS = 8  # number of random changes of all inputs: estimates the influence to 25 %
 
 
 @dataclass(frozen=True)
@@ -258,12 +249,12 @@ class Sampler:
             with np.errstate(all="ignore"):
                 q[1], qd[1] = self.reference.project(q[1], qd[1], nearest=False)
         ranges = np.full((2, *q.shape), math.inf)
-        for part in (2**k for k in range(MAX_HALVINGS + 1)):
+        for part in (2**k for k in range(6)):
             before = ranges
             with np.errstate(all="ignore"):
                 _, *x = self.reference.simulate(q, qd, h=h / part, steps=steps * part)
                 ranges = np.array([np.max(np.abs(y), axis=0) for y in x])
-                if np.all(np.abs(ranges - before) <= CONVERGED_CHANGE * ranges + NOISE):
+                if np.all(np.abs(ranges - before) <= 0.1 * ranges + NOISE):
                     break
         return np.asarray(np.max(np.nan_to_num(ranges, posinf=0), axis=1))
 
@@ -305,7 +296,9 @@ class Sampler:
         q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / self.scale)
         q[self.discrete] = drawn[0].q[self.discrete]
         states = [replace(drawn[0], q=q, qd=qd)]
-        states += [replace(s, qd=p * s.qd) for s, p in zip(drawn[1:], SLOW_FACTORS, strict=False)]
+        states += [
+            replace(s, qd=p * s.qd) for s, p in zip(drawn[1:], (2.0**-6, 2.0**-10), strict=False)
+        ]
         return [e for state in states if (e := self.regular_expected(self.project(state)))]
 
     def far_states(self) -> list[Expected]:
@@ -393,7 +386,7 @@ class Sampler:
             self.value_and_size(partial(self.reference.evaluate, name), projected)
             for name in ("constraints", "constraint_rates")
         ]
-        holds = all(np.all(np.abs(off) <= CONSTRAINT_TOLERANCE * size + TINY) for off, size in rows)
+        holds = all(np.all(np.abs(off) <= 1e-9 * size + 1e-12) for off, size in rows)
         if holds and not self.wrong_rotations(projected):
             return projected
         return replace(s, q=np.full_like(q, np.nan), qd=np.full_like(q, np.nan))
@@ -433,7 +426,7 @@ class Sampler:
             A = self.rows("constraint_jacobian", s)
             off = self.reference.switched & ~np.any(A, axis=1)
             weighted = bool(self.system.closure and self.system.closure.weights)
-            return kkt.is_regular(D, A[~off], MIN_SINGULAR_VALUE) and kkt.is_nonnegative(
+            return kkt.is_regular(D, A[~off], 1e-6) and kkt.is_nonnegative(
                 D, A[~off] if weighted else A[:0]
             )
         diagonal = np.abs(np.diag(D))
@@ -441,7 +434,7 @@ class Sampler:
             return False
         eigenvalues = np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))
         least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
-        return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
+        return bool(least * 1e8 > most and (s.params is None or eigenvalues[0] > 0))
 
     def regular_expected(self, s: State) -> Expected | None:
         """Return the reference's values and sizes at a state; None if D is not regular there."""

@@ -36,7 +36,7 @@ from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
 from eomc.verify.reference import SCALARS, ReferenceModel, Values, Vector
 
-BLOCK = 2**16  # entries of (nq, nq) matrices, of so many states at once: what caches hold
+BLOCK = 2**16  # entries of the (nq, nq) matrices of all states evaluated at once, for the cache
 
 Jet = dict[str, Any]  # value and derivatives, rows by states; what is zero is left out
 Fields = frozenset[str]

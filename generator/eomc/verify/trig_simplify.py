@@ -16,8 +16,6 @@ from sympy import Expr, Symbol, cos, sin
 from sympy.polys.polyerrors import PolynomialError
 from sympy.polys.rings import PolyElement, sring
 
-MAX_CANDIDATES = 4  # forms, the shortest of some, whose common factors are taken out
-MAX_TERMS = 400  # terms of a polynomial, beyond which it stays as it is
 _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the generators
 
 
@@ -71,7 +69,7 @@ def _coefficient(e: Expr) -> Expr:
         ring, polynomial = sring(e)
     except (PolynomialError, sympy.CoercionFailed):
         return e
-    if len(polynomial) > MAX_TERMS:
+    if len(polynomial) > 400:  # too expensive
         return e
     waves = [g for g in ring.symbols if isinstance(g, (sin, cos))]
     angles: _Angles = {g.args[0]: [sin(g.args[0]), cos(g.args[0])] for g in waves}
@@ -84,7 +82,7 @@ def _coefficient(e: Expr) -> Expr:
         forms += [sums, *_double_angles_as_squares(sums)]
         if len(angles) > 1:
             forms += [_sums(fewest, True)]
-    shortest = _ranked(forms)[:MAX_CANDIDATES]
+    shortest = _ranked(forms)[:4]
     return _ranked(shortest + [_factored(form) for form in shortest])[0]
 
 
