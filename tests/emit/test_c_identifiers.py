@@ -24,6 +24,7 @@ from eomc.base import names
 from eomc.derive import lagrange
 from eomc.emit import c_names
 from eomc.model import from_scene as system
+from eomc.model.symbols import Coordinate
 from eomc.program import program
 from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
@@ -70,8 +71,10 @@ def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
     used = {m: c_names.name_in_c(m, "scene") for m in accepted}
     assert {m for m, c in used.items() if c in macros()} == set()
     # and what is made of names
-    made = ("sin_{}", "cos_{}", "{}_dot", "{}_ddot", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
+    made = ("sin_{}", "cos_{}", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
     derived = {m.format(c, c) for m in made for c in used.values()}
+    coordinates = [Coordinate(c) for c in used.values()]
+    derived |= {x.name for c in coordinates for x in (c.qd, c.qdd)}
     assert derived & macros() == set()
 
 
@@ -253,7 +256,7 @@ kinetic = "I*theta_dot**2/2"
 
 
 def test_accelerations_are_renamed_with_their_coordinates() -> None:
-    """`small` may be a macro: C calls it small_, and its acceleration as well."""
+    """`small` may be a macro: C calls it small_; its acceleration keeps its name."""
     text = """eomc = 1
 name = "one"
 [coordinates]
@@ -266,7 +269,8 @@ a = "small_ddot*small"
 inverse_dynamics = true
 """
     source = eomc.sources(system.from_scene(scene.parse(text, "one.toml"))).files["one.c"]
-    assert "small__ddot" in source and not re.search(r"\bsmall_ddot\b", source)
+    assert "SMALL" in source and re.search(r"\bsmall_ddot\b", source)
+    assert re.search(r"\bsmall_\b", source) and not re.search(r"\bsmall\b", source)
 
 
 def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
@@ -296,3 +300,91 @@ turn = "A*phi_dot - lack_dot"
 """
     write(tmp_path, made(text))
     compiled(tmp_path, "scene", "-Werror=shadow")
+
+
+MECHANISM = """eomc = 1
+name = "robot"
+gravity = [0, -9.81]
+[coordinates]
+PREFIX_lift = { unit = "rad", start = 0.2, rate = 1, note = "of the arm" }
+PREFIX_bend = { start = 0.1 }
+[parameters]
+PREFIX_mass = 2
+above = 0.5
+[inputs]
+PREFIX_lift_torque = { signal = "sin(t)" }
+[[body]]
+name = "upper"
+joint = "revolute"
+coordinates = "PREFIX_lift"
+mass = "PREFIX_mass"
+center = [0.5, 0]
+actuator = "PREFIX_lift_torque"
+[[body]]
+name = "lower"
+parent = "upper"
+joint = "revolute"
+coordinates = "PREFIX_bend"
+offset = [1, 0]
+mass = 1
+center = [0.3, 0]
+friction = 0.2
+[[event]]
+name = "stop"
+when = "PREFIX_lift - above"
+action = "jump"
+PREFIX_lift_dot = "-PREFIX_lift_dot"
+above = "above + 0.1"
+[run]
+tolerance = 1e-9
+friction = "stick"
+batch = true
+"""
+
+
+def code_of(text: str) -> dict[str, str]:
+    """The C files of a scene without comments, strings, stamps and white space.
+
+    Enumerators of events and constraints keep the full names of joints; here they are shortened.
+    """
+    files = {f: c for f, c in made(text).items() if f.endswith((".c", ".h"))}
+    ignored = r"/\*.*?\*/|\"[^\"\n]*\"|0x[0-9a-f]{8}u|\s+|(?<=EVENT_|RAINT_)(LEFT_ARM|ROBOT)_"
+    return {f: re.sub(ignored, "", c, flags=re.DOTALL) for f, c in files.items()}
+
+
+@pytest.mark.parametrize("prefix", ["robot_", "left_arm_"])
+def test_a_prefix_that_all_coordinates_of_a_mechanism_share_is_left_out_in_c(prefix: str) -> None:
+    text = MECHANISM.replace("PREFIX_", prefix)
+    assert code_of(text) == code_of(MECHANISM.replace("PREFIX_", ""))
+    header = made(text)["robot.h"]
+    assert f"ROBOT_LIFT, /* {prefix}lift, rad, of the arm */" in header
+    assert f"ROBOT_LIFT_TORQUE, /* {prefix}lift_torque */" in header
+    assert f"double mass; /* {prefix}mass */" in header
+    assert f"{prefix}lift" in made(text)["__init__.py"]
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ("PREFIX_bend", "other_bend"),  # a coordinate without the prefix
+        ("PREFIX_bend", "PREFIX_2"),  # no name remains
+        ("PREFIX_bend", "PREFIX_I"),  # a macro remains
+        ("above", "lift"),  # the name is in use
+    ],
+)
+def test_a_prefix_stays_where_names_without_it_would_not_serve(old: str, new: str) -> None:
+    text = MECHANISM.replace(old, new).replace("PREFIX_", "arm_")
+    assert "ROBOT_ARM_LIFT," in made(text)["robot.h"]
+
+
+def test_no_identifier_has_two_underscores_in_a_row() -> None:
+    """Such names are reserved in C++; those of compilers have two at their start."""
+    names_of_macros = "small NAN I".split()
+    texts = (MECHANISM.replace("PREFIX_", "robot_"),
+             of_names("coordinates", names_of_macros, RUNS["batch"]),
+             of_names("inputs", names_of_macros, RUNS["implicit"]))  # fmt: skip
+    for text in texts:
+        for file, content in made(text).items():
+            if file.endswith((".c", ".h")):
+                found = {i for i in identifiers(content) if "__" in i.lstrip("_")}
+                assert {i for i in found if not i.startswith("__")} == set(), file

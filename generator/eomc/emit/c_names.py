@@ -2,23 +2,25 @@
 
 Names of a scene become struct members, enumerators and local variables next to the definitions of
 the C library, Python.h and users' headers. Names that may be macros get a trailing "_", which no
-scene name has, and the header lists them. Python keeps the author's names.
+scene name has, and the header lists them. If all coordinates of a mechanism share a prefix, as
+those of an imported robot often do, C leaves it out. Python keeps the author's names.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import takewhile
 
 from sympy import Symbol
 
-from eomc.base.names import MATHEMATICS
+from eomc.base.names import MATHEMATICS, fault
 from eomc.derive.frames import wrenches
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import CBody, CContext, Real
-from eomc.model.symbols import ALONG
+from eomc.model.symbols import ALONG, add_suffix
 from eomc.model.system import System
 from eomc.program.ir import Call, Function, rename
 from eomc.program.program import TIME, Program
@@ -59,6 +61,11 @@ class Target:
         `name` is its C name, which may have "_" appended.
         """
         return self.written.get(name, name)
+
+    def full_name(self, name: str) -> str:
+        """Return the scene's name for a C name without the shared prefix, else ""."""
+        scene_name = self.scene_name(name)
+        return "" if scene_name == name.rstrip("_") else scene_name
 
     @property
     def system(self) -> System:
@@ -221,9 +228,10 @@ class Target:
         read += [(w.name, f"wrenches[{k}]") for k, w in enumerate(self.wrenches)]
         read += [(x, f"lambda[{k}]") for k, x in enumerate(self.multipliers)]
         read += [(name, inputs("u", name)) for name in self.input_names]
-        read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
-        read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
-        read += [(name + ALONG, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
+        read += [(add_suffix(c.q.name, ALONG), state("along", c.name)) for c in s.coordinates]
+        along = [(c.qd.name, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
+        along += [(name, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
+        read += [(add_suffix(name, ALONG), element) for name, element in along]
         return [
             c_function.define_constant(real, local_name(name), element)
             for name, element in read
@@ -253,7 +261,7 @@ class Target:
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),
-            "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
+            "along": frozenset(add_suffix(x.name, ALONG) for x in (*s.q, *s.qd, *s.u)),
         }
 
 
@@ -353,12 +361,13 @@ def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
     system = program.system
     declared = [c.name for c in system.coordinates]
     declared += [p.name for p in system.parameters] + [i.name for i in system.inputs]
-    c_names = {name: name_in_c(name, system.name) for name in declared}
+    short = _short_names(program)
+    c_names = {name: short.get(name) or name_in_c(name, system.name) for name in declared}
     renamed_to = {name: c_name for name, c_name in c_names.items() if c_name != name}
     new = dict(_derived(renamed_to))
     for function in program.functions.values():
         for a in (*function.early, *function.body):
-            if (c_name := name_in_c(a.name, system.name)) != a.name:
+            if (c_name := short.get(a.name) or name_in_c(a.name, system.name)) != a.name:
                 new.setdefault(a.name, c_name)
     if not new:
         return program, {}
@@ -367,7 +376,7 @@ def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
         coordinates=tuple(replace(c, name=c_names[c.name]) for c in system.coordinates),
         parameters=tuple(replace(p, name=c_names[p.name]) for p in system.parameters),
         inputs=tuple(replace(i, name=c_names[i.name]) for i in system.inputs),
-        renamed=(*system.renamed, *renamed_to.items()),
+        renamed=(*system.renamed, *(x for x in renamed_to.items() if x[0] not in short)),
     )
     functions = {name: rename(f, new) for name, f in program.functions.items()}
     written = {c_name: name for name, c_name in renamed_to.items()}
@@ -377,6 +386,54 @@ def rename_for_c(program: Program) -> tuple[Program, Mapping[str, str]]:
 def _derived(renamed_to: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Yield the pairs of names, also for velocities, accelerations and directions."""
     for name, c_name in renamed_to.items():
-        for ending in ("", "_dot", "_ddot"):
-            yield name + ending, c_name + ending
-            yield name + ending + ALONG, c_name + ending + ALONG
+        yield name, c_name
+        yield name + ALONG, add_suffix(c_name, ALONG)
+        for ending in ("_dot", "_ddot"):
+            yield name + ending, add_suffix(c_name, ending)
+            yield name + ending + ALONG, add_suffix(c_name, ending + ALONG)
+
+
+def _short_names(program: Program) -> dict[str, str]:
+    """Return C names without the prefix that all coordinates of a mechanism share, by full name.
+
+    A mechanism is a system with bodies. The names are those of coordinates, parameters, inputs and
+    of values such as `cos_panda_joint1`, where the prefix stands before the name of a coordinate.
+    The result is empty if there is no such prefix or if a name without it could not stay as it is.
+    """
+    system = program.system
+    own = [c.name for c in system.coordinates if c.name not in system.discrete]
+    prefix = _shared_prefix(own)
+    if not system.tree or not prefix:
+        return {}
+    declared = [*own, *(p.name for p in system.parameters), *(i.name for i in system.inputs)]
+    declared = [name for name in declared if name.startswith(prefix)]
+    functions = program.functions.values()
+    values = {a.name for f in functions for a in (*f.early, *f.body)}
+    others = {e.name for e in (*system.outputs, *system.events, *system.constraints)}
+    others |= {f.name for f in system.output_frames} | values | set(system.names)
+    short = {name: name.removeprefix(prefix) for name in declared}
+    if any(_is_taken(new, system, others) for new in short.values()):
+        return {}
+    ends = "|".join(sorted(short.values(), key=len, reverse=True))
+    part = re.compile(rf"(?<![A-Za-z0-9]){prefix}(?=(?:{ends})(?![A-Za-z0-9]))")
+    for name in values - set(system.names):
+        new = part.sub("", name)
+        if new != name and new not in others and name_in_c(new, system.name) == new:
+            others.add(new)
+            short[name] = new
+    return short
+
+
+def _shared_prefix(names: Sequence[str]) -> str:
+    """Return the first words that two or more names share, each followed by "_"; "" if none."""
+    if len(names) < 2:
+        return ""
+    columns = zip(*(name.split("_")[:-1] for name in names), strict=False)
+    shared = takewhile(lambda words: len(set(words)) == 1, columns)
+    return "".join(f"{words[0]}_" for words in shared)
+
+
+def _is_taken(new: str, system: System, others: set[str]) -> bool:
+    """Return True if `new` cannot be a C name: not valid, a likely macro, or in use otherwise."""
+    derived = {new, *(new + ending for ending in ("_dot", "_ddot"))}
+    return fault(new) is not None or name_in_c(new, system.name) != new or bool(derived & others)

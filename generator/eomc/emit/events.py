@@ -24,11 +24,11 @@ from eomc.emit.adaptive import (
     step_view,
 )
 from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.c_names import Target
 from eomc.emit.coefficients import literals, matrix_rows
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.views import NameFields
 from eomc.integrators.tableaux import Row
-from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
 
 SAMPLES = 9  # values of an event function in a step
@@ -317,7 +317,7 @@ def _event_view(stepping: AdaptiveFunctions) -> EventsView:
         jump=evaluated[-1].call(**reached) if jumps else "",
         project=public.project.call(fixed="set[k]", **reached) if stepping.form.project else "",
         project_all=public.project.call(fixed="0", **reached) if stepping.form.project else "",
-        set=_jump_flags(system) if stepping.form.project and jumps else (),
+        set=_jump_flags(functions.target) if stepping.form.project and jumps else (),
         modes=c.initialiser_rows([str(m.at), str(m.of)] for m in system.modes),
         own=len(system.own_events),
         values_after=values.call(events="value", **reached),
@@ -339,10 +339,11 @@ def _rounding(stepping: AdaptiveFunctions, extra: Sequence[CArgument]) -> dict[s
     return {"rounding": function, "rounded": function.call(), "values_near": values}
 
 
-def _jump_flags(system: System) -> tuple[str, ...]:
+def _jump_flags(target: Target) -> tuple[str, ...]:
     """Return, for each event of the scene, flags in braces: the entries of [q, qd] that jump."""
-    states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
-    rows = ({name for name, _ in e.jump} for e in system.own_events)
+    coordinates = [target.scene_name(c.name) for c in target.system.coordinates]
+    states = [name + end for end in ("", "_dot") for name in coordinates]
+    rows = ({name for name, _ in e.jump} for e in target.system.own_events)
     return c.initialiser_rows([str(int(name in names)) for name in states] for names in rows)
 
 

@@ -538,11 +538,13 @@ class SceneFunctions:
         return GeneratedFunction(result, parts, values)
 
 
-def portable_functions(program: Program, real: Real | None = None) -> SceneFunctions:
+def portable_functions(
+    program: Program, real: Real | None = None, written: Mapping[str, str] | None = None
+) -> SceneFunctions:
     """Return the C functions of a program in portable form, which uses sin and cos of libm.
 
-    real: C type of the numbers; None for the type that the scene specifies.
+    real: C type of the numbers; None for the type that the scene specifies. written: names in the
+    scene of names that differ in C, see `Target`.
     """
-    return SceneFunctions(
-        Target(program, replace(real or REALS[program.system.run.real], reach=0.0))
-    )
+    real = replace(real or REALS[program.system.run.real], reach=0.0)
+    return SceneFunctions(Target(program, real, written or {}))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, sqrt
 from typing import ClassVar
@@ -225,13 +225,18 @@ class PortableRunsView(NameFields):
     run_one: str
 
 
-def files(program: Program, show: Show, real: Real | None = None) -> dict[str, str]:
+def files(
+    program: Program,
+    show: Show,
+    real: Real | None = None,
+    written: Mapping[str, str] | None = None,
+) -> dict[str, str]:
     """Return the header and the source of a program in portable C, as texts by file name.
 
     show: function that renders template data as text. real: the C type of numbers; by default that
-    of the scene.
+    of the scene. written: names in the scene of names that differ in C.
     """
-    functions = portable_functions(program, real)
+    functions = portable_functions(program, real, written)
     name = functions.prefix
     methods = [METHODS[m] for m in functions.target.system.run.methods]
     loops = [runs_view(functions, m) for m in methods]

@@ -127,7 +127,7 @@ def render(program: Program, extension: str) -> Sources:
     return Sources(
         name=name,
         files={
-            **portable.files(program, show),
+            **portable.files(program, show, written=written),
             **{f"{FAST}/{file}": text for file, text in optimised.files(methods, show).items()},
             "main.c": break_comments(show(embedding.main_view(target))),
             "selftest.c": break_comments(show(selftest.selftest_view(target))),

@@ -23,7 +23,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.public import KINDS, Public, refuses
 from eomc.emit.views import stamp
 from eomc.integrators.tableaux import DP8, METHODS, Method
-from eomc.model.symbols import ALONG
+from eomc.model.symbols import ALONG, add_suffix
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.outline import weight
 from eomc.program.program import TIME
@@ -313,10 +313,11 @@ class _Cases:
         vector, and column k is the product with unit vector k. `values` are the arguments by name.
         """
         names = [x.name for x in (*self.system.q, *self.system.qd, *self.system.u)]
-        zero = {f"{n}{ALONG}": 0.0 for n in names}
+        zero = {add_suffix(n, ALONG): 0.0 for n in names}
         own = names if name == "linearization" else names[: self.nq]
         columns = [
-            self.evaluate(f"{name}_column", {**values, **zero, f"{n}{ALONG}": 1.0}) for n in own
+            self.evaluate(f"{name}_column", {**values, **zero, add_suffix(n, ALONG): 1.0})
+            for n in own
         ]
         rows = [list(row) for row in zip(*columns, strict=True)]
         return (

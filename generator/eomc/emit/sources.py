@@ -289,19 +289,26 @@ def enumerators(
     items: coordinates, inputs, outputs, constraints or events. prefix: "OUT_", "EVENT_" or
     "CONSTRAINT_", which `Target.enum` adds to the names of such items.
     """
-    enum = functions.target.enum
+    target = functions.target
     return tuple(
-        Enumerator(enum[prefix + x.name], views.unit_and_note(x.unit, x.note)) for x in items
+        Enumerator(
+            target.enum[prefix + x.name],
+            views.unit_and_note(x.unit, x.note, target.full_name(x.name)),
+        )
+        for x in items
     )
 
 
 def parameter_members(functions: SceneFunctions) -> tuple[ParameterMember, ...]:
     """Return C name, default value (C literal) and comment (unit and note) of each parameter."""
+    target = functions.target
     return tuple(
         ParameterMember(
-            p.name, functions.target.literal(p.value), views.unit_and_note(p.unit, p.note)
+            p.name,
+            target.literal(p.value),
+            views.unit_and_note(p.unit, p.note, target.full_name(p.name)),
         )
-        for p in functions.target.system.parameters
+        for p in target.system.parameters
     )
 
 

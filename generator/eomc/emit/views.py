@@ -92,9 +92,12 @@ def description(target: Target) -> list[FreeText]:
     return list(map(FreeText, lines))
 
 
-def unit_and_note(unit: str, note: str) -> FreeText:
-    """Return a comment with the unit and the note of a coordinate, input or parameter."""
-    return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
+def unit_and_note(unit: str, note: str, full_name: str = "") -> FreeText:
+    """Return a comment with the unit and the note of a coordinate, input or parameter.
+
+    full_name: name in the scene if the C name is a part of it; the comment begins with it.
+    """
+    return FreeText(", ".join(t for t in (full_name, line(unit), flat(note)) if t))
 
 
 def solution_method(target: Target) -> list[str]:

@@ -14,8 +14,17 @@ t = Symbol("t", real=True)
 
 # suffix of the component of a direction along a variable; users' names do not end in it
 ALONG = "_along_"
+
 MULTIPLIER = "_lambda_"  # suffix of a constraint's Lagrange multiplier
 PARTS = ("_lack_", "_pivot_")  # suffixes of the numerator and denominator of a multiplier
+
+
+def add_suffix(name: str, suffix: str) -> str:
+    """Return `name` with a suffix such as "_dot", without two underscores in a row.
+
+    Names in C may end in an underscore: the velocity of `I_` is `I_dot`.
+    """
+    return name.rstrip("_") + suffix
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
@@ -96,12 +105,12 @@ class Coordinate:
     @property
     def qd(self) -> Symbol:
         """The symbol of the velocity, `<name>_dot`."""
-        return symbol(f"{self.name}_dot")
+        return symbol(add_suffix(self.name, "_dot"))
 
     @property
     def qdd(self) -> Symbol:
         """The symbol of the acceleration, `<name>_ddot`, which occurs in outputs only."""
-        return symbol(f"{self.name}_ddot")
+        return symbol(add_suffix(self.name, "_ddot"))
 
 
 @dataclass(frozen=True)

@@ -277,5 +277,5 @@ def nearby(system: System, k: int) -> dict[str, float]:
             float(f"{c.start + 0.37 * k * math.sin(1.0 + i + 2.3 * k):.6g}") if k else c.start
         )
         rate = c.rate + 0.53 * k * math.cos(0.7 + i + 1.9 * k)
-        out[f"{c.name}_dot"] = float(f"{rate:.6g}") if k else c.rate
+        out[c.qd.name] = float(f"{rate:.6g}") if k else c.rate
     return out

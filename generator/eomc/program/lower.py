@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -182,10 +183,12 @@ def _renamed(function: Function, hints: Mapping[str, str], reserved: frozenset[s
     used_names = {*function.uses, *reserved}
 
     def assign_name(name: str, preferred: str) -> None:
-        """Give a value the preferred name, with underscores appended until it is unused."""
-        name_ = preferred
+        """Give a value the preferred name, with "_", "_2", "_3", ... appended if it is in use."""
+        preferred = re.sub("__+", "_", preferred)
+        stem, name_, number = preferred.rstrip("_"), preferred, 1
         while name_ in used_names:
-            name_ += "_"
+            name_ = f"{stem}_{number}" if number > 1 else f"{stem}_"
+            number += 1
         used_names.add(name_)
         assigned[name] = name_
 

@@ -199,7 +199,8 @@ def render_unit(program: Program, version: int, show: Show) -> Unit:
             files["sources/buildDescription.xml"] = show(BuildDescriptionView(name, sources))
         return files | texts
 
-    texts = {f"sources/{file}": text for file, text in portable.files(safe, show).items()}
+    portable_files = portable.files(safe, show, written=written)
+    texts = {f"sources/{file}": text for file, text in portable_files.items()}
     texts |= {
         f"sources/fmi/{file}": resources.text("csrc", f"fmi/{file}")
         for file in (*_HEADERS[version], f"fmi{version}.c", "both.h", "unit.h")
