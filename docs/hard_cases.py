@@ -63,7 +63,7 @@ def best(name: str) -> Best | None:
     case = cases()[name]
     system = case_system(name)
     methods = tuple(m.name for m in METHODS.values() if m.order >= LEAST_ORDER)
-    module, _ = cost_of_digits.variant(system, methods, ROOT / "build" / "hard_cases")
+    module, _ = cost_of_digits.build_variant(system, methods, ROOT / "build" / "hard_cases")
     runs = [run for method in module.methods for run in _runs(module, method, case)]
     if not runs:
         return None

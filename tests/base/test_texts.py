@@ -341,7 +341,7 @@ def test_systems_made_in_python(given: str) -> None:
     ours = {"begin", "end", "ddot", "dot", "frac", "left", "mathrm", "quad", "right"}
     # names only, and those are plain
     assert {*re.findall(r"\\([A-Za-z]+)", latex)} <= ours and not re.search("[$#%]", latex)
-    for shown in (text, latex, equations_text.cost(made)):
+    for shown in (text, latex, equations_text.write_costs(made)):
         assert not RAW.search(shown)
 
 

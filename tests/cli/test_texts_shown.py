@@ -75,9 +75,9 @@ def test_the_page_of_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     measured = cost_of_digits.measure(
         derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8")
     )
-    plain = Tags(page.page(replace(measured, title="plain"))).seen
+    plain = Tags(page.write_page(replace(measured, title="plain"))).seen
     for name, given in PAYLOADS.items():
-        text = page.page(replace(measured, title=given))
+        text = page.write_page(replace(measured, title=given))
         assert not RAW.search(text), name
         read = Tags(text)
         assert read.seen == plain, name

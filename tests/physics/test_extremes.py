@@ -43,7 +43,7 @@ potential = "-m*mu/r"
 
 @cache
 def with_methods(text: str, *methods: str) -> ModuleType:
-    module, skipped = cost_of_digits.variant(
+    module, skipped = cost_of_digits.build_variant(
         from_scene(parse(text, "extreme.toml")), methods, BUILDS
     )
     assert not skipped

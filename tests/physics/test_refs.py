@@ -155,7 +155,7 @@ def compiled(name: str) -> ModuleType:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O1")  # it is the compiling that takes the time here
         methods = dict.fromkeys(("rk4", BEST[name][0] if name in BEST else "rk4"))
-        module, skipped = cost_of_digits.variant(case_system(name), tuple(methods), CASES)
+        module, skipped = cost_of_digits.build_variant(case_system(name), tuple(methods), CASES)
     assert not skipped
     return module
 

@@ -16,7 +16,7 @@ from eomc.base.errors import EomcError
 from eomc.report import animation
 from eomc.report.drawing import draw_mechanism
 from eomc.report.style import html_name
-from eomc.report.timeline import Timeline, instance_numbers, select_instances, system_of
+from eomc.report.timeline import Timeline, choose_instances, find_system, select_instances
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
@@ -142,7 +142,7 @@ def test_names_are_set_as_in_print():
 
 def test_a_loaded_module_knows_its_scene(modules, tmp_path):
     run = modules("cartpole").simulate(duration=1.0, params={"l": 1.0})
-    assert system_of(run).with_parameters({}).parameters[2].value == 1.0
+    assert find_system(run).with_parameters({}).parameters[2].value == 1.0
     made = run.animate(tmp_path / "a.html", run, title="Two")
     text = (tmp_path / "a.html").read_text()
     assert text == made.page and "<h1>Two</h1>" in text and text.count('class="stage"') == 2
@@ -209,7 +209,7 @@ def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
     assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
-    fifth = system_of(batch).with_parameters({"l": batch._params[4, 2]})
+    fifth = find_system(batch).with_parameters({"l": batch._params[4, 2]})
     alone = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
     path = alone.points[:, alone.paths[0].point]
@@ -246,8 +246,8 @@ def test_instances_that_are_not_there_are_named(batch, wrong):
 
 def test_too_many_instances_and_unknown_curves_are_refused():
     with pytest.raises(EomcError, match="at most 24 can be told apart, here 25"):
-        instance_numbers(100, 25)
-    assert instance_numbers(3, 24) == [0, 1, 2] and instance_numbers(3, np.array([2, 2])) == [2]
+        choose_instances(100, 25)
+    assert choose_instances(3, 24) == [0, 1, 2] and choose_instances(3, np.array([2, 2])) == [2]
 
 
 def test_unknown_curves_of_a_batch_are_refused(batch):

@@ -12,7 +12,7 @@ import pytest
 from report.pictures import chain, humanoid, motion, scene, system
 
 from eomc.report import animation
-from eomc.report.timeline import BatchTimeline, Timeline, system_of
+from eomc.report.timeline import BatchTimeline, Timeline, find_system
 
 pytestmark = [
     pytest.mark.slow,
@@ -184,7 +184,7 @@ def poles(count):
     module = batches.module("cartpole")
     q0 = np.column_stack([0.1 * np.arange(count), np.linspace(0.5, 3.0, count)])
     runs = module.simulate_batch(q0, steps=400)
-    return [BatchTimeline(system_of(runs), runs, (), count)]
+    return [BatchTimeline(find_system(runs), runs, (), count)]
 
 
 def test_instances_of_a_batch_move_in_their_own_colours(opened):

@@ -160,8 +160,8 @@ def test_adaptive_steps_stand_beside_fixed_ones(tmp_path: Path) -> None:
     assert found is not None and found.adaptive
     words = page.recommendation(r, 12)
     assert words.startswith(f"for 12 digits up to t = 4 s: adaptive steps with tol = {found.tol:g}")
-    assert page.rows(r)[1][-3] == f"tol {min(line.points, key=lambda p: p.along).tol:g}"
-    assert "Error against tolerance" in page.page(r)
+    assert page.stepper_rows(r)[1][-3] == f"tol {min(line.points, key=lambda p: p.along).tol:g}"
+    assert "Error against tolerance" in page.write_page(r)
     assert json.loads(json.dumps(page.as_dict(r), allow_nan=False))["lines"][0]["points"][0][
         "tol"
     ] is None  # fmt: skip
@@ -215,14 +215,14 @@ class _Page(HTMLParser):
 @pytest.mark.slow
 def test_the_page_is_one_file_with_its_pictures() -> None:
     pytest.importorskip("matplotlib")
-    text = page.page(measured())
+    text = page.write_page(measured())
     read = _Page()
     read.feed(text)
     assert read.tags.count("svg") == 3 and "script" not in read.tags
     assert all(link.startswith("#") for link in read.links)  # nothing from outside
     for words in page.recommendations(measured()):
         assert words in text
-    assert text == page.page(measured())
+    assert text == page.write_page(measured())
 
 
 def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
@@ -248,7 +248,7 @@ def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
 @pytest.mark.slow
 def test_names_are_escaped_on_the_page() -> None:
     pytest.importorskip("matplotlib")
-    text = page.page(replace(measured(), title="<script>"))
+    text = page.write_page(replace(measured(), title="<script>"))
     assert "<script>" not in text and "&lt;script&gt;" in text
 
 
@@ -345,10 +345,10 @@ def test_a_stepper_that_a_scene_can_not_use_is_reported(
 
     plain = pipeline.sources
     monkeypatch.setattr(pipeline, "sources", sources)
-    module, skipped = cost_of_digits.variant(oscillator(), ("rk4", "dp8"), tmp_path)
+    module, skipped = cost_of_digits.build_variant(oscillator(), ("rk4", "dp8"), tmp_path)
     assert module.methods == ("dp8",) and skipped == {"rk4": "rk4 is refused here"}
     with pytest.raises(EomcError, match="no stepper can be used: rk4 is refused here"):
-        cost_of_digits.variant(oscillator(), ("rk4",), tmp_path)
+        cost_of_digits.build_variant(oscillator(), ("rk4",), tmp_path)
 
 
 def test_progress_begins_before_the_reference_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,7 +70,7 @@ def system() -> System:
 def made() -> str:
     needs("gcc")
     report = cost_of_digits.measure(system(), REPORTS, longest=0.005, methods=("rk4", "dp8"))
-    return page.page(report, overview.describe_scene(system(), report, REPORTS))
+    return page.write_page(report, overview.describe_scene(system(), report, REPORTS))
 
 
 def test_equations_become_mathml() -> None:
@@ -121,7 +121,7 @@ def test_a_scene_too_large_to_write_out_says_how_it_is_computed(
     report = cost_of_digits.measure(chain, REPORTS, longest=0.002, methods=("rk4",))
     about = overview.describe_scene(chain, report, REPORTS)
     assert not about.equations and "link2 on link1: turns about z" in about.text
-    assert '<pre tabindex="0">Chain of links' in page.page(report, about)
+    assert '<pre tabindex="0">Chain of links' in page.write_page(report, about)
 
 
 @pytest.mark.parametrize("given", ["page", "latex", "escape", "attribute"])

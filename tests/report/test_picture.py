@@ -19,7 +19,7 @@ def axes():
 def drawn(name, **how):
     made = scene(name)
     run = motion(made, **how)
-    shown = picture.picture(system(made), run.t, run.q, run.qd)
+    shown = picture.make_picture(system(made), run.t, run.q, run.qd)
     on = axes()
     shown.draw(on)
     return shown, on, run

@@ -89,7 +89,7 @@ def show_command(scene: Path, root: Path, form: str | None) -> None:
 
         system = pipeline.read(scene)
         if form == "cost":
-            text = equations_text.cost(system)
+            text = equations_text.write_costs(system)
         else:
             text = equations_text.write_equations(system, form or "text")
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}

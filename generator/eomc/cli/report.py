@@ -53,10 +53,10 @@ def report_command(
             say(f"{measurement.scene}: {pages.recommendation(measurement, digits)}")
             continue
         if not quiet:
-            say(pages.table(measurement))
+            say(pages.write_table(measurement))
         page = root / measurement.scene / "report.html"
         with status_line(f"writing {shown(page)}", quiet):
-            text = pages.page(measurement, overview.describe_scene(system, measurement, root))
+            text = pages.write_page(measurement, overview.describe_scene(system, measurement, root))
         files.write_text(page, text)
         if not quiet:
             say(f"\nwrote {shown(page)}\n")

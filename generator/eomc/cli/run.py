@@ -165,7 +165,7 @@ def run_command(arguments: RunArguments) -> None:
     if plot:
         from eomc.report.plot import RunCurves, write_figure
 
-        curves = RunCurves.of_run(run, balance.words if balance else "")
+        curves = RunCurves.from_run(run, balance.words if balance else "")
         system = pipeline.read(scene).with_parameters(parameters)
         write_figure(system, curves, plot, wrap=arguments.wrap)
     if animate:

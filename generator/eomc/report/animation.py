@@ -21,7 +21,7 @@ from eomc.base.errors import EomcError, writing
 from eomc.emit.render import environment
 from eomc.report.drawing import Drawing
 from eomc.report.style import html_name
-from eomc.report.timeline import BatchTimeline, Panel, Source, Timeline, system_of
+from eomc.report.timeline import BatchTimeline, Panel, Source, Timeline, find_system
 from eomc.runtime.atomic_write import atomic_write
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def animate(
     """
     _check(file)
     timelines = [
-        Timeline(system_of(run, scene if k == 0 else None), run) for k, run in enumerate(runs)
+        Timeline(find_system(run, scene if k == 0 else None), run) for k, run in enumerate(runs)
     ]
     return make_animation(timelines, file, title)
 
@@ -104,7 +104,7 @@ def instances(
     """
     _check(file)
     return make_animation(
-        [BatchTimeline(system_of(batch, scene), batch, names, chosen)], file, title
+        [BatchTimeline(find_system(batch, scene), batch, names, chosen)], file, title
     )
 
 

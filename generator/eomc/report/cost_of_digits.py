@@ -266,7 +266,7 @@ def measure(
     progress(0, total)
     reference = reference_solution.solve(system, rows=ROW_COUNT, root=root)
     progress(1, total)
-    module, skipped = variant(system, names, Path(root) / system.name / "report")
+    module, skipped = build_variant(system, names, Path(root) / system.name / "report")
     values, at, place = compute_spectrum(module, reference)
     baseline = _Baseline(
         reference, evaluate_along(module.jacobi, reference), _energy_scale(module, reference)
@@ -298,7 +298,9 @@ def measure(
     )
 
 
-def variant(system: System, names: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
+def build_variant(
+    system: System, names: Sequence[str], root: Path
+) -> tuple[ModuleType, dict[str, str]]:
     """Build a Python module of a system with several steppers (integration methods).
 
     names: the steppers. Those that can't integrate the system are left out. root: build directory.

@@ -28,8 +28,8 @@ from eomc.report.typeset import (
     distribute_decimal,
     latex_sum,
     named_lines,
-    readable,
     section,
+    shorten_fractions,
     wrap,
 )
 from eomc.runtime.labels import tex
@@ -228,7 +228,7 @@ class Equations:
                     + (f"there are {', '.join(known)}" if known else "there are none")
                 )
             new[parameters[name]] = _exact(value, f"with_values: {name}")
-        return self._internal.substitute(new, readable).with_user_symbols()
+        return self._internal.substitute(new, shorten_fractions).with_user_symbols()
 
     def __repr__(self) -> str:
         s = self.system
@@ -283,21 +283,31 @@ def derive(system: System) -> Equations:
 
     @cache
     def short(e: Expr) -> Expr:
-        return readable(simplify_trig(e, system.qd))
+        return shorten_fractions(simplify_trig(e, system.qd))
 
     D, C, g, tau, friction = (
         getattr(plain, name).applyfunc(short) for name in ("D", "C", "g", "tau", "friction")
     )
     conserved = sympy.expand(plain.jacobi - plain.energy) == 0
     jacobi, power = None if conserved else short(plain.jacobi), short(plain.power)
-    linear = readable(_energy(plain.linear_potential, system))
+    linear = shorten_fractions(_energy(plain.linear_potential, system))
     left = tuple(_left_side(system, D, plain.bias[i], friction[i], i) for i in range(len(system.q)))
     result = Equations(
-        system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
-        plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
-        readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
-        jacobi, power if power != 0 else None, linear if linear != 0 else None, left,
-    )  # fmt: skip
+        system=system,
+        D=D,
+        C=C,
+        g=g,
+        tau=tau,
+        forces=(plain.tau + plain.friction).applyfunc(shorten_fractions),
+        zero=plain.constraints.applyfunc(shorten_fractions),
+        A=plain.constraint_jacobian.applyfunc(shorten_fractions),
+        kinetic=shorten_fractions(_energy(plain.kinetic, system)),
+        potential=shorten_fractions(_energy(plain.potential, system)),
+        jacobi=jacobi,
+        power=power if power != 0 else None,
+        linear_potential=linear if linear != 0 else None,
+        left=left,
+    )
     if _operations(result.set_out) > MAX_WRITTEN_OPERATIONS:
         raise too_long_error(system)
     return result
@@ -341,7 +351,7 @@ def _left_side(system: System, D: ImmutableMatrix, bias: Expr, friction: Expr, i
     last: Terms = []
     for part in (bias, friction):
         for rates, c in coefficients(part, system.qd) or [(sympy.S.One, part)]:
-            c = readable(c)
+            c = shorten_fractions(c)
             (last if rates == 1 else terms).append((rates, c))
     return terms + [(rates, c) for rates, c in last if c != 0]
 

@@ -37,8 +37,8 @@ from eomc.report.typeset import (
     Typesetter,
     latex_sum,
     named_lines,
-    readable,
     section,
+    shorten_fractions,
     wrap,
 )
 from eomc.runtime.labels import tex
@@ -113,7 +113,7 @@ def describe(system: System) -> str:
                 section_lines += write.text_lines(write.terms(c.formula), [])
             section_lines += constraint_note(c)
         parts.append(section("constraints", section_lines))
-    return "\n\n".join([*parts, "What computes them:", costs(system)])
+    return "\n\n".join([*parts, "What computes them:", tabulate_costs(system)])
 
 
 def _recursion(tree: Tree, write: Typesetter) -> str:
@@ -316,7 +316,7 @@ def _slope(numerator: str, denominator: str) -> str:
 
 
 def _formula(e: Expr, write: Typesetter) -> str:
-    return write.latex(write.ordered(readable(sympy.sympify(e))))
+    return write.latex(write.ordered(shorten_fractions(sympy.sympify(e))))
 
 
 def _vector(v: Vector, write: Typesetter) -> str:
@@ -342,17 +342,17 @@ def _escaped(words: str) -> str:
 # --- costs ----------------------------------------------------------------------------------------
 
 
-def cost(system: System) -> str:
+def write_costs(system: System) -> str:
     """Return a table, as text, of the floating-point operations of each generated function.
 
     A function that can be computed by several routes (algorithms) has one count for each of them.
     """
     head = f"{title_line(system)}: operations of one call, those on parameters alone left out"
-    return f"{head}\n\n{costs(system)}"
+    return f"{head}\n\n{tabulate_costs(system)}"
 
 
-def costs(system: System) -> str:
-    """Return the table of operation counts that `cost` returns, without its heading."""
+def tabulate_costs(system: System) -> str:
+    """Return the table of operation counts that `write_costs` returns, without its heading."""
     lowered = program.build(lagrange.derive(system))
     lines = []
     wide = max(map(len, lowered.functions))

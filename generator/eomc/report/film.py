@@ -15,8 +15,8 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.report.drawing import Drawing, draw_mechanism
 from eomc.report.picture import draw_marks, frame, project_points, shapes
-from eomc.report.style import COLOURS, INK, colours
-from eomc.report.timeline import Source, Timeline, system_of
+from eomc.report.style import COLOURS, INK, choose_colours
+from eomc.report.timeline import Source, Timeline, find_system
 from eomc.runtime.atomic_write import atomic_write
 from eomc.runtime.columns import imported
 
@@ -89,7 +89,7 @@ def render(run: Any, t: Any, scene: Source | None) -> Pixels:
     """
     imported("matplotlib", "render")
     instants = np.asarray(run.t[-1] if t is None else t, dtype=float)
-    timeline = Timeline(system_of(run, scene), run)
+    timeline = Timeline(find_system(run, scene), run)
     q, _ = run(instants.ravel())
     rows = np.unique(np.linspace(0, len(timeline.t) - 1, MAX_VIEW_ROWS).astype(int))
     times = np.concatenate([instants.ravel(), timeline.t[rows]])
@@ -185,7 +185,7 @@ class _Moving:
         self, axes: Axes, motion: Drawing, times: Array, instances: int, words: str
     ) -> None:
         self.axes, self.times, self.words, self.flat = axes, times, words, project_points(motion)
-        hues = colours(instances or len(COLOURS))
+        hues = choose_colours(instances or len(COLOURS))
         self.title = axes.set_title(self._title(0), fontsize=10, color=INK)
         pairs = [*zip(motion.paths, hues, strict=False)]
         self.points = [path.point for path, _ in pairs]

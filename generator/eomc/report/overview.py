@@ -15,7 +15,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import Coordinate, Input, Output, Parameter, System
 from eomc.report import equations, equations_text
-from eomc.report.cost_of_digits import WorkPrecisionReport, variant
+from eomc.report.cost_of_digits import WorkPrecisionReport, build_variant
 from eomc.report.equations import Equations
 from eomc.report.style import html_name
 from eomc.report.typeset import CONTINUATION
@@ -135,7 +135,9 @@ def _motion(system: System, report: WorkPrecisionReport, root: Path) -> tuple[Ma
     if plot.without_pictures():
         return Markup(""), ""
     best = report.best(6) or report.finest
-    module, _ = variant(system, [p.method for p in report.lines], root / system.name / "report")
+    module, _ = build_variant(
+        system, [p.method for p in report.lines], root / system.name / "report"
+    )
     finer = max(1, math.ceil(MIN_ROWS / best.steps))  # enough rows for smooth curves
     if best.adaptive:
         run = module.simulate(tol=best.tol, duration=report.duration)._drawn
@@ -145,7 +147,7 @@ def _motion(system: System, report: WorkPrecisionReport, root: Path) -> tuple[Ma
         run = module.simulate(h=h, steps=steps, method=best.method)
         caption = f"By {best.method}, h = {run.h:.3g} s"
     balance = run.balance().words if run._model.has_power else ""
-    figure = plot.make_figure(system, plot.RunCurves.of_run(run, balance), " ")
+    figure = plot.make_figure(system, plot.RunCurves.from_run(run, balance), " ")
     if best.adaptive or finer == 1:
         caption += f", within {best.along:.1g} of the reference solution"
-    return plot.svg(figure), caption + "."
+    return plot.to_svg(figure), caption + "."

@@ -21,7 +21,7 @@ from eomc.report.cost_of_digits import (
     WorkPrecisionReport,
 )
 from eomc.report.overview import Overview
-from eomc.report.plot import svg, without_pictures
+from eomc.report.plot import to_svg, without_pictures
 
 EXPLAINED = """\
 Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
@@ -148,7 +148,7 @@ def remarks(report: WorkPrecisionReport) -> list[str]:
     ]
 
 
-def table(report: WorkPrecisionReport) -> str:
+def write_table(report: WorkPrecisionReport) -> str:
     """Return the report as text for a terminal: table of steppers, recommendations and remarks."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -159,7 +159,7 @@ def table(report: WorkPrecisionReport) -> str:
     for head in ("stepper", "order", "observed", "usable h", "stable to", "smallest error",
                  "at h", "computing", "rounding from"):  # fmt: skip
         table.add_column(head, justify="left" if head == "stepper" else "right")
-    for row in rows(report):
+    for row in stepper_rows(report):
         table.add_row(*row)
     text = io.StringIO()
     Console(file=text, width=116).print(table)
@@ -168,7 +168,7 @@ def table(report: WorkPrecisionReport) -> str:
     return "\n".join([*lines, *words]).strip("\n")
 
 
-def rows(report: WorkPrecisionReport) -> list[tuple[str, ...]]:
+def stepper_rows(report: WorkPrecisionReport) -> list[tuple[str, ...]]:
     """Return the rows of the table of steppers, one for each stepper in the report.
 
     The cells of a row are texts: stepper, order, observed order, usable h, stable h, smallest
@@ -212,7 +212,7 @@ def _for_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def page(report: WorkPrecisionReport, overview: Overview | None = None) -> str:
+def write_page(report: WorkPrecisionReport, overview: Overview | None = None) -> str:
     """Return the report as one HTML page with embedded figures.
 
     overview: description of the scene that the page begins with. If matplotlib is not installed,
@@ -239,7 +239,7 @@ def page(report: WorkPrecisionReport, overview: Overview | None = None) -> str:
         about=overview,
         digit_rows=digit_rows(report),
         title=texts.html(report.title),
-        rows=rows(report),
+        rows=stepper_rows(report),
         recommendations=recommendations(report),
         remarks=remarks(report),
         explained=EXPLAINED,
@@ -268,7 +268,7 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
         axes.grid(color="#DDDDDD", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         draw(axes)
-        return svg(figure)
+        return to_svg(figure)
 
 
 def _styles(report: WorkPrecisionReport) -> dict[str, tuple[str, str]]:

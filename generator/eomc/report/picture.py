@@ -13,8 +13,8 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import System
 from eomc.report.drawing import TRAVEL_LIMIT, Drawing, Mark, draw_mechanism
-from eomc.report.style import COLOURS, INK, label, plain
-from eomc.report.timeline import system_of
+from eomc.report.style import COLOURS, INK, format_axes, label
+from eomc.report.timeline import find_system
 from eomc.runtime.labels import mathtext, with_unit
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, direction from which drawings in sp
 BODY, GHOST = "#4D4D4D", 0.80  # colour of rods; lightest grey of an earlier instant
 
 
-def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | PlaneCurve | None:
+def make_picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | PlaneCurve | None:
     """Return a picture of a run, for the figure of its motion.
 
     t: times (n,) in s. q, qd: coordinates and velocities (n, nq). The picture shows the mechanism
@@ -56,7 +56,7 @@ def of_run(run: Any) -> Mechanism | None:
     Returns None if the scene of the run is unknown or does not describe the shape of the mechanism.
     """
     try:
-        system = system_of(run)
+        system = find_system(run)
     except EomcError:
         return None
     t, q = (np.asarray(x, dtype=float)[:: max(len(run) // MAX_ROWS, 1)] for x in (run.t, run.q))
@@ -78,7 +78,7 @@ class PlaneCurve:
     def draw(self, axes: Axes) -> None:
         """Draw the curve into `axes`, with a ring at its start and a dot at its end."""
         axes.plot(*self.values.T, color=COLOURS[0])
-        plain(axes)
+        format_axes(axes)
         axes.plot(*self.values[0], "o", color=COLOURS[0], markerfacecolor="white", markersize=5)
         axes.plot(*self.values[-1], "o", color=COLOURS[0], markersize=5)
         axes.set_xlabel(self.labels[0])
@@ -198,7 +198,7 @@ def frame(axes: Axes, picture: Drawing, flat: Array) -> None:
     axes.margins(0.06)
     axes.set_aspect("equal", adjustable="datalim")
     if picture.is_planar:
-        plain(axes, lines=False)
+        format_axes(axes, lines=False)
         names = [mathtext(name) for name in picture.labels]
         axes.set_xlabel(with_unit(names[0], picture.unit))
         axes.set_ylabel(with_unit(names[1], picture.unit))

@@ -20,7 +20,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
-from eomc.report.style import COLOURS, INK, plain
+from eomc.report.style import COLOURS, INK, format_axes
 from eomc.runtime.atomic_write import atomic_write
 from eomc.runtime.labels import mathtext, rate_unit, with_unit
 from eomc.runtime.plot import Curve, against, grouped, wrapped
@@ -66,7 +66,7 @@ class RunCurves:
     balance: str = ""
 
     @classmethod
-    def of_run(cls, run: Any, balance: str = "") -> RunCurves:
+    def from_run(cls, run: Any, balance: str = "") -> RunCurves:
         """Return the curves of a run. An adaptive run with few rows is interpolated.
 
         balance: the energy balance of the run in words.
@@ -141,7 +141,7 @@ def without_pictures() -> str:
     return ""
 
 
-def svg(figure: Figure) -> Markup:
+def to_svg(figure: Figure) -> Markup:
     """Return a matplotlib figure as SVG text for an HTML page; equal figures give equal text."""
     import matplotlib
 
@@ -194,7 +194,7 @@ def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
             if x.name in values
         ]
     )  # fmt: skip
-    picture = pictures.picture(system, t, q, qd)
+    picture = pictures.make_picture(system, t, q, qd)
     rows = len(groups) + len(below) + 1
     height = min(2.1 * rows + 0.5, max(9, 1.5 * rows))
     result = Figure(figsize=(12, height), layout="constrained")
@@ -235,7 +235,7 @@ def _rate(c: Coordinate, values: Array) -> Curve:
 def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
     axes.set_prop_cycle(color=_colours(len(curves)))
     lines = against(axes, t, curves)
-    plain(axes)
+    format_axes(axes)
     if len(lines) > 1:
         some = lines if len(lines) <= 8 else [lines[0], lines[len(lines) // 2], lines[-1]]
         axes.legend(handles=some, fontsize=8, frameon=False, ncols=1, loc="center left",
@@ -267,7 +267,7 @@ def _energy(axes: Axes, run: RunCurves, unit: str) -> None:
         )
     if words:
         heading = "; " + integral_label + texts.figure(words).replace("; ", "\n")
-    plain(axes)
+    format_axes(axes)
     axes.set_ylabel(with_unit(label, unit))
     start = _quantity(float(energy[0]), unit) if len(energy) else "?"
     axes.set_title(f"Energy: $E(0)$ = {start}{heading}", fontsize=10, color=INK)

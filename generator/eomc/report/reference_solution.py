@@ -249,7 +249,7 @@ def _run(
     numbers += tuple(p.value for p in system.parameters)
     # Decimal writes a double as the number that it is
     exact = " ".join(str(Decimal(x)) for x in numbers)
-    standard_input = f"{gauss(stages)} {exact}\n"
+    standard_input = f"{gauss_coefficients(stages)} {exact}\n"
     completed = subprocess.run(
         [executable], input=standard_input, capture_output=True, text=True, check=False
     )
@@ -275,7 +275,7 @@ def _run(
 
 
 @cache
-def gauss(stages: int) -> str:
+def gauss_coefficients(stages: int) -> str:
     """Return the coefficients of the Gauss method with `stages` stages as text, to 40 digits.
 
     The text contains the number of stages, c, A, A A, b, b A and weights, separated by blanks.

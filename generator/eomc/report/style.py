@@ -18,7 +18,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, FAINT = "#333333", "#DDDDDD"
 
 
-def colours(count: int) -> tuple[str, ...]:
+def choose_colours(count: int) -> tuple[str, ...]:
     """Return `count` distinct colours as texts such as "#0072B2".
 
     They are the first of COLOURS, or hues from red to violet if COLOURS has too few.
@@ -30,7 +30,7 @@ def colours(count: int) -> tuple[str, ...]:
     return tuple("#{:02X}{:02X}{:02X}".format(*shade) for shade in shades)
 
 
-def plain(axes: Axes, lines: bool = True) -> None:
+def format_axes(axes: Axes, lines: bool = True) -> None:
     """Format matplotlib axes: a light grid, no box, and thin lines for the curves drawn so far.
 
     lines: False to leave the width of the curves unchanged.

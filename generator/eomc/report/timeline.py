@@ -128,7 +128,7 @@ class BatchTimeline(Timeline):
     """
 
     def __init__(self, system: System, batch: Any, names: Sequence[str], chosen: Any) -> None:
-        numbers = instance_numbers(len(batch), chosen)
+        numbers = choose_instances(len(batch), chosen)
         super().__init__(system, select_instances(batch, numbers))
         self.names = tuple(names) or self._default()
         table = np.broadcast_to(self.run._params, (len(numbers), len(system.parameters)))
@@ -173,7 +173,7 @@ class BatchTimeline(Timeline):
             yield Panel(curve.unit, tuple(lines), curve.name)
 
 
-def system_of(run: Any, scene: Source | None = None) -> System:
+def find_system(run: Any, scene: Source | None = None) -> System:
     """Return the system that a run simulated, with the parameter values of the run.
 
     Parameters
@@ -211,7 +211,7 @@ def system_of(run: Any, scene: Source | None = None) -> System:
     return system.with_parameters(dict(zip(model.parameters, map(float, values), strict=True)))
 
 
-def instance_numbers(count: int, chosen: int | Sequence[int]) -> list[int]:
+def choose_instances(count: int, chosen: int | Sequence[int]) -> list[int]:
     """Return the indices of the instances to show, for a batch of `count` instances.
 
     chosen: how many to show, spread evenly over the batch, or the list of their indices. Raises

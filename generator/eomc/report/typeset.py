@@ -304,7 +304,7 @@ def distribute_decimal(e: Expr) -> Expr:
     return e
 
 
-def readable(value: Expr) -> Expr:
+def shorten_fractions(value: Expr) -> Expr:
     """Return an expression with decimals or short fractions in place of fractions of many digits.
 
     Such fractions arise from slanted axes, whose components have 50 digits. Numbers that agree to
