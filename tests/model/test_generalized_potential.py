@@ -11,7 +11,7 @@ import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive import lagrange
 from eomc.model.from_scene import from_scene
-from eomc.model.generalized_potential import NotLinearError, split
+from eomc.model.generalized_potential import NotLinearError, split_potential
 from eomc.model.system import System, dot, symbol
 from eomc.program import program
 from eomc.scene.read import parse
@@ -120,7 +120,7 @@ def test_a_potential_is_split_through_its_definitions(definition: str) -> None:
     known = {"x": x, "y": y, "x_dot": x_dot, "y_dot": y_dot, "c": symbol("c"), "dot": dot}
     body = sympy.sympify(definition, known)
     d, c = symbol("d"), symbol("c")
-    potential, linear = split(x**2 + y * d, [(c, x * y), (d, body)], VELOCITIES)
+    potential, linear = split_potential(x**2 + y * d, [(c, x * y), (d, body)], VELOCITIES)
     whole = (x**2 + y * body).xreplace({dot(c): x_dot * y + x * y_dot})
     linear = linear.xreplace({dot(c): x_dot * y + x * y_dot})
     assert potential.free_symbols <= {x, y}
@@ -135,7 +135,7 @@ def test_what_is_not_linear_in_the_velocities_is_refused(text: str) -> None:
     c = symbol("c")
     names = {"x": x, "y": y, "x_dot": x_dot, "y_dot": y_dot, "c": c, "dot": dot}
     with pytest.raises(NotLinearError, match="linear terms only"):
-        split(sympy.sympify(text, names), [(c, x * y)], VELOCITIES)
+        split_potential(sympy.sympify(text, names), [(c, x * y)], VELOCITIES)
 
 
 def test_a_system_and_a_scene_refuse_it_in_the_same_words() -> None:

@@ -9,7 +9,7 @@ import sympy
 from eomc.model.from_scene import from_scene
 from eomc.model.kinematics import Kinematics
 from eomc.model.loops import perpendicular_axes
-from eomc.model.symbols import needed
+from eomc.model.symbols import needed_definitions
 from eomc.scene.joints import CLOSINGS
 from eomc.scene.read import parse
 
@@ -101,7 +101,7 @@ class Two:
     def numeric(self, expressions, more=()):
         """A function of the coordinates."""
         expressions = list(expressions)
-        for name, e in reversed(needed(self.system.definitions, expressions)):
+        for name, e in reversed(needed_definitions(self.system.definitions, expressions)):
             expressions = [sympy.sympify(x).xreplace({name: e}) for x in expressions]
         return sympy.lambdify([*self.system.q, *more], expressions)
 

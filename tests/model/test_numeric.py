@@ -9,7 +9,7 @@ import mpmath
 import pytest
 import sympy
 
-from eomc.model.algebra import compiled
+from eomc.model.algebra import compile_function
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import symbol
 from eomc.report.equations_text import write_equations
@@ -66,7 +66,7 @@ def test_arguments_and_definitions_hide_nothing(name: str, modules: Any) -> None
     x, y = symbol("x"), symbol(name)
     e = [sympy.exp(1) * x + sympy.Abs(y), sympy.Abs(y) / x, sympy.pi]
     for given, definitions in (((x, y), ()), ((x,), ((y, x + 1),))):
-        of = compiled(given, e, modules, definitions)
+        of = compile_function(given, e, modules, definitions)
         values = of(mpmath.mpf(2), mpmath.mpf(3)) if len(given) > 1 else of(mpmath.mpf(2))
         assert [*map(float, values)] == pytest.approx([2 * math.e + 3, 1.5, math.pi])
 

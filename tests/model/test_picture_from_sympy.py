@@ -15,7 +15,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
-from eomc.model.from_sympy import formula_text, in_python
+from eomc.model.from_sympy import formula_text, message_in_python
 from eomc.report.drawing import draw_mechanism
 from eomc.scene import formulas
 from eomc.scene.read import parse
@@ -126,7 +126,11 @@ def test_faults_are_told_as_those_of_a_scene(picture: str) -> None:
         parse(SCENE + "[picture]\n" + picture)
     with pytest.raises(SceneError, match=r"System\.make: error: picture") as of_python:
         made(tomllib.loads(picture))
-    told = [(p.key, in_python(p.message)) for p in of_scene.value.problems if p.severity == "error"]
+    told = [
+        (p.key, message_in_python(p.message))
+        for p in of_scene.value.problems
+        if p.severity == "error"
+    ]
     assert told == [(p.key, p.message) for p in of_python.value.problems if p.severity == "error"]
 
 

@@ -10,7 +10,7 @@ from mjcf_text import model, refused, reported
 
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
-from eomc.model.symbols import needed
+from eomc.model.symbols import needed_definitions
 from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
 from eomc.robots.preparation import prepare_for_scene
@@ -79,7 +79,7 @@ def rows(system):
 
 def numeric(system, expressions):
     """A function of the coordinates."""
-    for name, e in reversed(needed(system.definitions, expressions)):
+    for name, e in reversed(needed_definitions(system.definitions, expressions)):
         expressions = [x.xreplace({name: e}) for x in expressions]
     return sympy.lambdify([system.q], expressions)
 

@@ -306,10 +306,10 @@ def _fixed_inputs(
 
 def _varying_inputs(scene: Path) -> Iterator[str]:
     """Return the inputs whose signals depend on more than parameters."""
-    from eomc.model.symbols import resolved
+    from eomc.model.symbols import resolve_definitions
 
     system = pipeline.read(scene)
-    known, fixed = resolved(system.definitions), {p.symbol for p in system.parameters}
+    known, fixed = resolve_definitions(system.definitions), {p.symbol for p in system.parameters}
     return (i.name for i in system.inputs if i.signal.xreplace(known).free_symbols - fixed)
 
 

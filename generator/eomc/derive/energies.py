@@ -8,7 +8,7 @@ from sympy import Expr, S, Symbol
 
 from eomc.base.errors import EomcError
 from eomc.derive.tape import Stage, Tape
-from eomc.model.symbols import ALONG, needed
+from eomc.model.symbols import ALONG, needed_definitions
 from eomc.model.system import System, dot, symbol, t
 
 
@@ -132,7 +132,7 @@ def energies_on_tape(
     formulas += [i.signal for i in system.inputs]
     formulas += [e for pair in applied for e in pair]
     formulas += [row.formula for row in system.constraints]
-    for defined, expr in needed(system.definitions, formulas):
+    for defined, expr in needed_definitions(system.definitions, formulas):
         definitions[defined] = tape.named(value(expr), defined.name)
     energies = Energies(
         tape,
@@ -149,7 +149,9 @@ def energies_on_tape(
     )
     errors = [c.rotation_error for c in system.constraints if c.rotation_error is not None]
     # last, since no other function needs their definitions
-    for defined, expr in needed(system.definitions, [x for pair in errors for x in pair]):
+    for defined, expr in needed_definitions(
+        system.definitions, [x for pair in errors for x in pair]
+    ):
         if defined not in definitions:
             definitions[defined] = tape.named(value(expr), defined.name)
     energies.rotation_errors += [(value(error), value(half)) for error, half in errors]

@@ -23,7 +23,7 @@ from eomc.base.spatial import ENTRIES
 from eomc.derive.energies import leaves
 from eomc.derive.links import AXES, ZERO, LinkFrames, Vector
 from eomc.derive.tape import Stage, Tape
-from eomc.model.symbols import needed, symbol
+from eomc.model.symbols import needed_definitions, symbol
 from eomc.model.system import System, t
 from eomc.model.tree import BodyFrame, Tree
 
@@ -281,7 +281,7 @@ class Sweep:
         """
         formulas = [formula for f in self.frames for formula in self._formulas(f)]
         known: dict[Symbol, Expr] = {}
-        for name, formula in needed(self.system.definitions, formulas):
+        for name, formula in needed_definitions(self.system.definitions, formulas):
             known[name] = self.vectors.tape.named(formula.xreplace(known), name.name)
         return known
 

@@ -34,7 +34,7 @@ from eomc.derive.energies import Energies, energies_on_tape, tangent_symbols
 from eomc.derive.ldl import Rows, Solution, SolveResult, Vector, count_operations, solve
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import NotDifferentiableError, Stage, Tape
-from eomc.model.symbols import needed
+from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, symbol, t
 from eomc.model.tree import Tree
 
@@ -170,7 +170,7 @@ def derive(system: System) -> Derivation:
     Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3 (matrix C).
     """
     lagrange = newton_euler = articulated = composite = multipliers = None
-    places = len(needed(system.definitions, (system.kinetic, system.potential)))
+    places = len(needed_definitions(system.definitions, (system.kinetic, system.potential)))
     ldl: SolveResult = f"{places} world coordinates to differentiate"
     try:
         if system.tree is None or places <= MAX_LAGRANGE_DEFINITIONS:

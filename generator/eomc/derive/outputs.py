@@ -12,7 +12,7 @@ from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.linearize import LEAST_ROOT
 from eomc.derive.tape import NotDifferentiableError, Tape
-from eomc.model.symbols import MULTIPLIER, Output, dot, needed
+from eomc.model.symbols import MULTIPLIER, Output, dot, needed_definitions
 from eomc.model.system import System, t
 
 
@@ -117,7 +117,9 @@ def _outputs(
             (rates_of[derivative],) = tape.forward([position], rates)
         return tape.define(expr.xreplace(rates_of).xreplace(definitions))
 
-    for defined, expr in needed(system.definitions, [o.formula for o in system.outputs]):
+    for defined, expr in needed_definitions(
+        system.definitions, [o.formula for o in system.outputs]
+    ):
         definitions[defined] = tape.named(value(expr), defined.name)
     values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
     if not with_derivatives:

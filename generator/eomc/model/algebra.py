@@ -189,7 +189,7 @@ def bound(formula: Formula, known: Mapping[str, DigitBound]) -> DigitBound:
 # --- functions of numbers -------------------------------------------------------------------------
 
 
-def compiled(
+def compile_function(
     arguments: Sequence[Any],
     expressions: Any,
     modules: Any,

@@ -15,7 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
 from eomc.model import algebra
-from eomc.model.mechanics import in_words_of_python
+from eomc.model.mechanics import with_argument_names
 from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
@@ -45,7 +45,7 @@ _REPLACEMENTS = {
 }  # fmt: skip
 
 
-def fault(role: str, message: str) -> EomcError:
+def argument_error(role: str, message: str) -> EomcError:
     """Return the EomcError for an invalid argument of System.make.
 
     role: description of the argument for the message, such as "start of theta".
@@ -53,16 +53,16 @@ def fault(role: str, message: str) -> EomcError:
     return EomcError(f"System.make: {role}: {message}")
 
 
-def called(name: object, role: str) -> str:
+def valid_name(name: object, role: str) -> str:
     """Return the name of a quantity as text, from the name itself or from a SymPy Symbol.
 
     name: the text or Symbol that the user passed to System.make. role: description of the argument
     for the message. Raises EomcError if the name is not valid in C and Python.
     """
     if not isinstance(name, (str, Symbol)):
-        raise fault(role, f"{name!r} is not a name")
+        raise argument_error(role, f"{name!r} is not a name")
     if why := names.fault(str(name)):
-        raise fault(role, why)
+        raise argument_error(role, why)
     return str(name)
 
 
@@ -106,20 +106,20 @@ def check_units(units: Mapping[str, str], known: Iterable[str], outputs: Collect
     known = [*known]
     for name, unit in units.items():
         if name not in known:
-            raise fault(
+            raise argument_error(
                 "units",
                 f"{name} is no coordinate, parameter, input, constraint or output"
                 f"{formulas.suggest(name, known)}",
             )
         if name not in outputs and is_in_degrees(unit):
-            raise fault(
+            raise argument_error(
                 "units",
                 f"{name}: '{unit}': angles are in radians, nothing is converted: give values "
                 "in radians and the unit in rad",
             )
 
 
-def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "") -> Expr:
+def parse_formula(text: str, role: str, known: Mapping[str, Symbol], rule: str = "") -> Expr:
     """Parse a formula in the syntax of scenes and return it as a SymPy expression.
 
     Parameters
@@ -141,15 +141,15 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
     try:
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
-            raise undeclared(role, strange, known, rule)
+            raise undeclared_error(role, strange, known, rule)
         algebra.bound(formula, {})
         return algebra.expression(formula, known)
     except FormulaError as wrong:
         shown = text if len(text) <= 80 else text[:79] + "…"
-        raise fault(role, f"'{shown}' {in_words_of_python(str(wrong))}") from None
+        raise argument_error(role, f"'{shown}' {with_argument_names(str(wrong))}") from None
 
 
-def undeclared(
+def undeclared_error(
     role: str, strange: Sequence[str], known: Iterable[str], rule: str = ""
 ) -> EomcError:
     """Return the EomcError for names in an expression that are not declared or not allowed.
@@ -164,7 +164,7 @@ def undeclared(
     why = "not declared: name it among coordinates, parameters, inputs or definitions"
     if rule:
         why = f"can't be used here: {rule}"
-    return fault(role, f"{', '.join(strange)} {why}{suggestion}")
+    return argument_error(role, f"{', '.join(strange)} {why}{suggestion}")
 
 
 def expression(value: Any, role: str) -> Expr:
@@ -178,9 +178,11 @@ def expression(value: Any, role: str) -> Expr:
         expr = None
     if isinstance(expr, (sympy.MatrixBase, sympy.MatrixExpr)):
         rows, columns = expr.shape
-        raise fault(role, f"give one expression, not a matrix of {rows} by {columns}: its entry")
+        raise argument_error(
+            role, f"give one expression, not a matrix of {rows} by {columns}: its entry"
+        )
     if not isinstance(expr, Expr):
-        raise fault(role, f"{value!r} is not an expression")
+        raise argument_error(role, f"{value!r} is not an expression")
     return expr
 
 
@@ -195,13 +197,13 @@ def check_functions(expr: Expr, role: str) -> None:
         if not isinstance(part, _KNOWN):
             name = type(part).__name__
             if name in formulas.NOT_ELEMENTARY:
-                why = in_words_of_python(formulas.NOT_ELEMENTARY[name])
-                raise fault(role, f"{name} can't be used: {why}")
+                why = with_argument_names(formulas.NOT_ELEMENTARY[name])
+                raise argument_error(role, f"{name} can't be used: {why}")
             instead = f": write {_REPLACEMENTS[name]}" if name in _REPLACEMENTS else ""
             known = ", ".join(f.__name__ for f in _FUNCTIONS)
-            raise fault(role, f"{name} can't be used{instead}; functions are {known}")
+            raise argument_error(role, f"{name} can't be used{instead}; functions are {known}")
         if isinstance(part, sympy.Heaviside) and part.args[1] != sympy.S.Half:
-            raise fault(role, f"{part}: Heaviside(x) is 1/2 at 0, without another value")
+            raise argument_error(role, f"{part}: Heaviside(x) is 1/2 at 0, without another value")
         more = [arg for arg in part.args if arg not in visited]
         visited.update(more)
         queue += more
@@ -231,7 +233,7 @@ def check_smooth(
         for jump in part.atoms(sympy.sign, sympy.Heaviside):
             if jump.free_symbols - fixed:
                 name = type(jump).__name__
-                raise fault(
+                raise argument_error(
                     role,
                     f"{name}(...) jumps, and {what} is differentiated: use Abs, Min or "
                     "Max (Max(x, 0)**2 for a stop), a smooth tanh(x/width), or give the force "
@@ -250,19 +252,19 @@ def number(value: Any, role: str, rule: str = "it is made of numbers") -> float:
     states if the value does contain names. Raises EomcError if the value is not a finite number.
     """
     if isinstance(value, str):
-        value = from_text(value, role, {}, rule)
+        value = parse_formula(value, role, {}, rule)
     if isinstance(value, Expr) and value.free_symbols:
-        raise undeclared(role, sorted(map(str, value.free_symbols)), (), rule)
+        raise undeclared_error(role, sorted(map(str, value.free_symbols)), (), rule)
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError, IndexError):  # SymPy raises each of these
-        raise fault(role, f"must be a number, here {value!r}") from None
+        raise argument_error(role, f"must be a number, here {value!r}") from None
     if not math.isfinite(result):
-        raise fault(role, f"must be a finite number, here {result}")
+        raise argument_error(role, f"must be a finite number, here {result}")
     return result
 
 
-def start(value: Any, role: str) -> tuple[Any, Any]:
+def initial_values(value: Any, role: str) -> tuple[Any, Any]:
     """Return the pair (initial value, initial velocity) that a user gave for one coordinate.
 
     value: the value of the coordinate in the mapping `coordinates` of System.make: an initial
@@ -271,18 +273,18 @@ def start(value: Any, role: str) -> tuple[Any, Any]:
     """
     pair = value if isinstance(value, (tuple, list)) else (value, None)
     if len(pair) != 2:
-        raise fault(role, f"give a start, or a pair (start, rate), here {value!r}")
+        raise argument_error(role, f"give a start, or a pair (start, rate), here {value!r}")
     return pair[0], pair[1]
 
 
-def mapping(value: Any, role: str, example: str) -> Mapping[Any, Any]:
+def by_symbol(value: Any, role: str, example: str) -> Mapping[Any, Any]:
     """Return a copy of the mapping `value` in which all keys are symbols.
 
     Keys that are names (text) are converted. role, example: description of the argument and a valid
     value, for messages. Raises EomcError if `value` is not a mapping or a key can't be converted.
     """
     if not isinstance(value, Mapping):
-        raise fault(role, f"give a dict, such as {example}, here {value!r}")
+        raise argument_error(role, f"give a dict, such as {example}, here {value!r}")
     return {symbol_of(key, role): entry for key, entry in value.items()}
 
 
@@ -292,7 +294,7 @@ def by_name(value: Any, role: str, example: str) -> dict[str, Any]:
     Keys that are symbols are converted. role, example: description of the argument and a valid
     value, for messages. Raises EomcError if `value` is not a mapping or a key can't be converted.
     """
-    return {name_of(one): entry for one, entry in mapping(value, role, example).items()}
+    return {name_of(one): entry for one, entry in by_symbol(value, role, example).items()}
 
 
 def name_of(one: Any) -> str:
@@ -313,9 +315,9 @@ def symbols(value: Any, role: str, default: Any) -> dict[Any, Any]:
     `value` is a collection. Raises EomcError for other types.
     """
     if isinstance(value, Mapping):
-        return dict(mapping(value, role, ""))
+        return dict(by_symbol(value, role, ""))
     if not isinstance(value, (list, tuple, set, frozenset)):
-        raise fault(role, f"give a list or dict of symbols, here {value!r}")
+        raise argument_error(role, f"give a list or dict of symbols, here {value!r}")
     return {symbol_of(one, role): default for one in value}
 
 
@@ -326,7 +328,7 @@ def symbol_of(value: Any, role: str) -> Any:
     description of the argument for the message. Raises EomcError for other types.
     """
     if not isinstance(value, (str, Symbol, AppliedUndef)):
-        raise fault(role, f"{value!r} is not a symbol")
+        raise argument_error(role, f"{value!r} is not a symbol")
     return symbol(value) if isinstance(value, str) else value
 
 
@@ -340,22 +342,24 @@ def run_settings(settings: RunSettings, adaptive: bool) -> RunSettings:
     """
     for name in ("h", "duration"):
         if number(value := getattr(settings, name), name) <= 0:
-            raise fault(name, f"must be greater than zero, here {value!r}")
+            raise argument_error(name, f"must be greater than zero, here {value!r}")
     methods, known = settings.methods, (*METHODS, "auto")
     if not methods or not all(isinstance(m, str) and m in known for m in methods):
-        raise fault("methods", f"known are {', '.join(known)}, here {methods!r}")
+        raise argument_error("methods", f"known are {', '.join(known)}, here {methods!r}")
     if settings.real not in REALS:
-        raise fault("real", f"known are {', '.join(REALS)}, here {settings.real!r}")
+        raise argument_error("real", f"known are {', '.join(REALS)}, here {settings.real!r}")
     for name in ("batch", "discretize", "inverse_dynamics"):
         if not isinstance(value := getattr(settings, name), bool):
-            raise fault(name, f"must be True or False, here {value!r}")
+            raise argument_error(name, f"must be True or False, here {value!r}")
     linearize, tolerance = settings.linearize, settings.tolerance
     if not isinstance(linearize, bool) and linearize != "parameters":
-        raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
+        raise argument_error(
+            "linearize", f'must be True, False or "parameters", here {linearize!r}'
+        )
     if tolerance is not None:
         least = MIN_FLOAT_TOLERANCE if settings.real == "float" else MIN_TOLERANCE
         if not least <= number(tolerance, "tolerance") <= MAX_TOLERANCE:
-            raise fault(
+            raise argument_error(
                 "tolerance", f"lies between {least:g} and {MAX_TOLERANCE:g}, here {tolerance!r}"
             )
         tolerance = float(tolerance)

@@ -12,9 +12,9 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.model import loops
-from eomc.model.algebra import compiled
+from eomc.model.algebra import compile_function
 from eomc.model.loops import LoopEquations
-from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
+from eomc.model.symbols import Constraint, Coordinate, dot, needed_definitions, t
 
 NONSMOOTH = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
 
@@ -190,7 +190,7 @@ class ConstraintChecker:
         if self.velocity_degree.degree(e).moves == 2:
             return None
         known: dict[Expr, Expr] = {name: sympy.Float(v) for name, v in self.values.items()}
-        for name, formula in needed(self.definitions, [e]):
+        for name, formula in needed_definitions(self.definitions, [e]):
             known[name] = formula.xreplace(known)
         value = e.xreplace(known).evalf()
         return (
@@ -208,11 +208,11 @@ class ConstraintChecker:
             *(x for point in closed.points for x in point),
             *(r.formula for r in closed.rows),
         ]
-        known = needed(self.definitions, expressions)
+        known = needed_definitions(self.definitions, expressions)
         if any(e.has(*NONSMOOTH) for e in (*expressions, *(formula for _, formula in known))):
             return [None] * len(closed.rows)  # such an equation may be constant locally
         names = [*self.values, t, *(c.q for c in self.coordinates)]
-        of = compiled(names, expressions, "math", known)
+        of = compile_function(names, expressions, "math", known)
         draw, samples = random.Random(1), list[list[float]]()
         for _ in range(self.SAMPLES):
             p = [x + 0.1 * draw.uniform(-1, 1) * (abs(x) or 1.0) for x in self.values.values()]

@@ -9,7 +9,7 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, constraints
-from eomc.model.generalized_potential import NotLinearError, split
+from eomc.model.generalized_potential import NotLinearError, split_potential
 from eomc.model.hybrid import Friction, add_hybrid_dynamics
 from eomc.model.loops import LoopEquations
 from eomc.model.multibody import Builder, Terms
@@ -101,7 +101,7 @@ class _Formulas:
             return whole, sympy.S.Zero
         velocities = [symbol(f"{c.name}_dot") for c in self.scene.coordinates]
         try:
-            return split(whole, definitions, velocities)
+            return split_potential(whole, definitions, velocities)
         except NotLinearError as fault:
             self.problems.append(self.scene.problem(key, str(fault), formula))
             return whole, sympy.S.Zero

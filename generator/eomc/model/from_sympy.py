@@ -24,8 +24,8 @@ from eomc.base import names
 from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.model import api_arguments, constraints
 from eomc.model.algebra import UNDEFINED
-from eomc.model.api_arguments import name_of
-from eomc.model.generalized_potential import NotLinearError, split
+from eomc.model.api_arguments import argument_error, name_of, undeclared_error
+from eomc.model.generalized_potential import NotLinearError, split_potential
 from eomc.model.hybrid import Friction
 from eomc.model.mechanics import AnySystem
 from eomc.model.symbols import (
@@ -37,7 +37,7 @@ from eomc.model.symbols import (
     Parameter,
     dot,
     multiplier_of,
-    needed,
+    needed_definitions,
     symbol,
     t,
 )
@@ -54,7 +54,9 @@ Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
 
 def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]) -> str:
     """Return the first input by name on which an expression depends, also by definitions, or ""."""
-    uses = expr.free_symbols.union(*(e.free_symbols for _, e in needed(definitions, [expr])))
+    uses = expr.free_symbols.union(
+        *(e.free_symbols for _, e in needed_definitions(definitions, [expr]))
+    )
     return min((i for i in inputs if symbol(i) in uses), default="")
 
 
@@ -97,7 +99,7 @@ class Maker:
     def __init__(self, arguments: SystemArguments) -> None:
         name = arguments.name
         if not isinstance(name, str):
-            raise api_arguments.fault("name", f"must be text, here {name!r}")
+            raise argument_error("name", f"must be text, here {name!r}")
         if why := names.module_fault(name):
             raise EomcError(f"System.make: name: {why}")
         self.name = name
@@ -111,7 +113,7 @@ class Maker:
 
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
-            raise api_arguments.fault(role, f"{one!r} is not a symbol")
+            raise argument_error(role, f"{one!r} is not a symbol")
         text = name_of(one)
         used = names.plain(text) if names.fault(text) else text
         if used in self.taken:
@@ -124,7 +126,7 @@ class Maker:
     def _expression(self, value: Any, role: str, rule: str = "") -> Expr:
         if isinstance(value, str):
             known = {s.name: s for s in self.known}
-            value = api_arguments.from_text(value, role, known, rule)
+            value = api_arguments.parse_formula(value, role, known, rule)
         expr = api_arguments.expression(value, role)
         if not isinstance(value, str):
             self.used |= {s.name: s for s in expr.free_symbols}
@@ -139,21 +141,19 @@ class Maker:
         strange = sorted(map(str, functions))
         strange += sorted(s.name for s in expr.free_symbols if s not in self.known)
         if any(d.derivative_count > 1 for d in expr.atoms(sympy.Derivative)):
-            raise api_arguments.fault(
-                role, "accelerations are what is solved for, none can be used"
-            )
+            raise argument_error(role, "accelerations are what is solved for, none can be used")
         if strange == ["t"] and not rule:
-            raise api_arguments.fault(
+            raise argument_error(
                 role,
                 "this t is not the time: write eomc.model.system.t, or "
                 "dynamicsymbols._t where coordinates are dynamicsymbols",
             )
         if strange:
-            raise api_arguments.undeclared(role, strange, (s.name for s in self.known), rule)
+            raise undeclared_error(role, strange, (s.name for s in self.known), rule)
         try:
-            expr = rewritten(expr, self.fixed)
+            expr = rewrite_functions(expr, self.fixed)
         except JumpError as jump:
-            raise api_arguments.fault(role, str(jump)) from None
+            raise argument_error(role, str(jump)) from None
         if expr.has(*UNDEFINED, sympy.I):
             raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
         api_arguments.check_functions(expr, role)
@@ -163,7 +163,7 @@ class Maker:
         value = api_arguments.number(value_, f"parameter {one}", _OF_NUMBERS)
         never_negative = getattr(one, "is_nonnegative", None) is True
         if never_negative and value < 0:
-            raise api_arguments.fault(
+            raise argument_error(
                 f"parameter {one}", f"its symbol can't be negative, here {value:g}"
             )
         unit = units.get(name_of(one), "")
@@ -178,9 +178,9 @@ class Maker:
         """
         arguments = self.arguments
         starts = api_arguments.symbols(arguments.coordinates, "coordinates", None)
-        parameters = api_arguments.mapping(arguments.parameters, "parameters", "{m: 2.0}")
+        parameters = api_arguments.by_symbol(arguments.parameters, "parameters", "{m: 2.0}")
         forces = api_arguments.by_name(arguments.forces, "forces", "{x: F}")
-        definitions = api_arguments.mapping(
+        definitions = api_arguments.by_symbol(
             arguments.definitions, "definitions", "{y: l*cos(theta)}"
         )
         units = self._units()
@@ -267,15 +267,15 @@ class Maker:
         for role, energy in expressions.items():
             if used_input := _input_in(energy, definitions, inputs):
                 why = f"{used_input} is an input, and an energy can't depend on inputs"
-                raise api_arguments.fault(role, f"{why}: let it act through forces")
+                raise argument_error(role, f"{why}: let it act through forces")
             what = f"the {role} energy"
             api_arguments.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
         try:
-            expressions["potential"], linear = split(
+            expressions["potential"], linear = split_potential(
                 expressions["potential"], definitions, velocities
             )
         except NotLinearError as why:
-            raise api_arguments.fault("potential", str(why)) from None
+            raise argument_error("potential", str(why)) from None
         return expressions if linear == 0 else {**expressions, "linear_potential": linear}
 
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
@@ -305,15 +305,17 @@ class Maker:
         rule = "a start is made of numbers and parameters"
         for c, whole in zip(coordinates, starts, strict=True):
             role, ends = f"start of {c.name}", []
-            for x in api_arguments.start(whole, role):
+            for x in api_arguments.initial_values(whole, role):
                 follows = ""
                 if isinstance(x, (str, Expr)):
                     x = self._expression(x, role, rule)
                     if x.has(dot):
-                        raise api_arguments.undeclared(role, ["dot(...)"], (), rule)
+                        raise undeclared_error(role, ["dot(...)"], (), rule)
                     if x.free_symbols:
                         follows = formula_text(x)
-                        api_arguments.from_text(follows, role, {s.name: s for s in values}, rule)
+                        api_arguments.parse_formula(
+                            follows, role, {s.name: s for s in values}, rule
+                        )
                     x = x.xreplace(values)
                 ends.append((None if x is None else api_arguments.number(x, role), follows))
             (start, follows), (rate, rate_follows) = ends
@@ -328,14 +330,14 @@ class Maker:
         """Return the coordinates with initial values marked as fixed or as guesses."""
         guess, rows = self.arguments.guess, bool(self.arguments.constraints)
         if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
-            raise api_arguments.fault(
+            raise argument_error(
                 "guess", f"give a list of coordinates, such as [x], here {guess!r}"
             )
         guessed = {name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
         if unknown := sorted(guessed - {name_of(one) for one in keys}):
-            raise api_arguments.fault("guess", f"{', '.join(unknown)} not among the coordinates")
+            raise argument_error("guess", f"{', '.join(unknown)} not among the coordinates")
         if guessed and not rows:
-            raise api_arguments.fault(
+            raise argument_error(
                 "guess", "constraints move a guess, and there are none: leave it out"
             )
         free = [name_of(one) in guessed for one in keys]
@@ -356,14 +358,12 @@ class Maker:
         rows = self.arguments.constraints
         if not isinstance(rows, Mapping):
             example = '{"rod": x**2 + y**2 - l**2}'
-            raise api_arguments.fault(
-                "constraints", f"give a dict, such as {example}, here {rows!r}"
-            )
+            raise argument_error("constraints", f"give a dict, such as {example}, here {rows!r}")
         declared = []
         moving = (s.name for c in coordinates for s in (c.qd, c.qdd))
         taken = {*self.taken, *moving, "energy"}
         for one, formula in rows.items():
-            name, role = api_arguments.called(one, "constraints"), f"constraint {one}"
+            name, role = api_arguments.valid_name(one, "constraints"), f"constraint {one}"
             if name in taken:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
@@ -372,11 +372,11 @@ class Maker:
                 why = (
                     f"{used_input} is an input, whose rate is not known: let it act through forces"
                 )
-                raise api_arguments.fault(role, why)
+                raise argument_error(role, why)
             declared.append(Constraint(name, expr, unit=units.get(name, "")))
 
         def fault(row: Constraint, message: str) -> None:
-            raise api_arguments.fault(f"constraint {row.name}", f"{row.formula} {message}")
+            raise argument_error(f"constraint {row.name}", f"{row.formula} {message}")
 
         doubts: list[Problem] = []
 
@@ -402,7 +402,7 @@ class Maker:
             name, role = name_of(one), f"signal of {one}"
             value = self._expression(signal, role)
             if used_input := _input_in(value, definitions, used.values()):
-                raise api_arguments.fault(
+                raise argument_error(
                     role, f"{used_input} is an input, and a signal can't depend on inputs"
                 )
             ends = limits.get(name, (None, None))
@@ -418,18 +418,16 @@ class Maker:
         for name, pair in limits.items():
             role = f"limits of {name}"
             if name not in known:
-                raise api_arguments.fault(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
+                raise argument_error(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise api_arguments.fault(
-                    role, f"give the least and the largest value, here {pair!r}"
-                )
+                raise argument_error(role, f"give the least and the largest value, here {pair!r}")
             ends = zip(pair, (-sympy.oo, sympy.oo), strict=True)
             least, most = (
                 None if x is None or x == end else self._expression(x, role, rule)
                 for x, end in ends
             )
             if least is not None and most is not None and (most - least).xreplace(values) <= 0:
-                raise api_arguments.fault(role, f"{least}, the least value, is not below {most}")
+                raise argument_error(role, f"{least}, the least value, is not below {most}")
             checked[name] = (least, most)
         return checked
 
@@ -437,9 +435,7 @@ class Maker:
         """Yield the events; each is given as a formula or a dict as in [[event]]."""
         events = self.arguments.events
         if not isinstance(events, Mapping):
-            raise api_arguments.fault(
-                "events", f'give a dict, such as {{"impact": y}}, here {events!r}'
-            )
+            raise argument_error("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
         state: dict[str, str] = {}  # names in the system, by names that the user may write
         for one in starts:
             name = self.map[one].name
@@ -448,27 +444,25 @@ class Maker:
             state |= {str(rate): f"{name}_dot", f"{name_of(one)}_dot": f"{name}_dot"}
         state |= {name_of(self.taken[p.name]): p.name for p in parameters}
         for name, entry in events.items():
-            called, role = api_arguments.called(name, "events"), f"event {name}"
+            called, role = api_arguments.valid_name(name, "events"), f"event {name}"
             table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
             when = self._expression(table.pop("when", None) if table else entry, role)
             if not when.free_symbols:
-                raise api_arguments.fault(role, f"{when} never crosses zero: it has no names")
+                raise argument_error(role, f"{when} never crosses zero: it has no names")
             direction, action = table.pop("direction", "both"), table.pop("action", "record")
             if not isinstance(note := table.pop("note", ""), str):
-                raise api_arguments.fault(role, f"note is a text, not {note!r}")
+                raise argument_error(role, f"note is a text, not {note!r}")
             for key, word, known in (
                 ("direction", direction, DIRECTIONS), ("action", action, ACTIONS),
             ):  # fmt: skip
                 if word not in known:
-                    raise api_arguments.fault(
-                        role, f"{key} is one of {', '.join(known)}, here {word!r}"
-                    )
+                    raise argument_error(role, f"{key} is one of {', '.join(known)}, here {word!r}")
             if strange := [key for key in table if key not in state]:
                 why = f"{strange[0]} is no coordinate, velocity or parameter, which a jump sets"
-                raise api_arguments.fault(role, why)
+                raise argument_error(role, why)
             if (action == "jump") != bool(table):
                 remedy = 'add "action": "jump" where something is set, and only there'
-                raise api_arguments.fault(role, remedy)
+                raise argument_error(role, remedy)
             jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
             yield Event(called, when, direction, action, tuple(jump), note=note)
 
@@ -482,12 +476,12 @@ class Maker:
         for name, size in friction.items():
             role = f"friction of {name}"
             if name not in known:
-                raise api_arguments.fault(role, f"coordinates are {', '.join(known)}")
+                raise argument_error(role, f"coordinates are {', '.join(known)}")
             force = self._expression(size, role)
             if moving := sorted(s.name for s in force.free_symbols - self.fixed.keys()):
-                raise api_arguments.fault(role, f"{moving[0]} is no parameter, of which it is made")
+                raise argument_error(role, f"{moving[0]} is no parameter, of which it is made")
             if (value := float(force.xreplace(values))) < 0:
-                raise api_arguments.fault(role, f"is {value:g}, and can't be negative")
+                raise argument_error(role, f"is {value:g}, and can't be negative")
             yield Friction(known[name], force, "friction")
 
     def _outputs(
@@ -508,19 +502,17 @@ class Maker:
                 self.map |= {name: multiplier, Symbol(name.name): multiplier}
                 self.known |= {name, multiplier}
         if not isinstance(outputs, Mapping):
-            raise api_arguments.fault(
+            raise argument_error(
                 "outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}'
             )
         moving = {x for c in coordinates for x in (c.q, c.qd)}
         for name, formula in outputs.items():
-            called = api_arguments.called(name, "outputs")
+            called = api_arguments.valid_name(name, "outputs")
             expr = self._expression(formula, f"output {name}")
             if called in rows:
-                raise api_arguments.fault(
-                    "outputs", f"'{name}' is a constraint already: rename one"
-                )
+                raise argument_error("outputs", f"'{name}' is a constraint already: rename one")
             if expr in moving and is_in_degrees(units.get(name, "")):
-                raise api_arguments.fault(
+                raise argument_error(
                     "outputs",
                     f"{name}: angles are in radians, nothing is converted: give {formula}*180/pi",
                 )
@@ -583,7 +575,7 @@ class JumpError(ValueError):
     """Error for a SymPy Piecewise that is discontinuous or whose continuity is undecided."""
 
 
-def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
+def rewrite_functions(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
     """Return an equal expression without Piecewise and without functions such as sec and coth.
 
     The result uses only functions that formulas of scenes can use. fixed: dict from each constant
@@ -696,7 +688,7 @@ def picture_scene(
         If the picture is invalid.
     """
     if not isinstance(picture, Mapping):
-        raise api_arguments.fault(
+        raise argument_error(
             "picture", f"give a dict, such as {_PICTURE_EXAMPLE}, here {picture!r}"
         )
     table = _as_toml(picture, expression)
@@ -714,12 +706,12 @@ def picture_scene(
     try:
         scene = read.check_tree(tree, "System.make")
     except SceneError as wrong:
-        problems = [replace(p, message=in_python(p.message)) for p in wrong.problems]
+        problems = [replace(p, message=message_in_python(p.message)) for p in wrong.problems]
         raise SceneError(problems) from None
     return scene, json.dumps(table, sort_keys=True, default=str)
 
 
-def in_python(message: str) -> str:
+def message_in_python(message: str) -> str:
     """Return a message about the table [picture] with Python syntax in place of TOML syntax."""
     for toml, python in _WORDS:
         message = message.replace(toml, python)

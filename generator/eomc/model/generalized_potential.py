@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 import sympy
 from sympy import Dummy, Expr, S, Symbol
 
-from eomc.model.symbols import dot, needed
+from eomc.model.symbols import dot, needed_definitions
 
 NOT_LINEAR = (
     "the potential energy can contain velocities in linear terms only, such as those of a magnetic "
@@ -24,7 +24,7 @@ class NotLinearError(ValueError):
     """Error for a potential energy that is nonlinear in the velocities."""
 
 
-def split(
+def split_potential(
     potential: Expr, definitions: Sequence[tuple[Symbol, Expr]], velocities: Iterable[Symbol]
 ) -> tuple[Expr, Expr]:
     """Split a generalized potential U = P(q, t) + a(q, t).qd and return the pair (P, a.qd).
@@ -61,7 +61,7 @@ def split(
     if rest == 0:
         return potential, S.Zero
     known: dict[Expr, Expr] = {}
-    for name, e in needed(definitions, [rest]):
+    for name, e in needed_definitions(definitions, [rest]):
         if name in moving:
             known[name] = e.xreplace(known)
     rest = rest.xreplace(known)

@@ -30,7 +30,7 @@ from eomc.base.spatial import apply, cross, dot, plus, product, scaled, transpos
 from eomc.model import rational
 from eomc.model.mechanics import Mechanics
 from eomc.model.rational import ZERO, Matrix, Vector
-from eomc.model.symbols import Constraint, Reaction, needed, symbol, t
+from eomc.model.symbols import Constraint, Reaction, needed_definitions, symbol, t
 from eomc.scene.assembly import LoopJoint
 
 
@@ -219,7 +219,7 @@ def find_wrong_rotations(
     if not cosines:
         return lambda q, t, parameters: []
     branches = [branch for _, branch in cosines]
-    known = needed(system.definitions, branches)
+    known = needed_definitions(system.definitions, branches)
     names = [*(c.q for c in system.coordinates), t, *(p.symbol for p in system.parameters)]
     defaults = {p.name: p.value for p in system.parameters}
     of = sympy.lambdify(names, branches, "math", cse=lambda e: (known, e))

@@ -160,19 +160,19 @@ _TABLES = "constants constraints coordinates definitions energy forces inputs ou
 _TABLE = re.compile(rf"\[({_TABLES.replace(' ', '|')})\]")
 
 
-def in_words_of_python(message: str) -> str:
+def with_argument_names(message: str) -> str:
     """Replace the names of TOML tables in a message by the corresponding arguments of System.make.
 
-    >>> in_words_of_python("split it with [definitions]")
+    >>> with_argument_names("split it with [definitions]")
     'split it with definitions'
     """
     return _TABLE.sub(r"\1", message)
 
 
-def argument_of(key: str) -> str:
+def argument_name(key: str) -> str:
     """Return the argument of System.make that corresponds to a key of a scene.
 
-    >>> argument_of("run.method"), argument_of("energy.kinetic"), argument_of("parameters.m")
+    >>> argument_name("run.method"), argument_name("energy.kinetic"), argument_name("parameters.m")
     ('methods', 'kinetic', 'parameters.m')
     """
     table, _, last = key.partition(".")
@@ -327,7 +327,7 @@ class Mechanics:
         "note". The result contains file and line if the system was read from a scene.
         """
         if self.place is None:
-            message, key = in_words_of_python(message), argument_of(key)
+            message, key = with_argument_names(message), argument_name(key)
             return Problem(message, key, f"System {self.name}", severity=severity)
         return self.place(key, message, severity=severity)
 

@@ -283,7 +283,7 @@ def multiplier_of(row: str) -> Symbol:
     return symbol(f"{row}{MULTIPLIER}")
 
 
-def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
+def resolve_definitions(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
     """Return a dict from the symbol of each definition to its fully substituted expression.
 
     definitions: pairs (symbol, expression), each over the symbols before it. In the result, these
@@ -295,7 +295,7 @@ def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
     return known
 
 
-def needed(
+def needed_definitions(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:
     """Return the definitions on which expressions depend, in the order of `definitions`.

@@ -180,7 +180,7 @@ class System(Mechanics):
         arguments = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
         api_arguments.check_arguments(unknown, arguments)
         if kinetic is None:
-            raise api_arguments.fault(
+            raise api_arguments.argument_error(
                 "kinetic", f"None is not an expression: {api_arguments.LAGRANGIAN}"
             )
         run = RunSettings(

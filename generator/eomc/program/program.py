@@ -16,7 +16,7 @@ from eomc.derive.ldl import Solution
 from eomc.derive.linearize import STICKS, linearization, sensitivity
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
-from eomc.model.symbols import ALONG, Output, dot, needed, symbol
+from eomc.model.symbols import ALONG, Output, dot, needed_definitions, symbol
 from eomc.model.system import System, t
 from eomc.program import constrained
 from eomc.program.interpret import evaluator, nearby
@@ -496,7 +496,10 @@ def _tables(scene: Scene, name: str) -> set[str]:
 
 def _has(system: System, expression: Expr, name: Symbol) -> bool:
     """Return True if an expression contains a symbol, directly or through definitions."""
-    expressions = (expression, *(e for _, e in needed(system.definitions, [expression])))
+    expressions = (
+        expression,
+        *(e for _, e in needed_definitions(system.definitions, [expression])),
+    )
     return any(name in e.free_symbols for e in expressions)
 
 

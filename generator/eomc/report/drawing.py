@@ -19,7 +19,7 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 
 from eomc.base import spatial
-from eomc.model.algebra import compiled
+from eomc.model.algebra import compile_function
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.scene import formulas
@@ -662,7 +662,7 @@ def _positions(
         if not rates and used & coordinates and used <= coordinates | {time}:
             chosen.append(pair)
     flat = [expression[name] for pair in chosen for name in pair]
-    values = compiled((time, *system.q), flat, "numpy")(times, *q.T)
+    values = compile_function((time, *system.q), flat, "numpy")(times, *q.T)
     columns = [np.broadcast_to(v, times.shape).astype(float) for v in values]
     return {pair: np.column_stack(columns[2 * k : 2 * k + 2]) for k, pair in enumerate(chosen)}
 

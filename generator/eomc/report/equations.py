@@ -18,7 +18,7 @@ from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.hybrid import with_constant_parameters
-from eomc.model.symbols import resolved, symbol
+from eomc.model.symbols import resolve_definitions, symbol
 from eomc.model.system import Constraint, System, t
 from eomc.pipeline import ScenePath
 from eomc.report.typeset import (
@@ -602,7 +602,7 @@ def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Ex
 
 def _outputs(system: System) -> list[tuple[str, Expr]]:
     """Return the outputs as (name, formula) with all definitions substituted."""
-    known = resolved(system.definitions)
+    known = resolve_definitions(system.definitions)
     known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
     return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
 

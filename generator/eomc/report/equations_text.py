@@ -18,7 +18,7 @@ from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.rational import Vector
-from eomc.model.symbols import needed
+from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, t
 from eomc.model.tree import Link, Tree
 from eomc.program import program
@@ -140,7 +140,7 @@ def _shown_definitions(system: System) -> list[tuple[sympy.Symbol, Expr]] | None
     applied = (e for pair in system.applied for e in pair)
     shown = [*(c.formula for c in system.constraints), *applied, system.dissipation, *system.forces]
     shown += [e for _, e in _energies(system)]
-    known = needed(system.definitions, shown)
+    known = needed_definitions(system.definitions, shown)
     return known if len(known) <= MAX_DEFINITIONS else None
 
 

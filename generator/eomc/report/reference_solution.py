@@ -35,7 +35,7 @@ from eomc.emit.c_expression import QUAD
 from eomc.emit.c_names import Target, rename_for_c
 from eomc.emit.functions import SceneFunctions
 from eomc.emit.render import show
-from eomc.model.algebra import compiled
+from eomc.model.algebra import compile_function
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
@@ -396,8 +396,8 @@ class _PlainEquations:
         exact = [e.xreplace({f: sympy.Rational(f) for f in e.atoms(sympy.Float)}) for e in parts]
         self.n, self.m = len(system.coordinates), len(system.inputs)
         self.parameters = [mpmath.mpf(p.value) for p in system.parameters]
-        self.values = compiled(symbols, exact, "mpmath")
-        self.signals = compiled(symbols, list(r.signals), "mpmath")
+        self.values = compile_function(symbols, exact, "mpmath")
+        self.signals = compile_function(symbols, list(r.signals), "mpmath")
 
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
         """Solve D q̈ = τ - bias + Aᵀλ for the accelerations q̈ at (q, q̇, t); return them as a list.

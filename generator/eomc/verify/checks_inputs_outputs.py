@@ -21,8 +21,8 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
-from eomc.model.algebra import compiled
-from eomc.model.symbols import Output, resolved, symbol
+from eomc.model.algebra import compile_function
+from eomc.model.symbols import Output, resolve_definitions, symbol
 from eomc.model.system import System, dot, t
 from eomc.verify.checks_derivatives import differentiate
 from eomc.verify.comparison import Comparison
@@ -246,7 +246,7 @@ class Formulas:
             stand_ins = [sympy.Dummy() for _ in rates]
             bare = e.xreplace(dict(zip(rates, stand_ins, strict=True)))
             symbols = sorted(bare.free_symbols - set(stand_ins), key=str)
-            f = compiled([*symbols, *stand_ins], bare, [_NAMES, "mpmath"])
+            f = compile_function([*symbols, *stand_ins], bare, [_NAMES, "mpmath"])
             self._compiled[e] = f, symbols, [d.args[0] for d in rates]
         return self._compiled[e]
 
@@ -313,7 +313,7 @@ def report_closed_loop(check: Comparison) -> None:
 
 def _is_feedback(system: System) -> bool:
     """Return whether a signal depends on the state, and none has discontinuities."""
-    known = resolved(system.definitions)
+    known = resolve_definitions(system.definitions)
     signals = sympy.Tuple(*(i.signal.xreplace(known) for i in system.inputs))
     moves = signals.free_symbols & {*system.q, *system.qd}
     return bool(moves) and not signals.has(sympy.sign, sympy.Heaviside)

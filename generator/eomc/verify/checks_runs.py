@@ -23,8 +23,8 @@ import numpy as np
 import sympy
 
 from eomc.integrators.tableaux import METHODS
-from eomc.model.algebra import compiled
-from eomc.model.symbols import needed
+from eomc.model.algebra import compile_function
+from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, dot, t
 from eomc.verify.checks_derivatives import differentiate
 from eomc.verify.comparison import Comparison
@@ -664,7 +664,7 @@ def largest_angle(system: System) -> Callable[[State], float]:
         *(i.signal for i in system.inputs), *(c.formula for c in system.constraints),
     ]  # fmt: skip
     known, free = [], set[sympy.Symbol]()  # definitions without rates
-    for name, e in needed(system.definitions, formulas):
+    for name, e in needed_definitions(system.definitions, formulas):
         if not e.has(dot) and not e.free_symbols & free:
             known.append((name, e))
         else:
@@ -676,7 +676,9 @@ def largest_angle(system: System) -> Callable[[State], float]:
         return lambda s: 0.0
     parameters = [p.symbol for p in system.parameters]
     names = [*system.q, *system.qd, t, *system.u, *parameters]
-    evaluate = compiled(names, sorted(angles, key=str), "numpy", needed(known, [*angles]))
+    evaluate = compile_function(
+        names, sorted(angles, key=str), "numpy", needed_definitions(known, [*angles])
+    )
     defaults = {p.name: p.value for p in system.parameters}
 
     def evaluate_largest(s: State) -> float:

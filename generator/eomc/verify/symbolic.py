@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from sympy import Expr, ImmutableMatrix
 
 from eomc.base.errors import EomcError
-from eomc.model.algebra import compiled
+from eomc.model.algebra import compile_function
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.system import System, dot, t
 from eomc.verify.reference import (
@@ -335,7 +335,7 @@ class SymbolicReference(ReferenceModel):
             system, expr = self.system, getattr(self, name)
             symbols = (*system.q, *system.qd, t, *system.u, *(p.symbol for p in system.parameters))
             entries = [expr] if name in SCALARS else expr.flat()
-            self._functions[name] = compiled(symbols, entries, [_NAMED, "math"])
+            self._functions[name] = compile_function(symbols, entries, [_NAMED, "math"])
         return self._functions[name]
 
 
