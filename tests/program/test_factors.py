@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from sympy import Expr, cos, expand, sin, symbols
 
-from eomc.program.contradictions import has_only_repeated_factors
+from eomc.program.inconsistent_constraints import has_only_repeated_factors
 
 x, y, length = symbols("x y l")
 

@@ -72,7 +72,7 @@ class _Inertia:
 
 
 class _Articulated:
-    """State of the algorithm: the inward pass eliminates the joints, the outward pass gives qdd."""
+    """The articulated-body algorithm: one pass eliminates the joints, another gives qdd."""
 
     def __init__(self, recursion: Recursion) -> None:
         self.recursion, self.links = recursion, recursion.links
@@ -113,7 +113,7 @@ class _Articulated:
             p = link.parent
             size[p] = V.add(size[p], self._unreduced_size(k, body))
             bodies[p] = self._sum(bodies[p], self._to_parent_frame(k, reduced))
-            force, moment = tree.inwards(k, f[k]), tree.inwards(k, m[k])
+            force, moment = tree.to_parent(k, f[k]), tree.to_parent(k, m[k])
             f[p] = V.plus(f[p], force)
             m[p] = V.plus(m[p], moment, V.cross(tree.arm[k], force))
         return self._outwards(columns, inverse, joint_force), tuple(pivots)
@@ -129,8 +129,10 @@ class _Articulated:
         for k, link in enumerate(self.links):
             alpha, acceleration = ZERO, ZERO
             if (p := link.parent) >= 0:
-                alpha = tree.outwards(k, alphas[p])
-                acceleration = tree.outwards(k, V.plus(origins[p], V.cross(alphas[p], tree.arm[k])))
+                alpha = tree.from_parent(k, alphas[p])
+                acceleration = tree.from_parent(
+                    k, V.plus(origins[p], V.cross(alphas[p], tree.arm[k]))
+                )
             u_m, u_f = columns[k]
             remaining = V.add(
                 joint_force[k], V.minus(V.dot(u_m, alpha)), V.minus(V.dot(u_f, acceleration))
@@ -251,7 +253,7 @@ class _Articulated:
         def rotated(x: Expr, y: Expr) -> tuple[Expr, Expr]:
             v = list(ZERO)
             v[i], v[j] = x, y
-            v = list(self.tree.turn(k, (v[0], v[1], v[2])))
+            v = list(self.tree.rotate(k, (v[0], v[1], v[2])))
             return v[i], v[j]
 
         out[a][i], out[a][j] = rotated(m[a][i], m[a][j])

@@ -168,7 +168,7 @@ class Sweep:
             **dict(zip(system.qd, system.qdd, strict=True)),
             t: S.One,
         }
-        self.joint_accelerations = tree.by_link(
+        self.joint_accelerations = tree.joint_rates(
             dict(zip(system.q, system.qdd, strict=True))
         )  # without the terms that are quadratic in velocities
         self.columns: list[Sequence[Vector]] = []  # columns of R_k
@@ -385,7 +385,7 @@ class Sweep:
             if (p := link.parent) >= 0:
                 force[p] = V.plus(force[p], force[k])
                 moment[p] = V.plus(moment[p], moment[k], V.cross(self.step[k], force[k]))
-        for q, projected in self.tree.projected(joint_forces).items():
+        for q, projected in self.tree.project_forces(joint_forces).items():
             generalized[q].append(projected)
         return [V.add(*terms) for terms in generalized.values()]
 

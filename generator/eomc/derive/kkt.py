@@ -277,7 +277,7 @@ def accelerations(
     """
     A = jacobian(tape, rows)
     c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
-    D, b = with_mass(tape, D, b, A, c, rows.weights)
+    D, b = regularize_mass(tape, D, b, A, c, rows.weights)
     switched = _switched(rows)
     tolerance = PivotTolerance(rows.drop[0], rows.pivot_limits)
     factored = factorize(tape, D, A, tolerance, short, switched, switched)
@@ -303,7 +303,7 @@ def _switched(rows: Constraints) -> list[int]:
     return [r for r, row in enumerate(rows.solved) if row[0][0] in rows.switched]
 
 
-def with_mass(
+def regularize_mass(
     tape: Tape, D: Rows, b: Sequence[Expr], A: Rows, c: Sequence[Expr], weights: Vector = ()
 ) -> tuple[Rows, Sequence[Expr]]:
     """Return a regular mass matrix and its right-hand side for constrained equations of motion.
@@ -346,7 +346,7 @@ def projection(
         from which the pivot is computed.
     """
     n, A = len(D), jacobian(tape, rows)
-    D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
+    D, _ = regularize_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
     tolerance = PivotTolerance(rows.drop[1], rows.pivot_limits)
     factored = factorize(tape, D, A, tolerance, last=_switched(rows))
     indices = [row[0][0] for row in rows.solved]  # sums of constraints are all holonomic

@@ -241,7 +241,7 @@ def _by_newton_euler(
     recursion = Recursion(tape, tree)
 
     def by_coordinate(by_link: Sequence[Expr]) -> list[Expr]:
-        projected = recursion.tree.projected(by_link)
+        projected = recursion.tree.project_forces(by_link)
         return [projected.get(x, S.Zero) for x in q]
 
     bias = by_coordinate(recursion.bias())
@@ -256,7 +256,7 @@ def _by_newton_euler(
     operations = recursion.count_elimination_operations()
     use_articulated = isinstance(articulated, Solution) and operations > _length(articulated)
     if use_articulated and len(q) > MAX_UNROLLED_COORDINATES:
-        direction = recursion.tree.by_link(tangent_symbols(system))
+        direction = recursion.tree.joint_rates(tangent_symbols(system))
         D: Rows = (tuple(by_coordinate(recursion.mass_times(direction))),)
     else:
         columns = zip(*map(by_coordinate, recursion.mass_matrix()), strict=True)
@@ -283,7 +283,7 @@ def _by_articulated_bodies(system: System, recursion: Recursion, rest: MotionTer
     coordinate each.
     """
     q, links = system.q, recursion.links
-    if not recursion.tree.plain:
+    if not recursion.tree.has_own_coordinates:
         return "joints that move together"
     if len(links) < len(q) or any(x != 0 for column in rest.D for x in column):
         return None
@@ -562,8 +562,10 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     terms_of = [[x] for x in _inertial_forces(system, e, accelerations)]
     if tree:
         recursion = Recursion(e.tape, tree)
-        joint_accelerations = recursion.tree.by_link(dict(zip(system.q, system.qdd, strict=True)))
-        tree_forces = recursion.tree.projected(recursion.inverse_dynamics(joint_accelerations))
+        joint_accelerations = recursion.tree.joint_rates(
+            dict(zip(system.q, system.qdd, strict=True))
+        )
+        tree_forces = recursion.tree.project_forces(recursion.inverse_dynamics(joint_accelerations))
         for terms, q in zip(terms_of, system.q, strict=True):
             terms.append(tree_forces.get(q, S.Zero))
     return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in terms_of]

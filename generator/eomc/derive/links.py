@@ -90,7 +90,7 @@ class LinkFrames:
     ----------
     vectors : Vectors
         Sums and products on the tape.
-    moved, speed, drift
+    displacement, speed, drift
         For each link, s_k, its time derivative, and its second time derivative at qdd = 0.
     slopes
         For each link, the derivatives ds_k/dq by coordinate.
@@ -108,14 +108,14 @@ class LinkFrames:
         self.n = len(tree.links)
         # joint displacement s_k(q), its rate, its second derivative at qdd = 0, and ds_k/dq
         rates = dict(tree.rates)
-        self.moved = [V.define(x.q) for x in self.links]
-        self.speed = tape.forward(self.moved, rates)
+        self.displacement = [V.define(x.q) for x in self.links]
+        self.speed = tape.forward(self.displacement, rates)
         self.drift = tape.forward(self.speed, rates)
         self.slopes = [
             {q: tape.forward([moved], {q: S.One})[0] for q in rates if q in x.q.free_symbols}
-            for x, moved in zip(self.links, self.moved, strict=True)
+            for x, moved in zip(self.links, self.displacement, strict=True)
         ]
-        pairs = [*zip(self.links, self.moved, strict=True)]
+        pairs = [*zip(self.links, self.displacement, strict=True)]
         self.cosine = [V.define(sympy.cos(s)) if x.turns else S.One for x, s in pairs]
         self.sine = [V.define(sympy.sin(s)) if x.turns else S.Zero for x, s in pairs]
         self.rotation: list[Matrix] = [
@@ -127,12 +127,12 @@ class LinkFrames:
     # --- joints and coordinates ------------------------------------------------------------------
 
     @property
-    def plain(self) -> bool:
+    def has_own_coordinates(self) -> bool:
         """Whether each joint has a coordinate of its own: s_k = q_k."""
         coordinates = {link.q for link in self.links if link.q.is_Symbol}
         return len(coordinates) == self.n
 
-    def projected(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
+    def project_forces(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
         """Return the generalized force on each coordinate, from the force along each joint.
 
         `by_link` contains the force f_k (N) or moment (N m) along the joint of each link k. With
@@ -145,7 +145,7 @@ class LinkFrames:
                 terms.setdefault(q, []).append(V.times(slope, force))
         return {q: V.add(*forces) for q, forces in terms.items()}
 
-    def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
+    def joint_rates(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
         """Return the rate of each joint's displacement, from the rate of each coordinate.
 
         `direction` maps each coordinate q to its rate v_q. With the displacement s_k of the joint
@@ -159,7 +159,7 @@ class LinkFrames:
 
     # --- frames ----------------------------------------------------------------------------------
 
-    def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
+    def rotate(self, k: int, v: Vector, back: bool = False) -> Vector:
         """Return the vector `v`, given in link k's frame, rotated by the angle of the link's joint.
 
         With `back`, the vector is rotated by the negative angle. If the joint is prismatic, the
@@ -176,13 +176,13 @@ class LinkFrames:
         out[j] = V.add(V.minus(up) if back else up, V.times(c, v[j]))
         return (out[0], out[1], out[2])
 
-    def inwards(self, k: int, v: Vector) -> Vector:
+    def to_parent(self, k: int, v: Vector) -> Vector:
         """Return the components in the parent's frame of a vector given in link k's frame."""
-        return self.vectors.apply(self.rotation[k], self.turn(k, v))
+        return self.vectors.apply(self.rotation[k], self.rotate(k, v))
 
-    def outwards(self, k: int, v: Vector) -> Vector:
+    def from_parent(self, k: int, v: Vector) -> Vector:
         """Return the components in link k's frame of a vector given in its parent's frame."""
-        return self.turn(k, self.vectors.apply(transposed(self.rotation[k]), v), back=True)
+        return self.rotate(k, self.vectors.apply(transposed(self.rotation[k]), v), back=True)
 
     def _arm(self, k: int) -> Vector:
         """Return the vector from the parent's origin to link k's, in the parent's frame."""
@@ -191,7 +191,7 @@ class LinkFrames:
         offset = V.vector(link.offset)
         if link.turns:
             return offset
-        slide = tuple(V.times(row[link.axis], self.moved[k]) for row in self.rotation[k])
+        slide = tuple(V.times(row[link.axis], self.displacement[k]) for row in self.rotation[k])
         return V.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
@@ -207,7 +207,7 @@ class LinkFrames:
         """
         out: list[Vector] = []
         for k, link in enumerate(self.links):
-            w = self.outwards(k, out[link.parent]) if link.parent >= 0 else ZERO
+            w = self.from_parent(k, out[link.parent]) if link.parent >= 0 else ZERO
             out.append(self.vectors.plus(w, self.on_axis(k, rates[k])) if link.turns else w)
         return out
 
@@ -223,6 +223,6 @@ class LinkFrames:
             v = ZERO
             if (p := link.parent) >= 0:
                 v = V.plus(out[p], V.cross(spin[p], self.arm[k]))
-            v = self.outwards(k, v)
+            v = self.from_parent(k, v)
             out.append(v if link.turns else V.plus(v, self.on_axis(k, rates[k])))
         return out

@@ -204,10 +204,10 @@ class Recursion:
         put(i, j, V.add(off, V.minus(x.entry(i, j))))
         mixed = [S.Zero] * 3
         mixed[i], mixed[j] = x.entry(i, a), x.entry(j, a)
-        mixed = list(tree.turn(k, (mixed[0], mixed[1], mixed[2])))
+        mixed = list(tree.rotate(k, (mixed[0], mixed[1], mixed[2])))
         put(i, a, mixed[i])
         put(j, a, mixed[j])
-        return Inertia(x.mass, tree.turn(k, x.moment), inertia)
+        return Inertia(x.mass, tree.rotate(k, x.moment), inertia)
 
     def _double(self, x: Expr) -> Expr:
         """Return 2 x."""
@@ -254,8 +254,8 @@ class Recursion:
             alpha, acceleration = (alphas[p], origins[p]) if p >= 0 else (ZERO, fall)
             if p >= 0 and r != ZERO:
                 acceleration = V.plus(acceleration, V.apply(matrices[p], r))
-            alpha, acceleration = tree.outwards(k, alpha), tree.outwards(k, acceleration)
-            parent_spin = tree.outwards(k, spin[p]) if p >= 0 else ZERO
+            alpha, acceleration = tree.from_parent(k, alpha), tree.from_parent(k, acceleration)
+            parent_spin = tree.from_parent(k, spin[p]) if p >= 0 else ZERO
             relative = tree.on_axis(k, rates[k])
             if link.turns:
                 alpha = V.plus(
@@ -334,7 +334,7 @@ class Recursion:
             link = self.links[k]
             out[k] = (n if link.turns else f)[k][link.axis]
             if link.parent >= 0:
-                force, moment = tree.inwards(k, f[k]), tree.inwards(k, n[k])
+                force, moment = tree.to_parent(k, f[k]), tree.to_parent(k, n[k])
                 f[link.parent] = V.plus(f[link.parent], force)
                 n[link.parent] = V.plus(n[link.parent], moment, V.cross(tree.arm[k], force))
         return out
@@ -347,7 +347,7 @@ class Recursion:
         """Return D qdd + C qd + g as the force along each joint.
 
         `joint_accelerations` is the second time derivative of each joint's displacement, without
-        the part that depends on velocities alone; `LinkFrames.by_link` computes it from qdd.
+        the part that depends on velocities alone; `LinkFrames.joint_rates` computes it from qdd.
         """
         pairs = zip(joint_accelerations, self.tree.drift, strict=True)
         return self._forces_for([self.vectors.add(*pair) for pair in pairs])
@@ -360,8 +360,8 @@ class Recursion:
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
         """Return the product D v as the force along each joint, without forming the mass matrix D.
 
-        `direction` contains v by joint; `LinkFrames.by_link` computes it from one entry for each
-        coordinate.
+        `direction` contains v by joint; `LinkFrames.joint_rates` computes it from one entry for
+        each coordinate.
         """
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
@@ -402,7 +402,7 @@ class Recursion:
             D[k][k] = V.add((moment if link.turns else force)[a], self.armature[k])
             i = k
             while (p := self.links[i].parent) >= 0:
-                force, moment = tree.inwards(i, force), tree.inwards(i, moment)
+                force, moment = tree.to_parent(i, force), tree.to_parent(i, moment)
                 moment = V.plus(moment, V.cross(tree.arm[i], force))
                 i = p
                 projected = (moment if self.links[i].turns else force)[self.links[i].axis]
@@ -445,7 +445,7 @@ class Recursion:
         moment = [x.moment for x in self.inertia]
         total = self.fixed_moment
         for k in reversed(range(self.n)):
-            moment_at_parent = V.plus(tree.inwards(k, moment[k]), V.scaled(tree.arm[k], mass[k]))
+            moment_at_parent = V.plus(tree.to_parent(k, moment[k]), V.scaled(tree.arm[k], mass[k]))
             if (p := self.links[k].parent) >= 0:
                 mass[p] = V.add(mass[p], mass[k])
                 moment[p] = V.plus(moment[p], moment_at_parent)

@@ -47,12 +47,13 @@ _Varying = tuple[tuple[Symbol, Expr], ...]  # powers of names that do not depend
 class RootSlope:
     """The derivative of a root s**p, 0 < p < 1, bounded so that it is finite where s is 0.
 
-    By the chain rule the derivative of s is multiplied by p s**(p - 1), which is bounded by
-    p/least. If s is 0 at a smooth minimum, the derivative of s is 0. For p >= 1/2 the product is
-    then 0, which is correct, since s is of second order. For p < 1/2 the derivative of the root is
-    infinite, unless a factor of the root is 0. The derivative of a root of |x| is infinite, too; it
-    is taken with respect to x, with the sign of one side at 0. If the bound remains in a result,
-    the result is made infinite, see `Tape._overflowing`.
+    The tape (list of named operations) uses it in the chain rule: the derivative of s is multiplied
+    by p s**(p - 1), which is bounded by p/least with a small number `least`. If s is 0 at a smooth
+    minimum, the derivative of s is 0. For p >= 1/2 the product is then 0, which is correct, since s
+    is of second order. For p < 1/2 the derivative of the root is infinite, unless a factor of the
+    root is 0. The derivative of a root of |x| is infinite, too; it is taken with respect to x, with
+    the sign of one side at 0. If the bound remains in a result, the result is made infinite, see
+    `Tape._overflowing`.
 
     Attributes
     ----------
@@ -169,12 +170,15 @@ class Tape:
         return self.scaled(factor, symbol)
 
     def stage_of(self, atom: Expr) -> Stage:
-        """Return the stage of a number, a name, or a number times a name: when it is available."""
+        """Return the binding time of an atom: when it can be computed, see `Stage`.
+
+        An atom is a number, a name on the tape, or a number times a name.
+        """
         symbol = split(atom)[1]
         return Stage.NUMBER if symbol is None else self.stage[symbol]
 
     def is_sine(self, symbol: Symbol) -> bool:
-        """Return True if the name is defined as a sine."""
+        """Return True if a name on the tape is defined as the sine of something."""
         return isinstance(self._rhs.get(symbol), sympy.sin)
 
     def rhs(self, symbol: Symbol) -> Expr:
@@ -222,7 +226,11 @@ class Tape:
         return self.powers.get(symbol) or {symbol: S.One}
 
     def scaled(self, number: Expr, atom: Expr) -> Expr:
-        """Return the atom of a number times an atom."""
+        """Return the product of a number and an atom, which is an atom too.
+
+        An atom is a number, a name on the tape, or a number times a name. Nothing is added to the
+        tape.
+        """
         factor, symbol = split(atom)
         factor = number if factor is S.One else number * factor
         if symbol is None or factor is S.Zero:
@@ -283,7 +291,10 @@ class Tape:
         return result
 
     def times(self, first: Expr, second: Expr) -> Expr:
-        """Return the atom of the product of two atoms."""
+        """Return the product of two atoms as an atom; the tape is extended where necessary.
+
+        An atom is a number, a name on the tape, or a number times a name.
+        """
         (a, x), (b, y) = split(first), split(second)
         if x is None:
             return self.scaled(a, second)
@@ -300,7 +311,10 @@ class Tape:
         return self.scaled(a * b, product)
 
     def total(self, atoms: Iterable[Expr]) -> Expr:
-        """Return the atom of the sum of `atoms`."""
+        """Return the sum of `atoms` as an atom; the tape is extended where necessary.
+
+        An atom is a number, a name on the tape, or a number times a name.
+        """
         weights: dict[Symbol, Expr] = {}
         constant: Expr = S.Zero
         for atom in atoms:
@@ -481,7 +495,8 @@ class Tape:
             The direction: its component along each leaf (symbol without definition). Components
             along absent leaves are 0.
         least
-            Bound in derivatives of roots, see `RootSlope`. None for no bound.
+            Lower bound of the denominators in derivatives of roots, so that these stay finite where
+            the root is 0, see `RootSlope`. None for no bound.
 
         Returns
         -------
@@ -521,7 +536,8 @@ class Tape:
         stop
             Names that are independent variables: their definitions are not differentiated.
         least
-            Bound in derivatives of roots, see `RootSlope`. None for no bound.
+            Lower bound of the denominators in derivatives of roots, so that these stay finite where
+            the root is 0, see `RootSlope`. None for no bound.
 
         Returns
         -------

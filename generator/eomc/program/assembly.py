@@ -19,7 +19,15 @@ from eomc.base.texts import listed
 from eomc.model import hybrid, loops
 from eomc.model.mechanics import ConstraintSummary, Move
 from eomc.model.system import System
-from eomc.program import contradictions
+from eomc.program.inconsistent_constraints import (
+    constraints_without_gradient,
+    gradient_problems,
+    massless_problem,
+    position_problems,
+    scene_key,
+    value_problems,
+    velocity_problems,
+)
 from eomc.program.manifold import (
     HALF_TURN_RESIDUAL,
     ROUNDING_FACTOR,
@@ -90,19 +98,15 @@ def assembled(system: System) -> System:
         return replace(combined, closure=closure)
     manifold = Manifold(system)
     _refuse_idle(manifold)
-    if flat := contradictions.powers(system):
-        raise SceneError(list(contradictions.of_slopes(system, flat)))
+    if flat := constraints_without_gradient(system):
+        raise SceneError(list(gradient_problems(system, flat)))
     start = _start(manifold)
     constraint_ranks = ranks(manifold, start.configuration)
     if constraint_ranks.rank == 0:
-        raise SceneError(list(contradictions.of_slopes(system, constraint_ranks.flat)))
+        raise SceneError(list(gradient_problems(system, constraint_ranks.flat)))
     if constraint_ranks.massless_coordinates:
         raise SceneError(
-            [
-                contradictions.of_inertia(
-                    manifold, constraint_ranks.massless_coordinates, start.configuration
-                )
-            ]
+            [massless_problem(manifold, constraint_ranks.massless_coordinates, start.configuration)]
         )
     constraints = tuple(
         replace(c, redundant=k in constraint_ranks.left_out)
@@ -144,7 +148,7 @@ def _refuse_idle(manifold: Manifold) -> None:
     """Raise SceneError for constraints that depend on no coordinate."""
     system = manifold.system
     idle = [
-        system.problem(contradictions.key(c), "depends on no coordinate: it can hold nothing")
+        system.problem(scene_key(c), "depends on no coordinate: it can hold nothing")
         for k, c in enumerate(system.constraints)
         if not np.any(manifold.reads[k])
     ]
@@ -158,17 +162,17 @@ def _start(manifold: Manifold) -> ConsistentStart:
     free = np.array([not c.start_fixed for c in system.coordinates])
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
     if not manifold.has_values(guess):
-        raise SceneError(list(contradictions.of_values(manifold, guess)))
+        raise SceneError(list(value_problems(manifold, guess)))
     configuration, strayed = manifold.configuration(guess), False
     q: Sequence[Any] = guess.tolist()
     if configuration is None or _violates_constraints(manifold, configuration, free):
         closest, converged, strayed = _search(manifold, guess, free)
         if closest is None:
-            raise SceneError(list(contradictions.of_values(manifold, guess)))
+            raise SceneError(list(value_problems(manifold, guess)))
         if not converged:
             if _half_turned(manifold, closest):
                 _refuse_wrong_rotations(system)
-            raise SceneError(list(contradictions.of_positions(manifold, free, closest)))
+            raise SceneError(list(position_problems(manifold, free, closest)))
         closest = manifold.closest_configuration(closest, guess, free)
         q, _ = manifold.refine(closest, free)
         rounded = np.where(free, _rounded(closest, q), guess)
@@ -241,7 +245,7 @@ def _rates(
             configuration.q, rounded, 0.0, "constraint_rates"
         )
         if np.any(off > limit):
-            problems = contradictions.of_rates(manifold, free, configuration, list(q), rounded)
+            problems = velocity_problems(manifold, free, configuration, list(q), rounded)
             raise SceneError(list(problems))
     return rounded
 

@@ -14,7 +14,7 @@ from itertools import combinations
 from sympy import Expr, S
 
 from eomc.derive.tape import Stage, is_negative
-from eomc.program.ir import Assignment, Operand, Product, Sum, Value, renamed_value
+from eomc.program.ir import Assignment, Operand, Product, Sum, Value, rename_value
 
 
 class ScheduleBuilder:
@@ -107,7 +107,7 @@ class ScheduleBuilder:
             return aliases[name].name if name in aliases else name
 
         for name, value in list(self.values.items()):
-            self.values[name] = renamed_value(value, real)
+            self.values[name] = rename_value(value, real)
         ends[:] = [Operand(o.coefficient, real(o.name)) for o in ends]
         self.hints = {real(n): h for n, h in self.hints.items()}
         for alias in aliases:

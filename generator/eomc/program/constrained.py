@@ -29,7 +29,7 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
     system = derived.system
     if not system.constraints:
         return
-    yield from of_rows(derived)
+    yield from constraint_functions(derived)
     names = [f"lambda_{c.name}" for c in system.constraints]
     yield lower(
         "multipliers", taken.tape, taken.multipliers, system.names, checks=taken.checks,
@@ -57,7 +57,7 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         yield lower("constraint_slopes", e.tape, gradients, system.names)
 
 
-def of_rows(derived: Derivation) -> Iterator[Function]:
+def constraint_functions(derived: Derivation) -> Iterator[Function]:
     """Yield the functions for residuals, Jacobian and rates of the constraint equations.
 
     They are used to find initial values that satisfy the constraints. `derived` contains the
@@ -111,7 +111,7 @@ def _reactions(system: System) -> Function:
     return lower("reactions", derived.tape, derived.values, system.names)
 
 
-def weighted(
+def weighted_gradients(
     functions: Mapping[str, Function], system: System, values: Mapping[str, float]
 ) -> list[tuple[float, list[float]]]:
     """Return the pairs (weight w_k, gradient a_k) with which D + sum_k w_k a_k a_k^T is regular.

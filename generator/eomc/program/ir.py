@@ -187,7 +187,7 @@ def rename(function: Function, new_names: Mapping[str, str]) -> Function:
 
     def renamed(items: Iterable[Assignment]) -> tuple[Assignment, ...]:
         return tuple(
-            Assignment(new_name(a.name), renamed_value(a.value, new_name), a.stage, a.named)
+            Assignment(new_name(a.name), rename_value(a.value, new_name), a.stage, a.named)
             for a in items
         )
 
@@ -200,8 +200,8 @@ def rename(function: Function, new_names: Mapping[str, str]) -> Function:
     )
 
 
-def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
-    """Return a copy of a right-hand side in which each name is replaced by `real(name)`."""
+def rename_value(value: Value, real: Callable[[str], str]) -> Value:
+    """Return a copy of a right-hand side, in which each name n is replaced by `real(n)`."""
     if isinstance(value, Sum):
         return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
     if isinstance(value, Product):

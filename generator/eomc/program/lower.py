@@ -70,7 +70,7 @@ def lower(
 
 
 class _TapeReader(ScheduleBuilder):
-    """Values that are read from a tape."""
+    """The assignments of a function, as they are read from a tape (list of named operations)."""
 
     def __init__(self, tape: Tape) -> None:
         super().__init__()

@@ -237,7 +237,7 @@ class Manifold:
     def __init__(self, system: System) -> None:
         self.system = system
         derived = lagrange.derive(system)
-        functions = {f.name: f for f in constrained.of_rows(derived)}
+        functions = {f.name: f for f in constrained.constraint_functions(derived)}
         e = derived.lagrange or derived.newton_euler
         assert e is not None
         D = lower("D", e.tape, [x for row in e.D for x in row], system.names)

@@ -412,7 +412,7 @@ def _without_inertia(program: Program, k: int) -> list[str]:
     values = nearby(program.system, k)
     try:
         D = matrix(program, "D", values)
-        rows = constrained.weighted(program.functions, program.system, values)
+        rows = constrained.weighted_gradients(program.functions, program.system, values)
     except (ArithmeticError, ValueError):
         return names[:1]
     for w, row in rows:

@@ -35,7 +35,7 @@ MAX_FORMULA_LENGTH = 60  # characters of a formula in a message
 SAMPLE_DISTANCE = 0.1  # of these configurations, relative to the largest coordinate
 
 
-def key(row: Constraint) -> str:
+def scene_key(row: Constraint) -> str:
     """Return the key under which a constraint stands in the scene, such as "loop.knee".
 
     The scene is the TOML file that describes the system.
@@ -43,7 +43,7 @@ def key(row: Constraint) -> str:
     return f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
 
 
-def of_positions(
+def position_problems(
     manifold: Manifold, free: Flags, configuration: Configuration
 ) -> Iterator[Problem]:
     """Yield error messages that explain why no positions satisfy the constraints.
@@ -111,10 +111,10 @@ def of_positions(
         else:
             yield _inconsistent(manifold, rows, configuration)
             return
-    yield system.problem(key(row), message)
+    yield system.problem(scene_key(row), message)
 
 
-def of_rates(
+def velocity_problems(
     manifold: Manifold, free: Flags, place: Configuration, q: Sequence[Any], rates: Vector
 ) -> Iterator[Problem]:
     """Yield error messages that explain why no initial velocities satisfy the constraints.
@@ -166,7 +166,7 @@ def of_rates(
             f"changes at the start{others}, with {fixed_values} held, nor does one of "
             "them alone mend it: leave them out, and they follow"
         )
-    yield system.problem(key(row), message)
+    yield system.problem(scene_key(row), message)
 
 
 def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Configuration) -> Problem:
@@ -191,7 +191,7 @@ def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Config
             f"{residuals}. Correct a formula or a parameter{leave} or start closer to a position "
             "that closes"
         )
-    return manifold.system.problem(key(row), message)
+    return manifold.system.problem(scene_key(row), message)
 
 
 def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Configuration) -> Problem:
@@ -206,7 +206,7 @@ def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Configur
             f"changes at the start{others}, and no rates mend it: the start is a singular "
             "position. Start beside it, or correct a formula"
         )
-    return manifold.system.problem(key(row), message)
+    return manifold.system.problem(scene_key(row), message)
 
 
 def _needed(manifold: Manifold, rows: Sequence[int], configuration: Configuration) -> list[int]:
@@ -264,7 +264,7 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Configuration) -> boo
     return True
 
 
-def powers(system: System) -> list[int]:
+def constraints_without_gradient(system: System) -> list[int]:
     """Return the indices of constraints whose gradient vanishes wherever they are satisfied.
 
     An example is x^2 = 0. Such constraints are recognised by their formulas: powers above 1, sums
@@ -286,7 +286,7 @@ def powers(system: System) -> list[int]:
     return indices
 
 
-def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
+def gradient_problems(system: System, flat: Sequence[int]) -> Iterator[Problem]:
     """Yield an error message for each constraint whose gradient vanishes where it is satisfied.
 
     `flat` contains the indices of these constraints. If `flat` is empty, a single message about all
@@ -304,13 +304,13 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
         )
         alternative = f"{base} for {row.formula}" if simple else SEPARATE_TERMS
         message = f"has no slope where it holds, and so no force: write {alternative}"
-        yield system.problem(key(row), message)
+        yield system.problem(scene_key(row), message)
     if not flat:
         message = f"have no slope where they hold, and so no force: write {SEPARATE_TERMS}"
         yield system.problem("constraints", message)
 
 
-def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration) -> Problem:
+def massless_problem(manifold: Manifold, massless: Sequence[int], start: Configuration) -> Problem:
     """Return an error message about coordinates that neither inertia nor a constraint determines.
 
     `massless` contains the indices of the coordinates, `start` is the initial configuration.
@@ -336,7 +336,7 @@ def of_inertia(manifold: Manifold, massless: Sequence[int], start: Configuration
     return system.problem(f"coordinates.{names[0]}", message)
 
 
-def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
+def value_problems(manifold: Manifold, q: Vector) -> Iterator[Problem]:
     """Yield an error message for each constraint or energy that is not finite at `q`, (nq,).
 
     A message is also yielded if its gradient is not finite.
@@ -352,7 +352,7 @@ def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
                     f"has no {quantity} at {position}: start where it has one, or guess closer "
                     "to it"
                 )
-                yield system.problem(key(c), message)
+                yield system.problem(scene_key(c), message)
                 count += 1
                 break
     if not count:
