@@ -427,8 +427,10 @@ def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> No
 @pytest.mark.parametrize("name", ["everything", "single", "driven", "slopes"])
 def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Into static functions that hand values on in a struct; the self-test passes."""
-    monkeypatch.setattr(outline, "LARGE", 5)
-    monkeypatch.setattr(outline, "PIECE", 8)
+    for size in ("LARGE", "PORTABLE_LARGE"):
+        monkeypatch.setattr(outline, size, 5)
+    for size in ("PIECE", "PORTABLE_PIECE"):
+        monkeypatch.setattr(outline, size, 8)
     small = eomc.sources(made(name))
     title = small.name
     for file in (f"{title}.h", f"{title}.c", "selftest.c"):
@@ -443,6 +445,12 @@ def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.M
     fast, _ = both(name)
     plain = eomc.load(made(name), tmp_path / "modules", form="plain")
     assert [row for row in compared(name, fast, plain, states=3) if not row.passed] == []
+
+
+def test_portable_functions_stay_whole_where_optimised_ones_are_cut() -> None:
+    files = generated("bricard")
+    assert re.search(r"\bbricard_acceleration_\w*2\(", files["fast/bricard.c"])
+    assert not re.search(r"\bbricard_\w+_2\(", files["bricard.c"])
 
 
 @pytest.mark.slow

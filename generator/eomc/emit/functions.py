@@ -60,6 +60,11 @@ class SceneFunctions:
         """The template variables that most templates share: prefix, PREFIX and real."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
+    @property
+    def is_portable(self) -> bool:
+        """Whether these are functions of portable C, which take sines from the C library."""
+        return self.target.real.reach == 0
+
     def groups_angles(self, function: Function) -> bool:
         """Return True if `function` computes sines of several angles at once in vector registers.
 
@@ -244,7 +249,8 @@ class SceneFunctions:
         elements. arguments: names of the C arguments that pieces may take.
         """
         function = rename_reserved(function)
-        parts = outline.split(function, outline.PIECE)
+        size = outline.PORTABLE_PIECE if self.is_portable else outline.PIECE
+        parts = outline.split(function, size)
         shared = {n: c.member("s", n) for part in parts for n in part.keeps}
         type = f"{self.prefix}_{name}_values"
         pieces: list[CFunction] = []
@@ -311,7 +317,7 @@ class SceneFunctions:
             return self._by_columns(public, function, name)
         if name == "energy" and (summed := self._sum_of_energies(public)):
             return summed
-        if outline.is_large(function):
+        if outline.is_large(function, self.is_portable):
             out = kind.out or ("power" if name == "power" else "energy")
             size, last = "1", Block("", (c.return_statement(f"{out}[0]"),))
             if refuses(target, name):
@@ -385,7 +391,7 @@ class SceneFunctions:
         """
         values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
-        if outline.is_large(function):
+        if outline.is_large(function, self.is_portable):
             values, parts, blocks = self.outline(function, name, out, ("along", *ARGUMENT_NAMES))
         else:
             blocks, body = self.straight_line_body(function, out)
@@ -516,7 +522,7 @@ class SceneFunctions:
         unfinite = c.return_if(
             [f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE"
         )
-        if outline.is_large(function):
+        if outline.is_large(function, self.is_portable):
             values, parts, blocks = self.outline(function, "acceleration", "a", ARGUMENT_NAMES)
             first = Block("", (c.declare(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])

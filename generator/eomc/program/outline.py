@@ -19,6 +19,9 @@ from eomc.program.ir import Assignment, Call, Function, Operand
 
 LARGE = 1000  # weight above which a function is split
 PIECE = 500  # weight of an outlined function, within a third
+# Portable C is to be read: a function stays whole up to some 3,000 lines, of 2.5 operations each.
+PORTABLE_LARGE = 7500
+PORTABLE_PIECE = 3000
 
 
 @dataclass(frozen=True)
@@ -48,9 +51,12 @@ def weight(function: Function) -> int:
     return sum(map(_weight, (*function.early, *function.body)))
 
 
-def is_large(function: Function) -> bool:
-    """Return True if a function is long enough to be split into outlined functions."""
-    return weight(function) > LARGE
+def is_large(function: Function, is_portable: bool = False) -> bool:
+    """Return True if a function is long enough to be split into outlined functions.
+
+    is_portable: whether the function belongs to portable C, where longer functions stay whole.
+    """
+    return weight(function) > (PORTABLE_LARGE if is_portable else LARGE)
 
 
 def _weight(a: Assignment) -> int:
