@@ -127,7 +127,7 @@ def test_steps_are_judged_where_time_tells_them(
     stiff: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, drive = AdaptiveRefusalChecks(stiff, RefusalChecks(stiff)), AdaptiveRefusalChecks.drive
-    assert made.longest() == 0
+    assert made.step_limit_violations() == 0
     start, late = (e.state for e in stiff.expected)
     assert made.step_limit_errors(start) == 0 and made.step_limit_errors(late) is None
 
@@ -135,9 +135,11 @@ def test_steps_are_judged_where_time_tells_them(
         return drive(self, *of, **how)
 
     monkeypatch.setattr(AdaptiveRefusalChecks, "drive", unheard)
-    assert made.longest() == 1
+    assert made.step_limit_violations() == 1
     monkeypatch.setattr(stiff, "expected", stiff.expected[1:])
-    assert isinstance(made.longest(), Measurement)  # nothing is judged, and it says so
+    assert isinstance(
+        made.step_limit_violations(), Measurement
+    )  # nothing is judged, and it says so
 
 
 def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> None:

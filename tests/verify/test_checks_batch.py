@@ -84,9 +84,9 @@ def test_own_and_shared_parameters_are_compared_by_what_rounding_does(modules: M
     alike = [replace(s, params=b.instances[0].params) for s in b.instances]
     one, other = (b.simulate("rk4", alike, None, own=own) for own in (False, True))
     by = [b.simulate("rk4", b.rounded(alike), None)]
-    assert b.near(one, other, by) and b.near(by[0], other, by)
+    assert b.differ_by_rounding_only(one, other, by) and b.differ_by_rounding_only(by[0], other, by)
     one.q[3, 5] *= 1 + 1e-10
-    assert not b.near(one, other, by)
+    assert not b.differ_by_rounding_only(one, other, by)
 
 
 COUPLED = """eomc = 1
@@ -111,5 +111,5 @@ def test_what_one_coordinate_alone_would_throw_counts(modules: Modules) -> None:
     s = replace(b.instances[0], q=np.array([0.5, 0.5]), qd=np.array([0.1, 0.1]), params=None)
     beside = run_in_c(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
     assert np.abs(beside.rows[:, 1] - run_in_c(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
-    off = b.step_off("rk4", s, beside.rows[:, 1])
+    off = b.step_error("rk4", s, beside.rows[:, 1])
     assert off is not None and off < 10

@@ -78,10 +78,13 @@ def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
     runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
     turns = 2 * np.pi * np.round(TURNS / 2 / np.pi)
     for by, holds in (((3, 1), True), ((-3, -1), True), ((1, 1), False), ((1, -1), False)):
-        assert runs.holds(State(np.array([0.3, 0.1]) + turns * np.array(by), np.zeros(2))) == holds
+        assert (
+            runs.constraints_hold(State(np.array([0.3, 0.1]) + turns * np.array(by), np.zeros(2)))
+            == holds
+        )
     for off, holds in ((1e-8, True), (1e-3, False)):  # digits of 2.5e7 are of 4e-9
         q = np.array([0.3, 0.1]) + turns * np.array([3, 1]) + [off, 0]
-        assert runs.holds(State(q, np.zeros(2))) == holds
+        assert runs.constraints_hold(State(q, np.zeros(2))) == holds
 
 
 PHASE = """eomc = 1
@@ -114,7 +117,7 @@ def test_angles_are_compared_as_far_as_doubles_hold_them(
         module._model = None
         system = phase(angle)
         runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
-        assert (runs.far() > runs.limit) == fails
+        assert (runs.far_angle_error() > runs.limit) == fails
 
 
 def test_the_largest_angle_is_that_of_all_formulas() -> None:
@@ -145,10 +148,10 @@ def test_inputs_are_compared_as_long_as_steps_do_not_throw_the_state_out() -> No
     module._model = None
     runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
     spread, at = np.array([[1.0], [1.0]]), State(np.zeros(1), np.array([1e-5]))
-    steps, x, growth = runs.driven(at, np.zeros((6, 1)), spread)
+    steps, x, growth = runs.reference_run(at, np.zeros((6, 1)), spread)
     assert steps == 1
     assert 1 < x[1, 0] < 100 and 1e5 < growth < 1e6
-    steps, x, _ = runs.driven(at, np.full((6, 1), 1e5), spread)
+    steps, x, _ = runs.reference_run(at, np.full((6, 1), 1e5), spread)
     assert (steps, x[1, 0]) == (0, 1e-5)
 
 
@@ -157,8 +160,8 @@ def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) 
     """There stages of gauss16 are computed one by one, which stands last in its sweep."""
     assert shipped.source.count(STAGE) == 1
     wrong = shipped.source.replace(STAGE, STAGE.replace("= at", "= -at"))
-    assert found(shipped, shipped.source, lambda check: RunChecks(check).far()) < 10
-    assert found(shipped, wrong, lambda check: RunChecks(check).far()) > RunChecks.limit
+    assert found(shipped, shipped.source, lambda check: RunChecks(check).far_angle_error()) < 10
+    assert found(shipped, wrong, lambda check: RunChecks(check).far_angle_error()) > RunChecks.limit
 
 
 @pytest.mark.slow

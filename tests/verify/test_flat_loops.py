@@ -104,12 +104,12 @@ def test_roundings_that_grow_where_rows_fade_are_no_errors(
     made = comparison(modules, *of, seed=seed)
     runs, rows = RunChecks(made), ConstraintChecks(made, made.module)
     for found, limit in (
-        (runs.short(), SHORT_LIMIT), (runs.long(), runs.limit),
+        (runs.short_step_error(), SHORT_LIMIT), (runs.long_step_error(), runs.limit),
         (rows.residual_along_run("rk4"), MAX_RESIDUAL),
     ):  # fmt: skip
         assert isinstance(found, float) and found <= limit
-    runs.sines()  # which draws before it
-    assert runs.far() <= runs.limit
+    runs.sine_error()  # which draws before it
+    assert runs.far_angle_error() <= runs.limit
 
 
 @pytest.mark.slow

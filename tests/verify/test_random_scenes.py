@@ -270,7 +270,7 @@ def test_short_steps_end_where_rounding_of_constraints_lets_them(modules: Module
         assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
         np.random.default_rng(1034), None,
     )  # fmt: skip
-    found = RunChecks(comparison).short()
+    found = RunChecks(comparison).short_step_error()
     assert isinstance(found, float) and found < 5
 
 
@@ -284,8 +284,8 @@ def test_stages_by_sweeps_end_at_rounding_of_far_angles(modules: Modules) -> Non
         np.random.default_rng(25099), None,
     )  # fmt: skip
     runs = RunChecks(comparison)
-    runs.sines()  # which draws before it
-    assert 0 < runs.far() < 100
+    runs.sine_error()  # which draws before it
+    assert 0 < runs.far_angle_error() < 100
 
 
 def test_wide_scenes_have_all_of_it() -> None:
@@ -390,7 +390,7 @@ def test_an_angle_that_is_wound_up_may_throw_another_coordinate(
 def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, potential: str
 ) -> None:
-    monkeypatch.setattr(RunChecks, "rounded", lambda *_: 99.0)
+    monkeypatch.setattr(RunChecks, "run_difference", lambda *_: 99.0)
     text = WELL.replace("-depth*exp(-x**2)", potential).replace(', "gauss8", "gauss16"', "")
     (row,) = (r for r in checked(text, modules).results if r.name == "rk4 rounding")
     bends = "max" in potential
@@ -404,13 +404,13 @@ def test_what_shorter_steps_make_less_is_no_rounding(
 ) -> None:
     """As of friction that turns within a thousandth of a step."""
     found = dict(zip(FINE, (99.0, finer), strict=True))
-    monkeypatch.setattr(RunChecks, "rounded", lambda *given: found[given[-1]])
+    monkeypatch.setattr(RunChecks, "run_difference", lambda *given: found[given[-1]])
     text = WELL.replace(', "gauss8", "gauss16"', "")
     made = from_scene(parse(text, "test.toml"))
     module = modules.unoptimised(text)
     runs = RunChecks(Comparison(made, module, np.random.default_rng(0), 4))
     steep = Measurement(finer, "forces are so steep that shorter steps differ less")
-    assert runs.fine("rk4") == (finer if finer > 50 else steep)
+    assert runs.rounding_error("rk4") == (finer if finer > 50 else steep)
 
 
 def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -> None:

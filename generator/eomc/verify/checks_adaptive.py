@@ -198,7 +198,9 @@ def report_refusals(check: Comparison, refusals: RefusalChecks) -> None:
         return
     checks = AdaptiveRefusalChecks(check, refusals)
     check.add_check("adaptive steps: refusals", 0, "runs that end otherwise", checks.wrong_refusals)
-    check.add_check("adaptive steps: longest", 0, "runs that end otherwise", checks.longest)
+    check.add_check(
+        "adaptive steps: longest", 0, "runs that end otherwise", checks.step_limit_violations
+    )
 
 
 class AdaptiveRefusalChecks:
@@ -272,7 +274,7 @@ class AdaptiveRefusalChecks:
                     wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
         return wrong
 
-    def longest(self) -> float | Measurement:
+    def step_limit_violations(self) -> float | Measurement:
         """Return the number of errors in adaptive runs with a limit of the step size.
 
         No step may exceed the limit, the last step must end at the given time, and a run in several

@@ -53,10 +53,10 @@ class BatchChecks:
             add(f"batch of {method}", ALIKE, "units of rounding, from single runs",
                 partial(self.compare_with_single_steps, method))  # fmt: skip
             add(f"batch of {method}: places", 0, "batches with other bits",
-                partial(self.places, method))  # fmt: skip
+                partial(self.differing_batches, method))  # fmt: skip
             if not self.check.system.constraints:  # which move the starts that fail
                 add(f"batch of {method}: failures", 0, "instances that end otherwise",
-                    partial(self.failures, method))  # fmt: skip
+                    partial(self.wrong_failures, method))  # fmt: skip
 
     def sample_instances(self) -> list[State]:
         """Return COUNT initial states with different parameters, all with a regular mass matrix D.
@@ -77,10 +77,10 @@ class BatchChecks:
                 x[1] = x[1] + self.random.choice(LONG) * sampler.spread / self.h
             params = s.params or sampler.defaults
             instance = replace(s, q=x[0], qd=x[1], t=t, u=None, params=params)
-            instances.append(self.projected(instance, replace(s, t=t, u=None, params=params)))
+            instances.append(self.project(instance, replace(s, t=t, u=None, params=params)))
         return instances
 
-    def projected(self, s: State, near: State) -> State:
+    def project(self, s: State, near: State) -> State:
         """Return the state `s` projected onto the constraints.
 
         If the projection fails, return that of the state `near`; if that fails too, return the
@@ -116,7 +116,7 @@ class BatchChecks:
                 t0=states[0].t,
             )  # fmt: skip
 
-    def tables(self) -> list[Vector | None]:
+    def input_kinds(self) -> list[Vector | None]:
         """Return the kinds of inputs with which batches are tried, as arguments of `simulate`.
 
         They are None for the scene's signals (its formulas for inputs), constant inputs (COUNT,
@@ -137,7 +137,7 @@ class BatchChecks:
         alone.
         """
         errors: list[float | None] = []
-        for u in self.tables():
+        for u in self.input_kinds():
             runs = self.simulate(method, self.instances, u)
             for k, s in enumerate(self.instances):
                 rows = np.stack([runs.q[k], runs.qd[k]])
@@ -145,10 +145,10 @@ class BatchChecks:
                     row = u if u is None or u.ndim == 2 else u[:, n]
                     at = replace(s, q=rows[0, n], qd=rows[1, n], t=s.t + n * self.h,
                                  u=None if row is None else row[k])  # fmt: skip
-                    errors.append(self.step_off(method, at, rows[:, n + 1]))
+                    errors.append(self.step_error(method, at, rows[:, n + 1]))
         return largest(errors, "no step of an instance has digits to compare")
 
-    def step_off(self, method: str, s: State, end: Vector) -> float | None:
+    def step_error(self, method: str, s: State, end: Vector) -> float | None:
         """Return the difference between a step in a batch and a single step, in units of rounding.
 
         s: the state before the step. end: q and q̇ after the step in the batch, (2, nq). The result
@@ -169,7 +169,7 @@ class BatchChecks:
         size = wide * (grown + np.abs(alone.rows[:, 1]))
         return self.check.units(end, alone.rows[:, 1], size)
 
-    def places(self, method: str) -> float:
+    def differing_batches(self, method: str) -> float:
         """Return the number of batch runs in which some instance does not have the expected bits.
 
         The expected bits are those of a run of all instances together. They are compared with runs
@@ -178,7 +178,7 @@ class BatchChecks:
         beside other neighbours. Runs with shared and with own parameters may differ by rounding.
         """
         wrong = 0
-        for u in self.tables():
+        for u in self.input_kinds():
             whole = self.simulate(method, self.instances, u)
             order = self.random.permutation(COUNT)
             parts = [order, *(order[:n] for n in (1, 3, 9))]
@@ -193,10 +193,10 @@ class BatchChecks:
             wrong += not np.array_equal(sparse.q[good], whole.q[good][:, stored])
             wrong += not np.array_equal(sparse.qd[good], whole.qd[good][:, stored])
             alike = [replace(s, params=self.instances[0].params) for s in self.instances]
-            alike = [self.projected(s, self.instances[0]) for s in alike]
+            alike = [self.project(s, self.instances[0]) for s in alike]
             one, other = (self.simulate(method, alike, u, own=own) for own in (False, True))
-            by = [self.simulate(method, self.rounded(alike), u) for _ in range(2)]
-            wrong += not self.near(one, other, by)
+            by = [self.simulate(method, self.with_rounding_errors(alike), u) for _ in range(2)]
+            wrong += not self.differ_by_rounding_only(one, other, by)
             wrong += not self.first_step_agrees(method, whole, u)
         if self.check.system.constraints:
             return float(wrong)
@@ -208,7 +208,7 @@ class BatchChecks:
             )
         )
 
-    def rounded(self, states: list[State]) -> list[State]:
+    def with_rounding_errors(self, states: list[State]) -> list[State]:
         """Return copies of the states with each number of q and q̇ changed by about one rounding."""
         eps, n = self.check.eps, len(states[0].q)
         signs = self.random.choice([-eps, eps], (len(states), 2, n))
@@ -218,7 +218,7 @@ class BatchChecks:
         ]
         return [replace(s, q=x[0], qd=x[1]) for s, x in zip(states, moved, strict=True)]
 
-    def near(self, one: Any, other: Any, rounded: Sequence[Any]) -> bool:
+    def differ_by_rounding_only(self, one: Any, other: Any, rounded: Sequence[Any]) -> bool:
         """Return whether two batch runs, `one` and `other`, differ by rounding only.
 
         In one of them all instances share their parameters, in the other each has its own. Results
@@ -278,7 +278,7 @@ class BatchChecks:
             and np.array_equal(qd[good], whole.qd[good, 1])
         )
 
-    def failures(self, method: str) -> float:
+    def wrong_failures(self, method: str) -> float:
         """Return the number of errors in batch runs in which some instances fail.
 
         It is an error if an instance that does not fail has other bits than in a batch without
@@ -294,7 +294,7 @@ class BatchChecks:
                 states[k] = replace(states[k], qd=states[k].qd + (1 + n) * fast)
         wrong = 0
         good = np.setdiff1d(np.arange(COUNT), bad)
-        for u in self.tables():
+        for u in self.input_kinds():
             for every in (1, EVERY):
                 whole = self.simulate(method, self.instances, u, every=every)
                 other = self.simulate(method, states, u, every=every)
@@ -303,7 +303,7 @@ class BatchChecks:
             whole = self.simulate(method, states, u)
             for k in bad:
                 at = replace(states[k], u=None if u is None else u[k])
-                wrong += self.ends_otherwise(method, whole, k, at)
+                wrong += self.fails_differently(method, whole, k, at)
             none = self.simulate(method, [states[k] for k in bad], None if u is None else u[bad])
             wrong += not _are_permuted(none, whole, np.array(bad))
         return float(wrong + self.singular_starts_that_move(method))
@@ -321,7 +321,7 @@ class BatchChecks:
         batch = self.simulate(method, states, None)
         return int(np.sum((batch._codes != SINGULAR) | (batch.steps != 0)))
 
-    def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
+    def fails_differently(self, method: str, whole: Any, k: int, s: State) -> bool:
         """Return whether a failing instance of a batch run ends otherwise than in a single run.
 
         whole: the batch run by `method`. k: index of the failing instance. s: its initial state,

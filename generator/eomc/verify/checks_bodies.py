@@ -84,17 +84,17 @@ class BodyChecks:
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
             self.check.add_check(f"{label} of bodies", limit, "of its size, from point masses",
-                           partial(self.compare, name))  # fmt: skip
+                           partial(self.largest_error, name))  # fmt: skip
 
-    def compare(self, name: str) -> float:
+    def largest_error(self, name: str) -> float:
         """Return the largest relative error of a quantity of the module over some states.
 
         name: "kinetic_energy", "potential_energy" or "power" (the power of the forces). The
         expected value is recomputed from the scene's bodies.
         """
-        return self.check.largest(partial(self.off, name), 8)
+        return self.check.largest(partial(self.relative_error, name), 8)
 
-    def off(self, name: str, e: Expected) -> float:
+    def relative_error(self, name: str, e: Expected) -> float:
         """Return the relative error of the module's quantity `name` at the state of `e`.
 
         The expected value is recomputed from the scene's bodies by interpolation in time. Of
@@ -634,7 +634,7 @@ class FrameChecks:
                     self.scene, self.check.sampler.with_discrete_parameters(s), width, 1.0, bend
                 )
 
-    def off(
+    def relative_error(
         self, values: Vector, exact: Callable[[MotionLine], Vector], *state: Any, least: float = 0.0
     ) -> float:
         """Return the largest error of the module's `values`, relative to the largest exact value.
@@ -680,7 +680,7 @@ class FrameChecks:
 
         n = len(self.names)
         both = np.hstack([poses.position, np.reshape(poses.rotation, (n, -1))])
-        return self.off(both, exact, e.state)
+        return self.relative_error(both, exact, e.state)
 
     def twists(self, line: MotionLine) -> Vector:
         """Return linear and angular velocities of all nf frames along a motion, (nf, 6, n).
@@ -703,7 +703,7 @@ class FrameChecks:
         def exact(line: MotionLine) -> Vector:
             return self.relevant_twists(self.twists(line)[..., line.middle])
 
-        return self.off(twists, exact, s, least=least)
+        return self.relative_error(twists, exact, s, least=least)
 
     def twist_scale(self, s: State, rates: Vector) -> float:
         """Return the largest entry of |J| rates, a bound of the frames' velocities at a state.
@@ -727,7 +727,7 @@ class FrameChecks:
 
         sampler = self.check.sampler
         least = self.twist_scale(s, sampler.speed**2 / sampler.spread)
-        return self.off(rates, exact, s, qdd, least=least)
+        return self.relative_error(rates, exact, s, qdd, least=least)
 
     def jacobians(self, e: Expected) -> float:
         """Return the relative error of the module's Jacobians of frames.
@@ -747,7 +747,7 @@ class FrameChecks:
                 return both[0] - both[1]
 
             moving = replace(s, qd=direction * rates)
-            worst = max(worst, self.off(J[..., k] * rates[k], exact, moving))
+            worst = max(worst, self.relative_error(J[..., k] * rates[k], exact, moving))
         return worst
 
     def forces(self, e: Expected) -> float:
@@ -784,4 +784,4 @@ class FrameChecks:
             d = 2 if self.plane else 3
             return np.hstack([sum(weights), center[:d], self.relevant_components(linear, angular)])
 
-        return self.off(momentum, exact, s)
+        return self.relative_error(momentum, exact, s)

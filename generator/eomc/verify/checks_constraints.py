@@ -55,13 +55,13 @@ def report(check: Comparison) -> None:
     for name in VALUES:
         check.add_check(name, LIMIT, UNITS, partial(check.value, name))
     if check.dtype == np.float64:  # single precision leaves differences too few digits
-        check.add_check("A beside differences", SLOPE_LIMIT, "of A", checks.slopes)
+        check.add_check("A beside differences", SLOPE_LIMIT, "of A", checks.jacobian_error)
         if check.system.run.needs_derivatives and not check.system.modes:
-            check.add_check("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent)
-    check.add_check("power of multipliers", LIMIT, UNITS, checks.power)
+            check.add_check("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent_error)
+    check.add_check("power of multipliers", LIMIT, UNITS, checks.power_error)
     if check.system.reactions:
         limit = max(WORK_TOLERANCE, 30 * check.eps)  # the latter in single precision
-        check.add_check("reactions: virtual work", limit, "of its size", checks.reactions)
+        check.add_check("reactions: virtual work", limit, "of its size", checks.reaction_error)
     for module, form in check.forms:
         own = ConstraintChecks(check, module)
         if form:
@@ -94,7 +94,7 @@ class ConstraintChecks:
         self.check, self.module, self.system = check, module, check.system
         self.holonomic = np.array([c.holonomic for c in check.system.constraints])
 
-    def slopes(self) -> float:
+    def jacobian_error(self) -> float:
         """Return the largest relative error of the module's constraint Jacobian A over the states.
 
         The exact A is a difference quotient of the constraint equations, with respect to q for
@@ -124,7 +124,7 @@ class ConstraintChecks:
 
         return check.largest(error)
 
-    def tangent(self) -> float:
+    def tangent_error(self) -> float:
         """Return how much constraints and their rates change along the module's tangent directions.
 
         The module's function `tangent` returns directions in [q; q̇] along which the constraints
@@ -167,7 +167,7 @@ class ConstraintChecks:
                 )
         return total
 
-    def power(self) -> float:
+    def power_error(self) -> float:
         """Return the largest error of the power of the multipliers, λ·(A q̇), in units of rounding.
 
         A q̇ + b are the rates of the constraint equations, and must be zero. The expected power is
@@ -186,7 +186,7 @@ class ConstraintChecks:
 
         return self.check.largest(error)
 
-    def reactions(self) -> float:
+    def reaction_error(self) -> float:
         """Return the largest relative error of the virtual work of reactions over some states.
 
         Reactions are the force and moment at the point of a closed loop: they act on the loop's
@@ -322,9 +322,11 @@ def report_projection(check: Comparison, module: Any, form: str) -> None:
     module: the module of the optimised or the portable C code. form: prefix of the checks' names.
     """
     checks = ProjectionChecks(check, module)
-    check.add_check(f"{form}project", LIMIT, UNITS, partial(checks.projected, False))
-    check.add_check(f"{form}project, held", LIMIT, UNITS, partial(checks.projected, True))
-    check.add_check(f"{form}project: refusals", 0, "calls that end otherwise", checks.refusals)
+    check.add_check(f"{form}project", LIMIT, UNITS, partial(checks.projection_error, False))
+    check.add_check(f"{form}project, held", LIMIT, UNITS, partial(checks.projection_error, True))
+    check.add_check(
+        f"{form}project: refusals", 0, "calls that end otherwise", checks.wrong_refusals
+    )
 
 
 def report_massless(check: Comparison, refusals: RefusalChecks) -> None:
@@ -333,7 +335,7 @@ def report_massless(check: Comparison, refusals: RefusalChecks) -> None:
     With these parameters D has no positive eigenvalue. refusals: the checks of refusals.
     """
     checks = MasslessChecks(check, refusals)
-    check.add_check("no inertia: refusals", 0, "calls that do not refuse", checks.refuse)
+    check.add_check("no inertia: refusals", 0, "calls that do not refuse", checks.missing_refusals)
     if not checks.states:
         last = check.results[-1]
         check.results[-1] = replace(last, unit=f"{last.unit}: no parameters take all inertia away")
@@ -350,7 +352,7 @@ class ProjectionChecks:
     check: Comparison
     module: Any
 
-    def projected(self, with_fixed: bool) -> float | Measurement:
+    def projection_error(self, with_fixed: bool) -> float | Measurement:
         """Return the largest error of the states that `project` returns, in units of rounding.
 
         States displaced from the constraints are projected by the module and by the reference.
@@ -417,7 +419,7 @@ class ProjectionChecks:
         names = [c.name for c in self.check.system.coordinates]
         return [name for i in fixed for name in (names[i], f"{names[i]}_dot")]
 
-    def refusals(self) -> float:
+    def wrong_refusals(self) -> float:
         """Return the number of wrong results of `project` for states that are hard to project.
 
         A state that can't be projected must be refused (an error is returned) and left unchanged. A
@@ -517,7 +519,7 @@ class MasslessChecks:
                 if np.all(np.isfinite(D)) and np.linalg.eigvalsh(D)[-1] <= 0:
                     yield s
 
-    def refuse(self) -> float:
+    def missing_refusals(self) -> float:
         """Return the number of calls without inertia that return no error or write to outputs.
 
         The calls are `acceleration`, a run by each method, and `project`, with parameters with

@@ -65,20 +65,20 @@ class RefusalChecks:
             self.report_singular()
         add("not finite", 0, "calls that do not refuse", self.nonfinite_errors)
         for method in self.check.methods:
-            find = partial(self.overflow, method)
+            find = partial(self.overflow_errors, method)
             add(f"{method} too long", 0, "runs that end otherwise", find)
 
     def report_singular(self) -> None:
         """Append the checks of a singular mass matrix D, for a system without constraints."""
         add, unit = self.check.add_check, "states judged wrongly"
-        add("singular D", 0, unit, self.definite)
+        add("singular D", 0, unit, self.misjudged_states)
         if not self.singular:
             last = self.check.results[-1]
             self.check.results[-1] = replace(
                 last, unit=unit + ": D is regular at all that were tried"
             )
-        add("singular D: refusals", 0, "calls that do not refuse", self.refuse)
-        add("singular D in a run", 0, "runs that go on", self.run_into)
+        add("singular D: refusals", 0, "calls that do not refuse", self.missing_refusals)
+        add("singular D in a run", 0, "runs that go on", self.runs_past_singularity)
 
     def report_constrained(self) -> None:
         """Append the checks of states with negative inertia, for a system with constraints.
@@ -87,7 +87,7 @@ class RefusalChecks:
         """
         add, unit = self.check.add_check, "calls that do not refuse"
         add("negative D along the rows", 0, unit, self.negative_inertia_errors)
-        add("negative D along the rows: refusals", 0, unit, self.refuse)
+        add("negative D along the rows: refusals", 0, unit, self.missing_refusals)
 
     # where D is singular
 
@@ -99,7 +99,7 @@ class RefusalChecks:
         collected in `singular`.
         """
         wrong = 0
-        for s in self.suspects():
+        for s in self.suspect_states():
             with np.errstate(all="ignore"):
                 D, A = (
                     np.asarray(self.check.reference.evaluate(name, s.q, s.qd, 0.0, None, s.params))
@@ -112,13 +112,13 @@ class RefusalChecks:
                     wrong += not self.lacks_precision(s, D)
         return float(wrong)
 
-    def definite(self) -> float:
+    def misjudged_states(self) -> float:
         """Return the number of states at which the module accepts a bad or refuses a good D.
 
         The mass matrix D is good if it is positive definite. States that the module judges
         correctly are collected in `singular` and `regular`.
         """
-        suspects = self.suspects()
+        suspects = self.suspect_states()
         stacked: dict[str, Any] = {
             "q": np.array([s.q for s in suspects]),
             "qd": np.array([s.qd for s in suspects]),
@@ -133,16 +133,16 @@ class RefusalChecks:
         for s, D, least in zip(
             suspects, mass_matrices, _least_eigenvalues(mass_matrices).tolist(), strict=True
         ):
-            singular = least < -EIGENVALUE_TOLERANCE or (least == 0 and self.exact(s))
+            singular = least < -EIGENVALUE_TOLERANCE or (least == 0 and self.is_exact(s))
             if not (singular or least > EIGENVALUE_TOLERANCE):
                 continue
             if (self.accelerate(s)[0] == SINGULAR) == singular:
                 (self.singular if singular else self.regular).append(s)
-            elif singular or (self.natural(s) and self.exact(s)):
+            elif singular or (self.has_default_signs(s) and self.is_exact(s)):
                 wrong += not self.lacks_precision(s, D)
         return float(wrong)
 
-    def exact(self, s: State) -> bool:
+    def is_exact(self, s: State) -> bool:
         """Return whether rounding has no influence on whether D is singular at a state.
 
         It has an influence if a parameter is tiny or huge relative to its default: if one inertia
@@ -151,7 +151,7 @@ class RefusalChecks:
         sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
         return all(x == 0 or 2.0**-30 < x < 2.0**30 for x in sizes)
 
-    def natural(self, s: State) -> bool:
+    def has_default_signs(self, s: State) -> bool:
         """Return whether all parameters of a state have the signs of their defaults.
 
         If not, a module that divides by masses (method of link multipliers) may refuse a mass that
@@ -170,13 +170,13 @@ class RefusalChecks:
         off = np.abs(self.check.ask("D", s) - D)
         return bool(np.any(off > 1e-6 * np.outer(size, size)))
 
-    def suspects(self) -> list[State]:
+    def suspect_states(self) -> list[State]:
         """Return states at which D may be singular since their parameters are changed.
 
         In some, a single parameter is zero, negative, tiny or huge; in others, all parameters are
         random with random signs.
         """
-        states = self.places()
+        states = self.base_states()
         suspects_ = []
         changes: list[dict[str, float]] = [{}]
         for name, value in self.defaults.items():
@@ -199,7 +199,7 @@ class RefusalChecks:
         order = self.random.permutation(len(suspects_))[:most]
         return [suspects_[k] for k in sorted(order)]
 
-    def places(self) -> list[State]:
+    def base_states(self) -> list[State]:
         """Return states at which D may be singular for some parameters.
 
         They are the initial state, three random states, and states with all coordinates equal to 0,
@@ -229,7 +229,7 @@ class RefusalChecks:
         clean = bool(np.all(a == MARK)) if status else bool(np.all(np.isfinite(a)))
         return status, clean
 
-    def refuse(self) -> float:
+    def missing_refusals(self) -> float:
         """Return the number of calls at singular states that return no error or write to outputs.
 
         The functions are acceleration, multipliers, steps and runs by all methods, and derivatives.
@@ -241,7 +241,7 @@ class RefusalChecks:
             for name in solved:
                 wrong += not self.raises(partial(self.call, name, s), "singular")
             for method in self.check.methods:
-                wrong += not self.stays(method, s, "singular")
+                wrong += not self.stops_at_start(method, s, "singular")
             derivatives_present = {"linearize": self.model.has_slopes, "discretize": run.discretize}
             for name in (name for name, there in derivatives_present.items() if there):
                 wrong += not self.raises(partial(self.call, name, s), "singular")
@@ -262,7 +262,7 @@ class RefusalChecks:
             return getattr(fault, "status", "") == status and "q = " in str(fault)
         return False
 
-    def stays(self, method: str, s: State, status: str) -> bool:
+    def stops_at_start(self, method: str, s: State, status: str) -> bool:
         """Return whether a step and a run from `s` stop at once with the error `status`.
 
         The step must leave its outputs unchanged, and the run must store the initial state only.
@@ -281,7 +281,7 @@ class RefusalChecks:
             unchanged and run.status == status and run.steps == 0 and "stopped" in run.message
         )
 
-    def run_into(self) -> float:
+    def runs_past_singularity(self) -> float:
         """Return the number of runs that continue past a singular D, or store nan or inf.
 
         The runs start at states with a regular D and lead to states where D is singular. States at
@@ -289,7 +289,7 @@ class RefusalChecks:
         """
         wrong = tried = 0
         h = self.check.system.run.h
-        for s in filter(self.exact, self.singular):
+        for s in filter(self.is_exact, self.singular):
             starts = [r for r in self.regular if r.params == s.params]
             for start in starts[:1]:
                 if tried == 24:
@@ -303,7 +303,7 @@ class RefusalChecks:
                 for begin, parts in ways:
                     at = replace(begin, qd=(s.q - begin.q) / (parts * h))
                     for method in self.check.methods:
-                        wrong += self.goes_on(method, at, math.ceil(parts))
+                        wrong += self.continues_past_singularity(method, at, math.ceil(parts))
         return float(wrong)
 
     def regular_neighbour(self, s: State, turn: int) -> list[State]:
@@ -322,7 +322,7 @@ class RefusalChecks:
                 return [at]
         return []
 
-    def goes_on(self, method: str, s: State, steps: int) -> bool:
+    def continues_past_singularity(self, method: str, s: State, steps: int) -> bool:
         """Return whether a run makes a step from a state at which D is not positive definite.
 
         The run starts at `s`, by `method`, with up to steps + 3 steps. The result is True as well
@@ -378,17 +378,17 @@ class RefusalChecks:
             status, clean = self.accelerate(at)
             wrong += not clean
             # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
-            silent = math.isnan(what) and not status and self.matters(s, field, i)
-            wrong += silent and not self.bounded(at)
+            silent = math.isnan(what) and not status and self.depends_on(s, field, i)
+            wrong += silent and not self.has_finite_reference(at)
             if self.check.system.constraints:
-                wrong += not self.multiplied(at)
+                wrong += not self.has_valid_multipliers(at)
             for method in self.check.methods:
                 run = run_in_c(self.model, method, at, self.check.system.run.h, 3)
                 wrong += run.steps != 0 or run.status not in REFUSED
-            wrong += self.model.has_slopes and not self.linearized(at)
+            wrong += self.model.has_slopes and not self.has_valid_linearization(at)
         return float(wrong)
 
-    def multiplied(self, s: State) -> bool:
+    def has_valid_multipliers(self, s: State) -> bool:
         """Return whether the C function `multipliers` gives finite values, or an error and nan."""
         model = self.model
         multipliers = np.zeros(len(model.constraint_names), model.dtype)
@@ -401,7 +401,7 @@ class RefusalChecks:
         )  # fmt: skip
         return bool(np.all(np.isnan(multipliers) if refused else np.isfinite(multipliers)))
 
-    def matters(self, s: State, field: str, i: int) -> bool:
+    def depends_on(self, s: State, field: str, i: int) -> bool:
         """Return whether the module's accelerations at `s` depend on one coordinate or velocity.
 
         field: "q" or "qd". i: index of the coordinate.
@@ -411,7 +411,7 @@ class RefusalChecks:
         one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
         return not np.array_equal(one, other)
 
-    def bounded(self, s: State) -> bool:
+    def has_finite_reference(self, s: State) -> bool:
         """Return whether the reference's D, bias and tau are finite at a state with nan or inf.
 
         They may be, since functions such as tanh and atan are finite at infinity.
@@ -423,7 +423,7 @@ class RefusalChecks:
             ]
         return all(bool(np.all(np.isfinite(value))) for value in values)
 
-    def linearized(self, s: State) -> bool:
+    def has_valid_linearization(self, s: State) -> bool:
         """Return whether the C function `linearization` gives finite values or returns an error.
 
         After an error its outputs must be unchanged.
@@ -440,7 +440,7 @@ class RefusalChecks:
         written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
         return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
-    def overflow(self, method: str) -> float:
+    def overflow_errors(self, method: str) -> float:
         """Return the number of runs with far too long steps that do not end as required.
 
         With such steps the state overflows, or the iteration for the stages of an implicit method

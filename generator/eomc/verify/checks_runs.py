@@ -189,23 +189,27 @@ class RunChecks:
         add, rounding = self.check.add_check, "units of rounding"
         if self.check.methods[0] == "rk4":
             unit = rounding + ", times steps and growth"
-            add("long steps", self.limit, unit, self.long)
-            add("short steps", SHORT_LIMIT, unit, self.short)
+            add("long steps", self.limit, unit, self.long_step_error)
+            add("short steps", SHORT_LIMIT, unit, self.short_step_error)
         if np.any(self.sampler.angles):
-            add("sines around the circle", 20, rounding, self.sines)  # wrong terms make hundreds
+            # wrong terms of sines make hundreds of units
+            add("sines around the circle", 20, rounding, self.sine_error)
         if np.any(self.sampler.angles) or _reads_time(self.check.system):
-            add("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
+            unit = f"units, of angles of {TURNS:.3g}"
+            add("angles far out", self.limit, unit, self.far_angle_error)
         if self.model.nu and self.check.methods[0] == "rk4":
-            add("inputs row by row", self.limit, rounding, self.inputs)
-        add("every entry written", 0, "values with entries left", self.written)
+            add("inputs row by row", self.limit, rounding, self.input_sequence_error)
+        add("every entry written", 0, "values with entries left", self.incomplete_functions)
         for method in self.check.methods:
-            add(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
+            find = partial(self.divided_run_differences, method)
+            add(f"{method} cut anywhere", 0, "runs with other bits", find)
             if self.check.dtype == np.float64 and METHODS[method].order >= 4:
-                add(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
+                unit = "units of the state"
+                add(f"{method} rounding", ROUNDED, unit, partial(self.rounding_error, method))
 
     limit = 1e3
 
-    def written(self) -> float:
+    def incomplete_functions(self) -> float:
         """Return the number of functions of the module that leave some entry of `out` unwritten."""
         s, n, left = self.states[-1], self.model.nq, 0
         for name in ("D", "C", "g", "bias", "tau"):
@@ -242,7 +246,7 @@ class RunChecks:
         steps += [2 * moved / rate] if rate > 0 else []
         return min([*steps, 100 * self.h]) if steps else self.h
 
-    def long(self) -> float | Measurement:
+    def long_step_error(self) -> float | Measurement:
         """Return the largest error of runs with long steps, in units of rounding.
 
         In such steps angles move so far that the C code can't update their sines from the previous
@@ -264,7 +268,7 @@ class RunChecks:
         errors = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
         return largest(errors, "a difference grows too much in one long step")
 
-    def short(self) -> float | Measurement:
+    def short_step_error(self) -> float | Measurement:
         """Return the largest error of runs with short steps, in units of rounding.
 
         In such steps angles hardly change, so that the C code updates their sines from the previous
@@ -274,7 +278,7 @@ class RunChecks:
         errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
         return largest(errors, "a difference grows too much in one short step")
 
-    def sines(self) -> float:
+    def sine_error(self) -> float:
         """Return the largest error of D, g and bias at angles all around the circle, in roundings.
 
         At these angles the polynomials for sines and cosines need all of their terms.
@@ -310,7 +314,7 @@ class RunChecks:
             {name: values[k] for name, values in values_by_name.items()} for k in range(len(states))
         ]
 
-    def far(self) -> float:
+    def far_angle_error(self) -> float:
         """Return the largest error of values and steps at angles of many turns and at late times.
 
         The values are those of the dynamics, such as D and the accelerations; the steps are single
@@ -335,7 +339,7 @@ class RunChecks:
                 at = replace(at, t=s.t + t)
             if angle(at) > 2 / EPS:
                 continue
-            if constrained and not self.holds(at):
+            if constrained and not self.constraints_hold(at):
                 continue
             with np.errstate(all="ignore"):
                 far = self.sampler.expected(at)
@@ -358,11 +362,11 @@ class RunChecks:
                 errors.append(self.far_steps(at, gain))
             for method in self.check.methods:
                 if method != "rk4":
-                    solved = self.solved(far) if METHODS[method].implicit else far
+                    solved = self.with_stage_errors(far) if METHODS[method].implicit else far
                     errors.append(self.check.one_step_error(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
 
-    def holds(self, s: State) -> bool:
+    def constraints_hold(self, s: State) -> bool:
         """Return whether the constraints hold at a state with angles that are many turns away.
 
         Adding whole turns to angles may violate a constraint: two geared angles, for instance, need
@@ -373,7 +377,7 @@ class RunChecks:
         )
         return bool(np.all(np.abs(off) <= 1e3 * self.check.eps * size))
 
-    def solved(self, e: Expected) -> Expected:
+    def with_stage_errors(self, e: Expected) -> Expected:
         """Return a copy of `e` with larger error units of accelerations, for implicit methods.
 
         The unit grows since the stages of an implicit method are found by iteration: a rounding
@@ -412,7 +416,7 @@ class RunChecks:
         end = run_in_c(self.model, "rk4", s, h, self.few).rows[:, -1]
         return self.check.units(end, x[:, 0], size)
 
-    def inputs(self) -> float | Measurement:
+    def input_sequence_error(self) -> float | Measurement:
         """Return the largest error of runs whose inputs change from step to step.
 
         The error is in units of rounding and relative to a run of the reference. It is inf if the C
@@ -425,7 +429,7 @@ class RunChecks:
             scale = np.where(signals > 0, signals, 1)
             u = self.random.normal(size=(LONG_STEP_COUNT, self.model.nu)) * scale
             at = replace(s, u=u)
-            n, x, growth = self.driven(s, u, spread)
+            n, x, growth = self.reference_run(s, u, spread)
             run = run_in_c(self.model, self.check.methods[0], at, self.h, LONG_STEP_COUNT)
             size = np.abs(np.array([s.q, s.qd])) + np.abs(x)
             size = LONG_STEP_COUNT * (size + growth * spread)
@@ -439,7 +443,7 @@ class RunChecks:
                 errors += [] if same else [math.inf]
         return largest(errors, "the first step leads too far")
 
-    def driven(self, s: State, u: Vector, spread: Vector) -> tuple[int, Vector, float]:
+    def reference_run(self, s: State, u: Vector, spread: Vector) -> tuple[int, Vector, float]:
         """Return a run of the reference with given inputs, as far as the state stays near `s`.
 
         The results are the number of steps, the state after them (2, nq), and the factor by which a
@@ -460,7 +464,7 @@ class RunChecks:
                 sure = n + 1, x[:, 0], max(growth, 1.0)
         return sure
 
-    def cut(self, method: str) -> float:
+    def divided_run_differences(self, method: str) -> float:
         """Return the number of runs whose bits depend on how the run is divided or stored.
 
         A run by `method` that is divided into several calls, or that stores fewer states, must give
@@ -471,17 +475,17 @@ class RunChecks:
             steps = [self.h, *(self.large_step(s, part) for part in LONG)]
             steps += [self.turning_step(s, part) for part in (SHORT, SHORT / 64)]
             for h in steps:
-                for at in (s, *([self.table(s)] if self.model.nu else [])):
-                    wrong += self.differ(method, at, h)
+                for at in (s, *([self.with_input_sequence(s)] if self.model.nu else [])):
+                    wrong += self.differing_variants(method, at, h)
         return float(wrong)
 
-    def table(self, s: State) -> State:
+    def with_input_sequence(self, s: State) -> State:
         """Return a copy of the state with random inputs, (STEPS, nu), that change between steps."""
         u = self.random.normal(size=(STEPS, self.model.nu))
         u[::2] = u[1::2]  # inputs that jump at some steps and not at others
         return replace(s, u=u)
 
-    def differ(self, method: str, s: State, h: float) -> int:
+    def differing_variants(self, method: str, s: State, h: float) -> int:
         """Return how many variants of a run differ from the run in one call in any bit.
 
         The run starts at `s` with steps of h seconds. The variants are: a run divided into several
@@ -507,7 +511,7 @@ class RunChecks:
         )
         return wrong + (not moved.is_identical(fresh))
 
-    def fine(self, method: str) -> float | Measurement:
+    def rounding_error(self, method: str) -> float | Measurement:
         """Return how far rounding moves the end of a run of thousands of steps, in roundings.
 
         Two runs with different, very short steps cover the same time. The method's error is then
@@ -519,7 +523,7 @@ class RunChecks:
         """
         states, errors = self.check.few(4), list[float]()
         for parts in FINE:
-            errors.append(self.rounded(method, states, parts))
+            errors.append(self.run_difference(method, states, parts))
             if errors[-1] <= ROUNDED:
                 return errors[-1]
         if corners := self.check.corners:
@@ -528,7 +532,9 @@ class RunChecks:
             return Measurement(errors[-1], "forces are so steep that shorter steps differ less")
         return min(errors)
 
-    def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
+    def run_difference(
+        self, method: str, states: Sequence[Expected], parts: Sequence[int]
+    ) -> float:
         """Return the median difference of the final states of two runs, in units of rounding.
 
         The median is over the initial `states`. Both runs cover the same time by `method`. parts:
