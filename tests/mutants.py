@@ -80,7 +80,7 @@ def outcomes(module: Any, check: Any) -> Vector:
         near = 1 + 0.3 * draw.standard_normal((2, len(s.q)))
         at = State(s.q * near[0], s.qd * near[1], s.t, s.u, s.params)
         for name in names:
-            found.append(check.ask(name, at))
+            found.append(check.module_value(name, at))
         for method in module.methods:
             h = check.system.run.h * float(np.exp(draw.uniform(-3, 2)))
             for cuts in ((3, 17), ()):

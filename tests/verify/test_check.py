@@ -271,8 +271,9 @@ def test_each_method_has_its_row_of_one_step() -> None:
     for methods in (("rk4", "dp8", "gauss4"), ("gauss8", "euler")):
         names = list[str]()
         given = SimpleNamespace(
-            methods=methods, add_check=lambda name, *_, names=names: names.append(name), value=len,
-            steps=None, runs=None, run_energy=None, step_by=len,
+            methods=methods, add_check=lambda name, *_, names=names: names.append(name),
+            value_error=len, rk4_step_error=None, run_error=None, run_energy_error=None,
+            step_error=len,
         )  # fmt: skip
         add_value_checks(cast(Comparison, given))
         assert [n.removeprefix("one step of ") for n in names if "one step of" in n] == [

@@ -38,7 +38,7 @@ def test_what_a_rounding_of_the_state_moves_is_allowed(monkeypatch: pytest.Monke
     system = scene_system("mass_spring")
     made = Comparison(system, StandIn(symbolic.reference_for(system)), np.random.default_rng(0), 4)
     e = made.expected[-1]
-    e = replace(e, value={**e.value, "acceleration": made.ask("acceleration", e.state)})
+    e = replace(e, value={**e.value, "acceleration": made.module_value("acceleration", e.state)})
 
     def powers(_: Comparison, __: str, s: State) -> Any:
         return np.array([[s.q[0] ** 3 * s.qd[0] ** 2]])

@@ -54,7 +54,7 @@ def test_a_step_that_is_refused_without_need_fails() -> None:
     module: Any = StandIn(symbolic.derive(system))
     module.simulate = lambda **how: SimpleNamespace(status="no convergence")
     comparison = Comparison(system, module, np.random.default_rng(0), 4)
-    assert comparison.step_by("gauss16") == math.inf
+    assert comparison.step_error("gauss16") == math.inf
 
 
 GEARS = """eomc = 1
@@ -168,6 +168,6 @@ def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) 
 def test_a_stepper_that_refuses_what_it_could_do_fails(shipped: Shipped) -> None:
     right, wrong = "double most = 0, change = 0, size;", "double most = 0, change = 1, size;"
     assert shipped.source.count(right) == 1
-    assert found(shipped, shipped.source, lambda check: check.step_by("gauss16")) < 10
+    assert found(shipped, shipped.source, lambda check: check.step_error("gauss16")) < 10
     refusing = shipped.source.replace(right, wrong)
-    assert found(shipped, refusing, lambda check: check.step_by("gauss16")) == 1e300
+    assert found(shipped, refusing, lambda check: check.step_error("gauss16")) == 1e300

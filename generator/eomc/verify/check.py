@@ -120,13 +120,13 @@ def add_value_checks(comparison: Comparison) -> None:
     """
     add, rounding = comparison.add_check, "units of rounding"
     for name in (*VALUES, "acceleration"):
-        add(name, LIMIT, rounding, partial(comparison.value, name))
+        add(name, LIMIT, rounding, partial(comparison.value_error, name))
     if comparison.methods[0] == "rk4":  # which is what the reference steps by
-        add("one step", LIMIT, rounding, comparison.steps)
-        add("run", LIMIT, rounding + ", times steps and growth", comparison.runs)
+        add("one step", LIMIT, rounding, comparison.rk4_step_error)
+        add("run", LIMIT, rounding + ", times steps and growth", comparison.run_error)
     for method in comparison.methods[comparison.methods[0] == "rk4" :]:
-        add(f"one step of {method}", LIMIT, rounding, partial(comparison.step_by, method))
-    add("run: its energy", LIMIT, rounding, comparison.run_energy)
+        add(f"one step of {method}", LIMIT, rounding, partial(comparison.step_error, method))
+    add("run: its energy", LIMIT, rounding, comparison.run_energy_error)
 
 
 def add_property_checks(comparison: Comparison) -> None:
@@ -135,16 +135,16 @@ def add_property_checks(comparison: Comparison) -> None:
     Examples: D is symmetric, and derivatives agree with difference quotients.
     """
     add, rounding = comparison.add_check, "units of rounding"
-    add("D = D^T", LIMIT, rounding, comparison.symmetry)
+    add("D = D^T", LIMIT, rounding, comparison.symmetry_error)
     if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
-        add("D > 0", 0, "least eigenvalue of D, scaled", comparison.definiteness, minimum=True)
-    add("bias = C qd + g", LIMIT, rounding, comparison.bias)
+        add("D > 0", 0, "least eigenvalue of D, scaled", comparison.least_eigenvalue, minimum=True)
+    add("bias = C qd + g", LIMIT, rounding, comparison.bias_error)
     force = "tau + A^T lambda" if comparison.system.constraints else "tau"
-    add(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion)
+    add(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion_error)
     checks_derivatives.report_acceleration_derivatives(comparison)
     if comparison.dtype == np.float64:  # single precision leaves its differences too few digits
         # differences are exact to 1e-10; a wrong sign in C makes an error of 1
-        add("Ddot - 2C + dD/dt skew", 1e-6, "of D's rate", comparison.skewness)
+        add("Ddot - 2C + dD/dt skew", 1e-6, "of D's rate", comparison.skewness_error)
         comparison.add_convergence_checks()
 
 

@@ -104,10 +104,10 @@ class BodyChecks:
         s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
         if name == "power":  # that of forces alone
-            value = float(self.check.ask("tau", s) @ s.qd)
+            value = float(self.check.module_value("tau", s) @ s.qd)
             size = float(e.size["tau"] @ np.abs(s.qd))
         else:
-            value, size = float(self.check.ask(name, s)), float(e.size[name])
+            value, size = float(self.check.module_value(name, s)), float(e.size[name])
         for width in widths(self.check.sampler.spread, s.qd):
             with np.errstate(all="ignore"):
                 key = id(e), width

@@ -53,7 +53,7 @@ def report(check: Comparison) -> None:
     """
     checks = ConstraintChecks(check, check.module)
     for name in VALUES:
-        check.add_check(name, LIMIT, UNITS, partial(check.value, name))
+        check.add_check(name, LIMIT, UNITS, partial(check.value_error, name))
     if check.dtype == np.float64:  # single precision leaves differences too few digits
         check.add_check("A beside differences", SLOPE_LIMIT, "of A", checks.jacobian_error)
         if check.system.run.needs_derivatives and not check.system.modes:

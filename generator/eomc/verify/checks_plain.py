@@ -46,11 +46,11 @@ def report(check: Comparison) -> None:
         "plain C",
         LIMIT,
         unit,
-        lambda: float(np.max([twin.value(name) for name in COMPARED_VALUES])),
+        lambda: float(np.max([twin.value_error(name) for name in COMPARED_VALUES])),
     )
     if check.methods[0] == "rk4":
-        check.add_check("plain C: one step", LIMIT, unit, twin.steps)
-        check.add_check("plain C: run", LIMIT, unit + ", times steps and growth", twin.runs)
+        check.add_check("plain C: one step", LIMIT, unit, twin.rk4_step_error)
+        check.add_check("plain C: run", LIMIT, unit + ", times steps and growth", twin.run_error)
     check.add_check("plain C beside fast", LIMIT, unit, partial(_values, check, plain))
     if (
         hasattr(check.module, "linearize")

@@ -167,7 +167,7 @@ class RefusalChecks:
         lengths are huge.
         """
         size = np.sqrt(np.abs(np.diag(D)))
-        off = np.abs(self.check.ask("D", s) - D)
+        off = np.abs(self.check.module_value("D", s) - D)
         return bool(np.any(off > 1e-6 * np.outer(size, size)))
 
     def suspect_states(self) -> list[State]:
@@ -408,7 +408,9 @@ class RefusalChecks:
         """
         x = getattr(s, field).copy()
         x[i] += 0.1 * (1 + abs(x[i]))
-        one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
+        one, other = (
+            self.check.module_value("acceleration", at) for at in (s, replace(s, **{field: x}))
+        )
         return not np.array_equal(one, other)
 
     def has_finite_reference(self, s: State) -> bool:

@@ -265,7 +265,7 @@ class RunChecks:
         ]
         # almost the largest angles by which the C code rotates sines
         pairs += [(e, self.turning_step(e.state, 0.012, 0.11)) for e in self.turning]
-        errors = (self.check.run(e, h=h, steps=self.few) for e, h in pairs)
+        errors = (self.check.run_error_from(e, h=h, steps=self.few) for e, h in pairs)
         return largest(errors, "a difference grows too much in one long step")
 
     def short_step_error(self) -> float | Measurement:
@@ -275,7 +275,10 @@ class RunChecks:
         ones. The runs are compared with runs of the reference.
         """
         starts = self.check.few(2 if self.check.large else 8)
-        errors = (self.check.run(e, self.turning_step(e.state, SHORT), self.few) for e in starts)
+        errors = (
+            self.check.run_error_from(e, self.turning_step(e.state, SHORT), self.few)
+            for e in starts
+        )
         return largest(errors, "a difference grows too much in one short step")
 
     def sine_error(self) -> float:
@@ -299,7 +302,7 @@ class RunChecks:
         for at, values in zip(states, expected, strict=True):
             for name, width in size.items():
                 if np.all(np.isfinite(values[name])):
-                    value = self.check.ask(name, at)
+                    value = self.check.module_value(name, at)
                     errors.append(self.check.units(value, values[name], width))
         return float(np.max(errors, initial=0))
 
@@ -353,7 +356,9 @@ class RunChecks:
             for name in ("D", "g", "bias", "tau", *energies, "acceleration"):
                 near = far if wound and name == "acceleration" else e
                 size = wide * near.size[name] + far.size[name]
-                errors.append(self.check.units(self.check.ask(name, at), far.value[name], size))
+                errors.append(
+                    self.check.units(self.check.module_value(name, at), far.value[name], size)
+                )
             if wound:
                 continue
             gain = wide * e.size["acceleration"] + far.size["acceleration"]
@@ -363,7 +368,7 @@ class RunChecks:
             for method in self.check.methods:
                 if method != "rk4":
                     solved = self.with_stage_errors(far) if METHODS[method].implicit else far
-                    errors.append(self.check.one_step_error(method, solved, self.h) or 0.0)
+                    errors.append(self.check.step_error_from(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
 
     def constraints_hold(self, s: State) -> bool:
@@ -634,7 +639,7 @@ def _entry_errors(
             known = [check.reference.evaluate(name, x.q, x.qd, x.t, None, x.params) for x in states]
             expected = np.reshape(known, (len(states), -1))
             parts = expected / sines[:, None]
-            values = np.reshape([check.ask(name, x) for x in states], expected.shape)
+            values = np.reshape([check.module_value(name, x) for x in states], expected.shape)
             least = VANISHING_LIMIT * check.eps * np.ravel(e.size[name])
             for k, (part, entry, value) in enumerate(
                 zip(parts.T, expected.T, values.T, strict=True)

@@ -85,7 +85,9 @@ class Comparison:
         self.sampler = Sampler(self.reference, random, self.effort)
         self.expected = self.sampler.states(self.effort.states if states is None else states)
         self.results: list[CheckResult] = []
-        self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
+        self.reference_runs: dict[
+            tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]
+        ] = {}
 
     def add_convergence_checks(self) -> None:
         """Check convergence orders, advised step sizes and the power balance; add the results.
@@ -246,7 +248,7 @@ class Comparison:
         ]
         return float(sum(theirs != ours for theirs, ours in pairs))
 
-    def value(self, name: str) -> float:
+    def value_error(self, name: str) -> float:
         """Return the largest error of one of the module's values over all states, in roundings.
 
         name: "acceleration" or a key of VALUES, such as "D" or "energy".
@@ -260,7 +262,7 @@ class Comparison:
 
         return float(np.max([error(e) for e in (*self.expected, *self.unusual_states)]))
 
-    def steps(self) -> float | Measurement:
+    def rk4_step_error(self) -> float | Measurement:
         """Return the largest error of one RK4 step with the scene's h, in units of rounding.
 
         Steps from a few of the states are compared with the reference's steps.
@@ -283,7 +285,7 @@ class Comparison:
 
         return largest(map(error, self.few(self.effort.few)), "all steps are thrown far")
 
-    def step_by(self, method: str) -> float | Measurement:
+    def step_error(self, method: str) -> float | Measurement:
         """Return the largest error of one step of `method` over a few states, in units of rounding.
 
         The expected step applies the method's Runge-Kutta tableau to the reference's accelerations.
@@ -292,7 +294,7 @@ class Comparison:
         implicit method does not converge.
         """
         errors = (
-            self.one_step_error(method, e, h)
+            self.step_error_from(method, e, h)
             for e in self.few(self.effort.few)
             for h in (self.system.run.h, LONG_STEP * self.system.run.h)
         )
@@ -311,7 +313,7 @@ class Comparison:
 
         return acceleration
 
-    def one_step_error(self, method: str, e: Expected, longest: float) -> float | None:
+    def step_error_from(self, method: str, e: Expected, longest: float) -> float | None:
         """Return the error of one step of the module by `method`, in units of rounding.
 
         e: the state at which the step begins. longest: the largest step size to be tried, s. Its
@@ -354,15 +356,15 @@ class Comparison:
                 break
         return math.inf if failures == 2 or refused else None
 
-    def runs(self) -> float | Measurement:
+    def run_error(self) -> float | Measurement:
         """Return the largest error of two short runs, in units of rounding.
 
         One run starts at the initial state of the scene, the other at a random state.
         """
-        errors = map(self.run, self.few(2))
+        errors = map(self.run_error_from, self.few(2))
         return largest(errors, "a difference grows too much in one step")
 
-    def run(self, e: Expected, h: float = 0.0, steps: int = 0) -> float | None:
+    def run_error_from(self, e: Expected, h: float = 0.0, steps: int = 0) -> float | None:
         """Return the error of a run from the state of `e`, in units of rounding.
 
         The run has `steps` steps of `h` seconds; 0 stands for a default number and for the scene's
@@ -373,9 +375,9 @@ class Comparison:
         s, h = e.state, h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         key = id(s), h, steps  # the states live as long
-        if key not in self.motions:
-            self.motions[key] = self._motion(s, h, steps)
-        t, x, growth, rounded = self.motions[key]
+        if key not in self.reference_runs:
+            self.reference_runs[key] = self._reference_run(s, h, steps)
+        t, x, growth, rounded = self.reference_runs[key]
         if len(t) < 2:
             return None
         kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
@@ -388,7 +390,9 @@ class Comparison:
         off_time = self.units(run.t, t, np.abs(t) + h)
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
-    def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector, Vector]:
+    def _reference_run(
+        self, s: State, h: float, steps: int
+    ) -> tuple[Vector, Vector, Vector, Vector]:
         """Return the reference's run while it is certain: t (n,), states, growth, rounding errors.
 
         The states are (n, 2, nq). growth (n, 1, 1): of a small difference of the initial state. The
@@ -433,7 +437,7 @@ class Comparison:
             how.setdefault("t0", begin)
         return simulate(self.module, projected_start(self.module, s), **how)
 
-    def run_energy(self) -> float:
+    def run_energy_error(self) -> float:
         """Return the largest error of the energies stored in a run, in units of rounding.
 
         They are compared with the reference's energies at the states stored in the same run.
@@ -448,7 +452,7 @@ class Comparison:
                 errors += [self.units(energy_of_run, energy, size)] if np.isfinite(energy) else []
         return float(np.max(errors, initial=0))
 
-    def ask(self, name: str, s: State) -> Vector:
+    def module_value(self, name: str, s: State) -> Vector:
         """Return the value of the module's function `name`, such as "D", at the state `s`."""
         return evaluate_module(self.module, name, s)
 
@@ -460,7 +464,7 @@ class Comparison:
         if self.dtype == np.float64:
             return True
         try:
-            self.ask("acceleration", s)
+            self.module_value("acceleration", s)
         except ArithmeticError:
             return False
         return True
@@ -479,7 +483,7 @@ class Comparison:
 
     # properties of the module alone
 
-    def symmetry(self) -> float:
+    def symmetry_error(self) -> float:
         """Return the largest difference of D and Dᵀ over all states, in units of rounding."""
 
         def error(e: Expected) -> float:
@@ -488,7 +492,7 @@ class Comparison:
 
         return self.largest(error)
 
-    def definiteness(self) -> float:
+    def least_eigenvalue(self) -> float:
         """Return the least eigenvalue of D over all states, scaled to a unit diagonal.
 
         The scaled matrix is D_ij / sqrt(D_ii D_jj).
@@ -503,7 +507,7 @@ class Comparison:
 
         return -self.largest(lambda e: -least_eigenvalue(e))
 
-    def skewness(self) -> float:
+    def skewness_error(self) -> float:
         """Return the largest entry of N + Nᵀ over all states, N = Ḋ - 2C + ∂D/∂t, relative to Ḋ.
 
         N must be skew-symmetric. Ḋ and ∂D/∂t are difference quotients of order 8 of the module's D,
@@ -519,7 +523,7 @@ class Comparison:
 
             def rate_of_D(qd: Vector, width: float) -> Vector:
                 at = (
-                    self.ask("D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
+                    self.module_value("D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
                     for n, _ in stencil
                     for k in (n, -n)
                 )
@@ -534,7 +538,7 @@ class Comparison:
 
         return self.largest(error)
 
-    def bias(self) -> float:
+    def bias_error(self) -> float:
         """Return the largest error of bias = C q̇ + g over all states, in units of rounding."""
 
         def error(e: Expected) -> float:
@@ -545,7 +549,7 @@ class Comparison:
 
         return self.largest(error)
 
-    def motion(self) -> float:
+    def motion_error(self) -> float:
         """Return the largest residual of D q̈ + bias = τ over all states, in units of rounding.
 
         With constraints the right-hand side is τ + Aᵀλ.

@@ -267,7 +267,7 @@ class Convergence:
         """Return the same as `end`, by RK4 in Python."""
 
         def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
-            return self.ask("acceleration", replace(s, q=q, qd=qd, t=t))
+            return self.module_value("acceleration", replace(s, q=q, qd=qd, t=t))
 
         x, h = np.array([s.q, s.qd]), span / steps
         with np.errstate(all="ignore"):
@@ -388,18 +388,18 @@ class Convergence:
             if str(run.status) != "ok":
                 return [], False
             states = states_of_run(run, s)
-            power = np.array([self.ask("power", row) for row in states])
+            power = np.array([self.module_value("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
-            after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
+            after, before = (self.module_value("jacobi", states[i]) for i in (-1, 0))
             gaps.append(float(after - before - simpson @ power))
             names = ("kinetic_energy", "potential_energy")
-            sizes = [np.abs(self.ask(name, states[i])) for name in names for i in (0, -1)]
+            sizes = [np.abs(self.module_value(name, states[i])) for name in names for i in (0, -1)]
             energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
             if abs(gaps[-1]) <= 1e3 * EPS * energy:
                 return gaps, True
         return (gaps if np.all(np.isfinite(gaps)) else []), False
 
-    def ask(self, name: str, s: State) -> Vector:
+    def module_value(self, name: str, s: State) -> Vector:
         """Return the module's value `name`, such as "power" or "jacobi", at the state `s`."""
         return evaluate_module(self.module, name, s)
 
@@ -514,7 +514,7 @@ class Advice:
         """True if accelerations depend on velocities."""
         s = self.runs.places[-1].state
         at_rest = replace(s, qd=0 * s.qd)
-        one, other = (self.runs.ask("acceleration", x) for x in (s, at_rest))
+        one, other = (self.runs.module_value("acceleration", x) for x in (s, at_rest))
         return not np.array_equal(one, other)
 
     def _warns(self, method: str, s: State, h: float) -> bool:
@@ -568,7 +568,7 @@ class Advice:
             by = SMALL_PERTURBATION**0.5 * 1e-2 * direction.reshape(2, n) * self.scale
             try:
                 ends = [
-                    self.runs.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
+                    self.runs.module_value("acceleration", replace(s, q=moved[0], qd=moved[1]))
                     for moved in (x + by, x - by)
                 ]
             except ArithmeticError:  # off the constraints there may be none
