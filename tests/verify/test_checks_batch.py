@@ -71,19 +71,19 @@ def test_the_last_row_of_an_instance_that_stops_is_that_alone(modules: Modules) 
     for steps in range(alone.steps, 0, -1):  # rounding may decide a step that all but fails
         whole.steps[0] = steps
         whole.q[0, steps + 1 :] = whole.qd[0, steps + 1 :] = np.nan
-        assert not b.ends_otherwise("rk4", whole, 0, s)
+        assert not b.fails_differently("rk4", whole, 0, s)
         whole.q[0, steps] *= 1.01
-        assert b.ends_otherwise("rk4", whole, 0, s)
+        assert b.fails_differently("rk4", whole, 0, s)
     whole = b.simulate("rk4", b.instances, None)
     whole.q[0, STEPS] *= 1.01
-    assert not b.ends_otherwise("rk4", whole, 0, b.instances[0])
+    assert not b.fails_differently("rk4", whole, 0, b.instances[0])
 
 
 def test_own_and_shared_parameters_are_compared_by_what_rounding_does(modules: Modules) -> None:
     b = batches(modules, "-x/7")
     alike = [replace(s, params=b.instances[0].params) for s in b.instances]
     one, other = (b.simulate("rk4", alike, None, own=own) for own in (False, True))
-    by = [b.simulate("rk4", b.rounded(alike), None)]
+    by = [b.simulate("rk4", b.with_rounding_errors(alike), None)]
     assert b.differ_by_rounding_only(one, other, by) and b.differ_by_rounding_only(by[0], other, by)
     one.q[3, 5] *= 1 + 1e-10
     assert not b.differ_by_rounding_only(one, other, by)

@@ -38,7 +38,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
     module = StandIn(TaylorReference(made))  # type: ignore[arg-type]  # which answers alike
     check = Comparison(made, module, np.random.default_rng(0), states)
     assert check.expected
-    return {name: BodyChecks(check, made.scene).compare(name) for name in NAMES}
+    return {name: BodyChecks(check, made.scene).largest_error(name) for name in NAMES}
 
 
 @pytest.mark.slow

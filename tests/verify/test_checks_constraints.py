@@ -119,7 +119,7 @@ def test_reactions_are_compared_where_a_coordinate_hardly_moves(
     made = ConstraintChecks(
         hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]})
     )
-    assert least <= made.reactions() <= most
+    assert least <= made.reaction_error() <= most
 
 
 BELT = """eomc = 1
@@ -145,7 +145,7 @@ def test_rows_do_the_work_of_their_parts_without_rates(bent: dict[str, Any]) -> 
     """A belt's with no t in it, of which it was expected that it does none."""
     system = assembled(from_scene(parse(BELT)))
     of = Comparison(system, None, np.random.default_rng(0), 4)
-    power = ConstraintChecks(of, Answering(of, **bent)).power()
+    power = ConstraintChecks(of, Answering(of, **bent)).power_error()
     assert (power > LIMIT) == bool(bent)
 
 

@@ -37,7 +37,7 @@ class Projecting:
 
 
 def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, CheckResult]:
-    monkeypatch.setattr(ProjectionChecks, "refusals", lambda _: 0.0)  # which ask a C function
+    monkeypatch.setattr(ProjectionChecks, "wrong_refusals", lambda _: 0.0)  # which ask a C function
     random = np.random.default_rng(0)
     made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
     report_projection(made, module, "")
