@@ -63,11 +63,11 @@ def read(scene: ScenePath) -> System:
     _refuse_other(scene, "")
     if not isinstance(scene, (str, os.PathLike)):
         raise EomcError(f"give the path of a scene, here {scene!r}")
-    return _assembled(from_scene(scenes.read(scene)))
+    return assemble(from_scene(scenes.read(scene)))
 
 
-def _assembled(system: System) -> System:
-    """Return the system, with consistent initial values if it has constraints."""
+def assemble(system: System) -> System:
+    """Return a system with initial values that satisfy its constraints, if it has any."""
     if not system.constraints:
         return system
     from eomc.program import assembly
@@ -98,7 +98,7 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
 
     if isinstance(system, (str, os.PathLike)):
         raise EomcError(f"give a System, such as eomc.read({str(system)!r})")
-    system = _assembled(system)
+    system = assemble(system)
     derived = program.build(lagrange.derive(system))
     for problem in (
         *system.warnings,
@@ -352,7 +352,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     if not isinstance(source, Path) and source.scene and read(source.file) == source:
         source = Path(source.file)
     if not isinstance(source, Path):
-        system = _eventful(source, events, what)
+        system = _add_events(source, events, what)
         return load(system, folder / ".events" / system.digest[:16])
     try:
         data = source.read_bytes()
@@ -367,7 +367,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         try:
             scenes.parse(text, what)
         except SceneError as wrong:
-            raise _by_name(wrong, len(model.events), events) from None
+            raise _name_events(wrong, len(model.events), events) from None
         with writing(f"{what}: {file}"):
             root.mkdir(parents=True, exist_ok=True)
             with atomic_write(file) as new:
@@ -375,7 +375,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     return load(file, root)
 
 
-def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
+def _add_events(system: System, events: Mapping[str, Any], what: str) -> System:
     """Return the system that System.make returns with additional events."""
     from dataclasses import replace
 
@@ -393,26 +393,26 @@ def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
         extended: System = system.again(events={**own, **events})
         return extended
     except SceneError as wrong:
-        problems = [replace(p, file=what) for p in _by_name(wrong, len(own), events).problems]
+        problems = [replace(p, file=what) for p in _name_events(wrong, len(own), events).problems]
         raise SceneError(problems) from None
     except EomcError as wrong:
         raise EomcError(str(wrong).replace("System.make:", f"{what}:")) from None
 
 
-def _by_name(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneError:
+def _name_events(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneError:
     """Replace the numbers of events in problems by names; `own` events of the scene come first."""
     from dataclasses import replace
 
     names = {f"event.{own + k}": str(called) for k, called in enumerate(events, start=1)}
     return type(wrong)(
         [
-            replace(p, line=0, column=-1, source="", key=_renamed(p.key, names))
+            replace(p, line=0, column=-1, source="", key=_rename_key(p.key, names))
             for p in wrong.problems
         ]
     )
 
 
-def _renamed(key: str, names: Mapping[str, str]) -> str:
+def _rename_key(key: str, names: Mapping[str, str]) -> str:
     """Return the key of an event with its name in place of its number."""
     start = ".".join(key.split(".")[:2])
     return names.get(start, start) + key[len(start) :]

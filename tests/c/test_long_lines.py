@@ -32,7 +32,7 @@ def test_no_line_of_c_is_long(name: str, steps: str) -> None:
     text = re.sub(r"(?m)^(method|tolerance|batch)\b.*\n", "", text)
     text = text.replace(f'name = "{name}"', f'name = "{name}_of_a_long_name"')
     text = text.replace("[run]\n", f"[run]\n{steps}\n")
-    made = pipeline._assembled(from_scene(parse(text, f"{name}.toml")))
+    made = pipeline.assemble(from_scene(parse(text, f"{name}.toml")))
     for file, text in eomc.sources(made).embeddable.items():
         assert file.endswith((".txt", ".in")) or wide(text) == [], file
 

@@ -46,11 +46,11 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
 
 
 def test_a_lock_of_windows_is_waited_for(windows: list[tuple[int, int]], tmp_path: Path) -> None:
-    with cache.locked(tmp_path / "a.lock"):
+    with cache.hold_lock(tmp_path / "a.lock"):
         assert windows == [(1, 1), (1, 1)]
     assert (tmp_path / "a.lock").read_bytes() == b""
     (tmp_path / "folder").mkdir()
-    with pytest.raises(EomcError, match="remove it"), cache.locked(tmp_path / "folder"):
+    with pytest.raises(EomcError, match="remove it"), cache.hold_lock(tmp_path / "folder"):
         pass
 
 
@@ -61,7 +61,7 @@ def test_a_lock_that_can_not_be_taken_is_an_error(
         raise OSError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(sys.modules["msvcrt"], "locking", refused)
-    with pytest.raises(OSError, match="denied"), cache.locked(tmp_path / "a.lock"):
+    with pytest.raises(OSError, match="denied"), cache.hold_lock(tmp_path / "a.lock"):
         pass
 
 

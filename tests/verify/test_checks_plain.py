@@ -156,7 +156,7 @@ def test_derivatives_that_cancel_to_nothing_are_compared_in_units_of_their_terms
     system = from_scene(parse(text, "disk.toml"))
     plain = eomc.load(system, Path("build/tests/plain_disk"), form="plain")
     fast = eomc.load(system, Path("build/tests/fast_disk"), form="fast")
-    made = Comparison(pipeline._assembled(system), fast, np.random.default_rng(0), 8)
+    made = Comparison(pipeline.assemble(system), fast, np.random.default_rng(0), 8)
     assert checks_plain._linearization(made, plain) < LIMIT
     for off in (1e-8, 1e-11):
         assert checks_plain._linearization(made, Linear(plain, off)) > LIMIT

@@ -12,7 +12,7 @@ import click
 from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.cli import options
-from eomc.cli.terminal import say, shown, status_line, warn
+from eomc.cli.terminal import escape_line, say, status_line, warn
 
 
 @click.command("build")
@@ -73,7 +73,7 @@ def build_command(
         )  # fmt: skip
         if not quiet and not as_json:
             outcome = f"built in {seconds:.1f} s" if built.fresh else "is up to date"
-            say(f"{shown(built.folder)}/: {outcome}")
+            say(f"{escape_line(built.folder)}/: {outcome}")
     if as_json:
         say(json.dumps(results, indent=1))
 
@@ -91,8 +91,8 @@ def _refuse_duplicate_names(scenes: Sequence[Path]) -> None:
         name = pipeline.name_and_digest(scene)[0]
         if name and (other := paths.setdefault(name, scene)) != scene:
             raise EomcError(
-                f"{shown(other)} and {shown(scene)} are both named '{name}': one would replace "
-                "the other"
+                f"{escape_line(other)} and {escape_line(scene)} are both named '{name}': one would "
+                "replace the other"
             )
 
 
@@ -104,7 +104,7 @@ def _write_wheels(scenes: Sequence[Path], quiet: bool, as_json: bool) -> None:
             wheel = pipeline.write_wheel(scene, Path(), warn=warn)
         results.append({"scene": str(scene), "wheel": str(wheel)})
         if not quiet and not as_json:
-            say(f"wrote {shown(wheel)}")
+            say(f"wrote {escape_line(wheel)}")
     if as_json:
         say(json.dumps(results, indent=1))
 
@@ -114,7 +114,7 @@ def _write_c(
 ) -> None:
     """Write the C of one scene into a folder."""
     if len(scenes) > 1:
-        raise EomcError(f"--c: takes one scene, since {shown(folder)} holds the C of one")
+        raise EomcError(f"--c: takes one scene, since {escape_line(folder)} holds the C of one")
     with status_line(_progress_text(scenes, 0), quiet or as_json):
         files = pipeline.write_c(scenes[0], folder, prefix, warn=warn)
     if as_json:
@@ -124,7 +124,7 @@ def _write_c(
             )
         )
     elif not quiet:
-        say(f"wrote {shown(folder)}/: {', '.join(files)}")
+        say(f"wrote {escape_line(folder)}/: {', '.join(files)}")
 
 
 # --- export ---------------------------------------------------------------------------------------
@@ -162,4 +162,4 @@ def export_fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bo
         say(f"sources only: {exported.why}", err=True)
     if not quiet:
         inside = f"sources and a binary for {exported.binary}" if exported.binary else "sources"
-        say(f"{shown(exported.file)}: FMI {fmi}.0, {inside}")
+        say(f"{escape_line(exported.file)}: FMI {fmi}.0, {inside}")

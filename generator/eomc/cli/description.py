@@ -95,7 +95,7 @@ def show_command(scene: Path, root: Path, form: str | None) -> None:
         return {"text": text, "warnings": "\n".join(map(str, system.warnings))}
 
     with status_line("deriving", False):
-        stored = cache.cached_texts(root, name, form or "text", digest, make)
+        stored = cache.cache_texts(root, name, form or "text", digest, make)
     if stored["warnings"]:
         say(stored["warnings"], err=True)
     say(stored["text"])

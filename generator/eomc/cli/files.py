@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from eomc.base.errors import EomcError, writing
-from eomc.cli.terminal import shown
+from eomc.cli.terminal import escape_line
 from eomc.runtime.atomic_write import atomic_write
 
 
@@ -23,9 +23,9 @@ def write_new(path: Path, text: str) -> None:
             file.write(text)
         incomplete = False
     except FileExistsError:
-        raise EomcError(f"{shown(path)}: is there already, and stays as it is") from None
+        raise EomcError(f"{escape_line(path)}: is there already, and stays as it is") from None
     except OSError as fault:
-        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
+        raise EomcError(f"{escape_line(path)}: can't be written ({fault.strerror})") from None
     finally:
         if incomplete:  # and not whole
             path.unlink(missing_ok=True)
@@ -36,5 +36,5 @@ def write_text(path: Path, text: str) -> None:
 
     Raises EomcError if the file can't be written.
     """
-    with writing(shown(path)), atomic_write(path) as new:
+    with writing(escape_line(path)), atomic_write(path) as new:
         new.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 
 from eomc.base.errors import EomcError, writing
-from eomc.cli.terminal import shown
+from eomc.cli.terminal import escape_line
 from eomc.runtime.atomic_write import check_replaceable
 
 Arguments = TypeVar("Arguments")
@@ -25,7 +25,7 @@ QUIET = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def parsed_as(
+def parse_into(
     arguments: Callable[..., Arguments],
 ) -> Callable[[Callable[[Arguments], None]], Callable[..., None]]:
     """Return a decorator for a command that takes all of its parsed arguments as one object.
@@ -91,6 +91,8 @@ def check_target(path: Path | None, endings: Sequence[str], option: str) -> None
     if path is None:
         return
     if path.suffix not in endings:
-        raise EomcError(f"{option} {shown(path)}: give a name that ends in {' or '.join(endings)}")
-    with writing(f"{option} {shown(path)}"):
+        raise EomcError(
+            f"{option} {escape_line(path)}: give a name that ends in {' or '.join(endings)}"
+        )
+    with writing(f"{option} {escape_line(path)}"):
         check_replaceable(path)

@@ -11,7 +11,7 @@ import click
 from eomc import pipeline
 from eomc.base.errors import SceneError
 from eomc.cli import files, options
-from eomc.cli.terminal import progress_bar, say, shown, status_line
+from eomc.cli.terminal import escape_line, progress_bar, say, status_line
 
 
 @click.command("report")
@@ -55,11 +55,11 @@ def report_command(
         if not quiet:
             say(pages.write_table(measurement))
         page = root / measurement.scene / "report.html"
-        with status_line(f"writing {shown(page)}", quiet):
+        with status_line(f"writing {escape_line(page)}", quiet):
             text = pages.write_page(measurement, overview.describe_scene(system, measurement, root))
         files.write_text(page, text)
         if not quiet:
-            say(f"\nwrote {shown(page)}\n")
+            say(f"\nwrote {escape_line(page)}\n")
             if missing_pictures := without_pictures():
                 say(f"{missing_pictures}\n")
     if file is not None:

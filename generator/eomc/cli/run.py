@@ -20,7 +20,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.cli import options
 from eomc.cli.options import parse_pairs
-from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
+from eomc.cli.terminal import escape_line, progress_bar, say, status_line, warn
 
 if TYPE_CHECKING:
     from eomc.runtime.balance import Balance
@@ -128,7 +128,7 @@ class Simulation:
 )
 @options.QUIET
 @options.JSON
-@options.parsed_as(RunArguments)
+@options.parse_into(RunArguments)
 def run_command(arguments: RunArguments) -> None:
     """Simulate a scene; print the end, the error and the speed.
 
@@ -158,7 +158,7 @@ def run_command(arguments: RunArguments) -> None:
         except module.Interrupted:  # the run itself is whole
             interrupted = True
     if out:
-        with writing(shown(out)):
+        with writing(escape_line(out)):
             run.save(out)
     has_work = module._model.has_power or len(run.events) > 0  # forces, or jumps
     balance = run.balance() if has_work and simulation.is_short else None
@@ -376,7 +376,7 @@ def _summary(
         },
         "events": {name: e.t.tolist() for name, e in run.events.items()},
         "stopped_by": getattr(run, "stopped", "") or None,
-        "saturated": _saturated(module, run),
+        "saturated": _saturation(module, run),
         "jacobi_change": None if np.array_equal(energy, jacobi) else _change(jacobi),
         "error_estimate": _error(run),
         "beyond_stability": simulation.beyond_stability,
@@ -388,7 +388,7 @@ def _summary(
     }
 
 
-def _saturated(module: Any, run: Run) -> dict[str, float]:
+def _saturation(module: Any, run: Run) -> dict[str, float]:
     """Return the fraction of rows in which each input was beyond its limits, if there are any."""
     parts = zip(module.inputs, map(float, run.saturated.mean(axis=0)), strict=True)
     return {name: part for name, part in parts if part}
@@ -398,8 +398,8 @@ def _print_summary(
     module: Any, run: Run, balance: Balance | None, summary: Mapping[str, Any]
 ) -> None:
     say(
-        f"{shown(module.title)}: {run.steps} steps of {summary['method']}, {run.description}, "
-        f"to t = {run.t[-1]:g} s"
+        f"{escape_line(module.title)}: {run.steps} steps of {summary['method']}, "
+        f"{run.description}, to t = {run.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
     ends = zip(module.coordinates, summary["q"].values(), summary["qd"].values(), strict=True)
@@ -425,7 +425,7 @@ def _print_summary(
     speed = summary["steps_per_second"] or 0.0
     say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
-        say(f"  wrote {shown(file)}")
+        say(f"  wrote {escape_line(file)}")
 
 
 def _print_energy(run: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:

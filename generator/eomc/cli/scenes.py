@@ -16,7 +16,7 @@ from eomc.base import resources, texts
 from eomc.base.errors import EomcError, NoCompilerError
 from eomc.cli import files, options
 from eomc.cli.options import parse_pairs
-from eomc.cli.terminal import say, shown
+from eomc.cli.terminal import escape_line, say
 
 if TYPE_CHECKING:
     from eomc.robots.robot import Robot
@@ -51,7 +51,7 @@ def new_command(name: str | None, source: str | None) -> None:
         raise EomcError(why)
     path = files.scene_path(name)
     files.write_new(path, _driven_pendulum(name) if copied is None else copied)
-    say(f"wrote {shown(path)}; try: eomc run {texts.command(str(path))}")
+    say(f"wrote {escape_line(path)}; try: eomc run {texts.command(str(path))}")
 
 
 def _driven_pendulum(name: str) -> str:
@@ -71,7 +71,7 @@ def _copy_shipped(source: str, name: str) -> str:
         near = nearest(source, known)
         hint = f"did you mean '{near}'? " if near else ""
         raise EomcError(
-            f"--from {shown(source)}: is no scene that comes with eomc; {hint}they are "
+            f"--from {escape_line(source)}: is no scene that comes with eomc; {hint}they are "
             + ", ".join(known)
         )
     text = known[source].read_text(encoding="utf-8")
@@ -125,7 +125,7 @@ class ImportArguments:
     help="Make the masses parameters, with a payload at each tip.",
 )  # fmt: skip
 @click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
-@options.parsed_as(ImportArguments)
+@options.parse_into(ImportArguments)
 def import_command(arguments: ImportArguments) -> None:
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
@@ -141,21 +141,21 @@ def import_command(arguments: ImportArguments) -> None:
     text = scene_text.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:
         raise EomcError(
-            f"{shown(arguments.file)}: its scene would have {len(text.encode())} bytes, and a "
-            f"scene has at most {MAX_BYTES}: cut out a part with --root and --tip"
+            f"{escape_line(arguments.file)}: its scene would have {len(text.encode())} bytes, and "
+            f"a scene has at most {MAX_BYTES}: cut out a part with --root and --tip"
         )
     files.write_new(path, text)
     called = "" if path.stem == robot.name else f"; its module is called {robot.name}"
     points = sum(body.point for body in robot.bodies)
     marks = f"points {points}, " if points else ""
     say(
-        f"wrote {shown(path)}: bodies {len(robot.bodies) - points}, {marks}"
+        f"wrote {escape_line(path)}: bodies {len(robot.bodies) - points}, {marks}"
         f"coordinates {len(robot.motions)}, inputs {len(robot.drives)}{called}"
     )
     if robot.left_out:
         say("not modelled, or to be looked at:")
         for words in robot.left_out:
-            say(f"  - {shown(words)}")
+            say(f"  - {escape_line(words)}")
     typed = texts.command(str(path))
     say(f"try: eomc dof {typed}; eomc run {typed}")
 
@@ -170,7 +170,7 @@ def _read_robot(arguments: ImportArguments) -> Robot:
     if xml.root(file).kind.startswith("mujoco"):  # mujocoinclude is a part, which is refused
         robot = read.read(file, arguments.include)
     elif arguments.include:
-        raise EomcError(f"--include is for MJCF files, and {shown(file)} is none")
+        raise EomcError(f"--include is for MJCF files, and {escape_line(file)} is none")
     else:
         robot = urdf.read(file)
     if name is None:
@@ -245,7 +245,7 @@ def list_command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
 def _scenes_in(folder: Path, root: Path) -> Iterator[Row]:
     """Yield the rows of the scenes in a folder."""
     if not folder.is_dir():
-        raise EomcError(f"{shown(folder)}: is not a folder")
+        raise EomcError(f"{escape_line(folder)}: is not a folder")
     for path in sorted(folder.glob("*.toml")):
         if row := _row(path, root):
             yield row
@@ -278,8 +278,8 @@ def _print(rows: Sequence[Row]) -> None:
     """Print one line per scene, in columns."""
     rows = [
         row
-        | {key: shown(row[key]) for key in ("scene", "title")}
-        | {key: list(map(shown, row[key])) for key in ("coordinates", "inputs")}
+        | {key: escape_line(row[key]) for key in ("scene", "title")}
+        | {key: list(map(escape_line, row[key])) for key in ("coordinates", "inputs")}
         for row in rows
     ]
     width = max((len(row["scene"]) for row in rows), default=0)

@@ -63,7 +63,7 @@ def say(words: str = "", err: bool = False) -> None:
     click.echo(texts.lines(words), err=err)
 
 
-def shown(path: object) -> str:
+def escape_line(path: object) -> str:
     """Return the text of a path or another object on one line, with control characters escaped."""
     return texts.line(str(path))
 
@@ -101,7 +101,7 @@ def progress_bar(
             columns = (description, *Progress.get_default_columns()[1:])
             progress = Progress(*columns, console=Console(stderr=True), transient=True)
             progress.start()
-            bar.extend([progress, progress.add_task(shown(what), total=total)])
+            bar.extend([progress, progress.add_task(escape_line(what), total=total)])
         if bar:
             bar[0].update(bar[1], completed=completed)
 
@@ -124,5 +124,5 @@ def status_line(what: str, silent: bool) -> Iterator[None]:
     from rich.console import Console
     from rich.text import Text
 
-    with Console(stderr=True).status(Text(f"{shown(what)} ...")):  # no str, which has markup
+    with Console(stderr=True).status(Text(f"{escape_line(what)} ...")):  # no str, which has markup
         yield

@@ -339,19 +339,19 @@ class _Sketch:
         assembly, picture = self.scene.assembly, self.scene.picture
         if assembly:
             self._place(assembly)
-            self._skeleton(assembly)
+            self._draw_skeleton(assembly)
         if picture:
             for shape in picture.shapes:
-                self._shape(shape)
+                self._draw_shape(shape)
         if assembly and not self.marks.paths:
-            self._paths(assembly)
+            self._add_paths(assembly)
         plane = assembly.plane if assembly else bool(picture and picture.axes != "xyz")
         axes = picture.axes if picture else "xy" if plane else "xyz"
         units = {c.unit for c in self.scene.coordinates} | {p.unit for p in self.scene.parameters}
         unit = "m" if assembly or "m" in units else ""
-        return self.marks.to_drawing(axes, unit, up=self._up(assembly))
+        return self.marks.to_drawing(axes, unit, up=self._upward_axis(assembly))
 
-    def _up(self, assembly: Assembly | None) -> int:
+    def _upward_axis(self, assembly: Assembly | None) -> int:
         """Return the index of the upward axis, opposite to gravity."""
         if assembly is None:
             return 2
@@ -381,10 +381,10 @@ class _Sketch:
         """Return the rotation matrices of successive turns, (n, 3, 3)."""
         R = self.poses[WORLD][1]
         for turn in turns:
-            R = R @ self._about(np.eye(3)["xyz".index(turn.axis)], self._number(turn.angle))
+            R = R @ self._axis_rotation(np.eye(3)["xyz".index(turn.axis)], self._number(turn.angle))
         return R
 
-    def _about(self, axis: Sequence[float] | Array, angle: Any) -> Array:
+    def _axis_rotation(self, axis: Sequence[float] | Array, angle: Any) -> Array:
         angle = np.broadcast_to(angle, self.n)
         rows = spatial.axis_angle_rotation(tuple(axis), np.cos(angle), np.sin(angle))
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
@@ -397,12 +397,12 @@ class _Sketch:
             if body.joint:
                 at, R = self.poses[body.parent]
                 if body.offset:
-                    at = at + _turned(R, self._vector(body.offset))
+                    at = at + _rotate(R, self._vector(body.offset))
                 R = R @ self._rotation(body.rotation)
                 self.joint_frames[body.name] = at, R
                 self.poses[body.name] = self._after_joint(body, at, R)
                 at, R = self.poses[body.name]
-                self.centers[body.name] = at + _turned(R, self._vector(body.center))
+                self.centers[body.name] = at + _rotate(R, self._vector(body.center))
         for body in assembly.bodies:
             if body.position:
                 pose = self._vector(body.position), self._rotation(body.rotation)
@@ -415,25 +415,25 @@ class _Sketch:
             unit = np.array(axis) / np.linalg.norm(axis)
             moved = self._number(by)
             if motion == "t":
-                at = at + _turned(R, np.broadcast_to(moved, self.n)[:, None] * unit)
+                at = at + _rotate(R, np.broadcast_to(moved, self.n)[:, None] * unit)
             else:
-                R = R @ self._about(unit, moved)
+                R = R @ self._axis_rotation(unit, moved)
         return at, R
 
-    def _skeleton(self, assembly: Assembly) -> None:
+    def _draw_skeleton(self, assembly: Assembly) -> None:
         for body in assembly.bodies:
             if body.joint:
                 self._draw_joint(body)
         for body in assembly.bodies:
-            self._mass(body, assembly.plane)
+            self._draw_center_of_mass(body, assembly.plane)
         if not assembly.plane:
-            self._boxes(assembly)
+            self._draw_boxes(assembly)
         for loop in assembly.loops:
             if loop.bodies:
                 self._draw_loop(loop)
         for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
             for end in some:
-                self._between(kind, end, assembly)
+                self._draw_spring_or_damper(kind, end, assembly)
 
     def _draw_joint(self, body: RigidBody) -> None:
         """Draw the joint of a body, and a rod from the parent's frame to it."""
@@ -449,7 +449,7 @@ class _Sketch:
         if "t" in motions:
             axis = JOINTS[body.joint].motion_axes(body.axes)[motions.index("t")]
             direction = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
-            unit = _turned(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
+            unit = _rotate(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
             ends = (marks.add_point(seat + x * unit) for x in (direction.min(), direction.max()))
             marks.add_mark("rail", *ends)
             marks.add_mark("slide", marks.add_point(self.poses[body.name][0]))
@@ -463,15 +463,16 @@ class _Sketch:
         marks, ends = self.marks, list[Array]()
         for k, name in enumerate(loop.bodies):
             at, R = self.poses[name]
-            ends.append(at + _turned(R, self._vector(loop.points[k])) if loop.points else at)
+            ends.append(at + _rotate(R, self._vector(loop.points[k])) if loop.points else at)
             marks.add_mark(
-                "ground" if name == WORLD else "rod", *self._support(name, marks.add_point(ends[k]))
+                "ground" if name == WORLD else "rod",
+                *self._support_points(name, marks.add_point(ends[k])),
             )
         first, second = map(marks.add_point, ends)
         if loop.joint == "distance":
             marks.add_mark("rod", first, second)
         if loop.joint in ("prismatic", "cylindrical", "point-on-line"):
-            unit = _turned(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
+            unit = _rotate(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
             direction = np.sum((ends[1] - ends[0]) * unit, axis=1)
             marks.add_mark(
                 "rail",
@@ -482,7 +483,7 @@ class _Sketch:
             for end in (first, second) if loop.joint == "distance" else (first,):
                 marks.add_mark("joint", end)
 
-    def _mass(self, body: RigidBody, plane: bool) -> None:
+    def _draw_center_of_mass(self, body: RigidBody, plane: bool) -> None:
         """Draw the centre of mass; in the plane also the orientation of the body."""
         mass = float(self._number(body.mass))
         if mass <= 0:
@@ -499,7 +500,7 @@ class _Sketch:
             return
         marks.add_mark("mass", at)
 
-    def _boxes(self, assembly: Assembly) -> None:
+    def _draw_boxes(self, assembly: Assembly) -> None:
         """Draw inertia boxes of bodies in space whose rotation no line shows.
 
         Bodies that are fixed to one another share one box.
@@ -514,9 +515,9 @@ class _Sketch:
             group = [b for b in assembly.bodies if roots[b.name] == root.name]
             shows_rotation = any(marks.add_point(self.poses[b.name][0]) in lines for b in group)
             if group and (root.joint in ("", "free") or not shows_rotation):
-                self._inertia(group, self.poses[root.name][1])
+                self._draw_inertia(group, self.poses[root.name][1])
 
-    def _inertia(self, group: Sequence[RigidBody], R: Array) -> None:
+    def _draw_inertia(self, group: Sequence[RigidBody], R: Array) -> None:
         """Draw the box with the mass and inertia of bodies fixed to one another.
 
         `R` is the rotation of the box. With edges 2a, 2b, 2c, Ixx = m (b² + c²)/3.
@@ -546,16 +547,16 @@ class _Sketch:
             points = (self.marks.add_point(center + tip) for tip in tips)
             self.marks.add_mark("inertia", self.marks.add_point(center), *points)
 
-    def _between(self, kind: str, end: SpringDamper, assembly: Assembly) -> None:
+    def _draw_spring_or_damper(self, kind: str, end: SpringDamper, assembly: Assembly) -> None:
         """Draw a spring or damper if its end points are known."""
         marks = self.marks
         if end.points and end.bodies:
             points = []
             for name, place in zip(end.bodies, end.points, strict=True):
                 at, R = self.poses[name]
-                points.append(marks.add_point(at + _turned(R, self._vector(place))))
+                points.append(marks.add_point(at + _rotate(R, self._vector(place))))
                 marks.add_mark(
-                    "ground" if name == WORLD else "rod", *self._support(name, points[-1])
+                    "ground" if name == WORLD else "rod", *self._support_points(name, points[-1])
                 )
             marks.add_mark(kind, *points)
             return
@@ -569,11 +570,11 @@ class _Sketch:
                 ends = (self.joint_frames[body.name][0], self.poses[body.name][0])
                 marks.add_mark(kind, *map(marks.add_point, ends))
 
-    def _support(self, name: str, point: int) -> tuple[int, ...]:
+    def _support_points(self, name: str, point: int) -> tuple[int, ...]:
         """Return the points of the mark that supports a spring's end: ground or rod."""
         return (point,) if name == WORLD else (self.marks.add_point(self.poses[name][0]), point)
 
-    def _paths(self, assembly: Assembly) -> None:
+    def _add_paths(self, assembly: Assembly) -> None:
         """Add the paths of the scene's [[point]]s, or of the only body without children."""
         marks = self.marks
         tips = [b.name for b in assembly.bodies if b.point]
@@ -588,7 +589,7 @@ class _Sketch:
 
     # --- the picture of a scene ------------------------------------------------------------------
 
-    def _shape(self, shape: Shape) -> None:
+    def _draw_shape(self, shape: Shape) -> None:
         marks = self.marks
         at = [self._pose_of_place(place.name, place.at) for place in shape.places]
         points = [marks.add_point(x) for x, _ in at]
@@ -610,7 +611,7 @@ class _Sketch:
         return self.poses[name] if at is None else (self._vector(at), self.poses[WORLD][1])
 
 
-def _turned(R: Array, v: Array) -> Array:
+def _rotate(R: Array, v: Array) -> Array:
     turned: Array = np.einsum("nij,nj->ni", R, v)
     return turned
 

@@ -579,7 +579,7 @@ def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iter
     if not isinstance(value, MatrixBase):
         yield from _sum_lines(write, value)
         return
-    block = write.text(write.ordered(value))
+    block = write.text(write.sort_expression(value))
     if block.width() <= WIDE:
         yield from (line.rstrip() for line in str(block).splitlines())
         return
@@ -658,8 +658,8 @@ def latex_lines(equations: Equations) -> tuple[list[str], list[str]]:
     for name, value in _values(equations).items():
         symbol = _LATEX.get(name, name)
         if isinstance(value, MatrixBase):
-            if write.text(write.ordered(value)).width() <= WIDE:
-                lines.append(f"  {symbol} &= {write.latex(write.ordered(value))}")
+            if write.text(write.sort_expression(value)).width() <= WIDE:
+                lines.append(f"  {symbol} &= {write.latex(write.sort_expression(value))}")
                 continue
             for (i, j), entry in _entries(name, value):
                 lines += latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)

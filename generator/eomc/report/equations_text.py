@@ -94,9 +94,9 @@ def describe(system: System) -> str:
     """
     write = Typesetter(system)
     parts = [
-        wrap(f"{title_line(system)}: {equation_form(_driven(system), system)}"),
+        wrap(f"{title_line(system)}: {equation_form(_has_forces(system), system)}"),
         "Written out, these equations would fill many pages. They are those of L = K - P,\n"
-        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_hand_side(_driven(system), system)}.",
+        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_hand_side(_has_forces(system), system)}.",
     ]
     if system.tree is not None:
         parts.append(_recursion(system.tree, write))
@@ -130,7 +130,7 @@ def _recursion(tree: Tree, write: Typesetter) -> str:
     for link in tree.links:
         parent = "the world" if link.parent < 0 else tree.links[link.parent].name
         how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
-        by = str(write.text(write.ordered(link.q))).strip()
+        by = str(write.text(write.sort_expression(link.q))).strip()
         lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
     return section(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
 
@@ -185,7 +185,7 @@ def _environment_bodies(system: System) -> list[str]:
 def _latex_form(system: System) -> list[str]:
     """Return the lines of the equation of motion, and of D, C and g as derivatives."""
     force = " + ".join(
-        [*([r"\tau"] * _driven(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
+        [*([r"\tau"] * _has_forces(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
     )
     force = force or "0"
     order = r", \; ".join(tex(c.name) for c in system.coordinates)
@@ -204,7 +204,7 @@ def _latex_form(system: System) -> list[str]:
     return lines
 
 
-def _driven(system: System) -> bool:
+def _has_forces(system: System) -> bool:
     """True if anything acts besides potentials and constraint forces."""
     return bool(system.applied) or any(e != 0 for e in (system.dissipation, *system.forces))
 
@@ -266,7 +266,7 @@ def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
         r += f" + {R or ''} e_{{{axis}}} s_{{{n}}}"
     S = f"(e_{{{axis}}}, 0)" if link.turns else f"(0, e_{{{axis}}})"
     lines = [
-        rf"  & \text{{{_escaped(f'{link.name} on {parent}')}}}, "
+        rf"  & \text{{{_escape(f'{link.name} on {parent}')}}}, "
         rf"\; k = {n}, \; p = {link.parent + 1}: \quad "
         rf"s_{{{n}}} = {_formula(link.q, write)}, \; S_{{{n}}} = {S}, \; "
         rf"R_{{{n}}} = {R or '1'}, \; r_{{{n}}} = {r}"
@@ -296,7 +296,7 @@ def _latex_rest(
     applied_forces = "".join(
         f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in range(1, len(system.applied) + 1)
     )
-    if _driven(system):
+    if _has_forces(system):
         lines.append(rf"  \tau &= Q{friction}{applied_forces}")
     if friction:
         lines += latex_sum(write, "R", system.dissipation)
@@ -316,7 +316,7 @@ def _slope(numerator: str, denominator: str) -> str:
 
 
 def _formula(e: Expr, write: Typesetter) -> str:
-    return write.latex(write.ordered(shorten_fractions(sympy.sympify(e))))
+    return write.latex(write.sort_expression(shorten_fractions(sympy.sympify(e))))
 
 
 def _vector(v: Vector, write: Typesetter) -> str:
@@ -335,7 +335,7 @@ def _matrix(rows: Sequence[Sequence[str]]) -> str:
     return rf"\begin{{pmatrix}} {body} \end{{pmatrix}}"
 
 
-def _escaped(words: str) -> str:
+def _escape(words: str) -> str:
     return re.sub(r"([#$%&_{}])", r"\\\1", words)
 
 

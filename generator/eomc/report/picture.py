@@ -101,7 +101,7 @@ class Mechanism:
     def draw(self, axes: Axes) -> None:
         """Draw the picture into `axes`. A mechanism in space is seen slightly from above."""
         picture = self.drawing
-        flat = self._near(project_points(picture))
+        flat = self._visible_part(project_points(picture))
         paths = [(p.name, flat[:, p.point]) for p in picture.paths]
         shapes = sum(mark.kind in LINES for mark in picture.marks)
         last = self._stretch(flat) if shapes else len(flat) - 1
@@ -123,7 +123,7 @@ class Mechanism:
         if paths:
             axes.legend(fontsize=8, frameon=False, loc="upper right")
 
-    def _near(self, flat: Array) -> Array:
+    def _visible_part(self, flat: Array) -> Array:
         """Return the initial part of the motion, if the mechanism travels too far to be seen."""
         if not self.drawing.travels:
             return flat

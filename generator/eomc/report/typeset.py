@@ -52,7 +52,7 @@ class Typesetter:
         self._rates = (*system.qdd, *system.qd)
         # rows keep their names: some letters have subscripts, others none
         names = {symbol(f"lambda_{c.name}"): f"λ_{c.name}" for c in system.constraints}
-        shown = {s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()}
+        shown = {s: Symbol(_dotted_name(name, n)) for s, (name, n) in dotted.items()}
         names |= {
             s: pretty_symbol(name) + DOTS[n]
             for s, (name, n) in dotted.items()
@@ -106,31 +106,31 @@ class Typesetter:
                 number = sympy.S.One
             else:
                 number = sympy.Float(number, 15)
-        ordered = [self.ordered(f) for f in sorted(others, key=self._factor)]
+        ordered = [self.sort_expression(f) for f in sorted(others, key=self._factor)]
         if number != 1 or not ordered:
             ordered.insert(0, number)
         product = ordered[0] if len(ordered) == 1 else sympy.Mul(*ordered, evaluate=False)
         return bool(signed < 0), product
 
-    def ordered(self, e: Expr) -> Expr:
+    def sort_expression(self, e: Expr) -> Expr:
         """Return an expression equal to `e` whose sums and products are sorted for printing.
 
         SymPy does not evaluate them, so that the order is preserved.
         """
         if e.is_Add:
             signed = [(-1 if minus else 1, term) for minus, term in self.terms(e)]
-            return sympy.Add(*(_negative(x) if s < 0 else x for s, x in signed), evaluate=False)
+            return sympy.Add(*(_negate(x) if s < 0 else x for s, x in signed), evaluate=False)
         if (distributed := distribute_decimal(e)) is not e:
-            return self.ordered(distributed)
+            return self.sort_expression(distributed)
         if e.is_Mul:
             minus, product = self.term(e)
-            return _negative(product) if minus else product
+            return _negate(product) if minus else product
         if e.is_Pow:
-            return sympy.Pow(self.ordered(e.base), e.exp, evaluate=False)
+            return sympy.Pow(self.sort_expression(e.base), e.exp, evaluate=False)
         if isinstance(e, sympy.MatrixBase):
-            return sympy.ImmutableDenseMatrix(e.applyfunc(self.ordered))
+            return sympy.ImmutableDenseMatrix(e.applyfunc(self.sort_expression))
         if isinstance(e, sympy.Function) and len(e.args) == 1:
-            return e.func(self.ordered(e.args[0]), evaluate=False)
+            return e.func(self.sort_expression(e.args[0]), evaluate=False)
         return sympy.Float(e, 15) if _decimal(e) else e
 
     def _factor(self, f: Expr) -> tuple[Any, ...]:
@@ -204,11 +204,11 @@ class Typesetter:
                 if joined.width() <= WIDE - 4 * (k > 0):
                     block, ends = joined, ends[1:]
                 else:
-                    lines += _indented(block, 4 * (k > 0))
+                    lines += _indent(block, 4 * (k > 0))
                     block, ends = closing, ends[1:]
-            lines += _indented(block, 4 * (k > 0))
+            lines += _indent(block, 4 * (k > 0))
         for row in ends:
-            lines += _indented(self._row(row, "+"), 8)
+            lines += _indent(self._row(row, "+"), 8)
         return lines
 
     def _row(self, row: Sequence[Term], begin: str) -> prettyForm:
@@ -311,11 +311,13 @@ def shorten_fractions(value: Expr) -> Expr:
     30 digits are merged, and factors below ZERO_TOLERANCE, which are rounding errors of zero, are
     removed.
     """
-    if not _long(value):
+    if not _long_numbers(value):
         return value
-    short = _rounded(sympy.expand(value))
-    plain = _rounded(sympy.expand(short))  # each factor whole again
-    return plain.xreplace({x: _simple_fraction(x) or sympy.Float(x, 15) for x in _long(plain)})
+    short = _round_numbers(sympy.expand(value))
+    plain = _round_numbers(sympy.expand(short))  # each factor whole again
+    return plain.xreplace(
+        {x: _simple_fraction(x) or sympy.Float(x, 15) for x in _long_numbers(plain)}
+    )
 
 
 def _simple_fraction(x: sympy.Rational) -> sympy.Rational | None:
@@ -324,20 +326,20 @@ def _simple_fraction(x: sympy.Rational) -> sympy.Rational | None:
     return sympy.Rational(simple) if float(simple) == float(x) else None
 
 
-def _rounded(e: Expr) -> Expr:
+def _round_numbers(e: Expr) -> Expr:
     return e.xreplace(
         {
             x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > ZERO_TOLERANCE else 0
-            for x in _long(e)
+            for x in _long_numbers(e)
         }
     )
 
 
-def _long(e: Expr) -> set[sympy.Rational]:
+def _long_numbers(e: Expr) -> set[sympy.Rational]:
     return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= MAX_FRACTION_PART}
 
 
-def _negative(e: Expr) -> Expr:
+def _negate(e: Expr) -> Expr:
     factors = sympy.Mul.make_args(e)
     if factors[0].is_Number:
         return sympy.Mul(-factors[0], *factors[1:], evaluate=False) if factors[1:] else -e
@@ -348,11 +350,11 @@ def _join_blocks(*blocks: prettyForm) -> prettyForm:
     return prettyForm(*stringPict.next(*blocks))
 
 
-def _indented(block: prettyForm, by: int) -> list[str]:
+def _indent(block: prettyForm, by: int) -> list[str]:
     return [(" " * by + line).rstrip() for line in str(block).splitlines()]
 
 
-def _dotted(name: str, dots: int) -> str:
+def _dotted_name(name: str, dots: int) -> str:
     """Return the name of a time derivative: theta2 -> thetadot2, which SymPy prints with a dot."""
     if not dots:
         return name

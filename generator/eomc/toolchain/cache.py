@@ -218,7 +218,7 @@ def build(
         return Built(name, folder, False, build_key)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        with locked(root / f".{folder.name}.lock"):
+        with hold_lock(root / f".{folder.name}.lock"):
             if is_built(folder, build_key):  # by another process, meanwhile
                 return Built(name, folder, False, build_key)
             _check_folder_is_free(folder)
@@ -443,7 +443,7 @@ def unpickled(
 
     name, folder, _ = place
     try:
-        package = importlib.import_module(f"{_build_of(place).__name__}._runtime.package")
+        package = importlib.import_module(f"{_find_build(place).__name__}._runtime.package")
         why = package.refusal(identity, path)
         if not why:
             return package.call_path(path, arguments)
@@ -460,7 +460,7 @@ def unpickled(
     return Unreadable(why, EomcError, (unpickled, (place, identity, path, arguments)))
 
 
-def _build_of(place: tuple[str, str, str]) -> ModuleType:
+def _find_build(place: tuple[str, str, str]) -> ModuleType:
     """Return the module of the build at a place, or from the archive, or else its successor."""
     name, folder, key = place
     if (loaded := sys.modules.get(_alias(name, key))) is not None:
@@ -480,7 +480,7 @@ _LOCK_FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not need
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def hold_lock(path: Path) -> Iterator[None]:
     """Hold an exclusive lock on the file `path` while the block of the with statement runs.
 
     Other processes that lock the same file wait until the block ends. If the file does not exist,
@@ -526,7 +526,7 @@ def _wait(lock: int) -> None:
 # --- cached texts ---------------------------------------------------------------------------------
 
 
-def cached_texts(
+def cache_texts(
     root: Path, name: str, kind: str, scene_digest: str, make: Callable[[], dict[str, str]]
 ) -> dict[str, str]:
     """Return the texts that `make` produces, from a cache on disk if they are up to date.
