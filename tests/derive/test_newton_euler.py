@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.derive.links import Vectors
-from eomc.derive.newton_euler import Recursion
+from eomc.derive.newton_euler import TreeDynamics
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
@@ -450,7 +450,7 @@ def test_grouping_inertias_saves_work_and_changes_no_motion(
     made = made_of(trees.arm(3))
     grouped = every_route(made, accelerations)
     monkeypatch.setattr(
-        Recursion, "_grouped", lambda r: [r._link_inertia(link) for link in r.links]
+        TreeDynamics, "_grouped", lambda r: [r._link_inertia(link) for link in r.links]
     )
     plain = every_route(made, accelerations)
     for route in ("composite", "articulated"):

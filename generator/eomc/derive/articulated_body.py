@@ -16,7 +16,7 @@ from itertools import combinations_with_replacement
 from sympy import Expr, S
 
 from eomc.derive.links import AXES, ZERO, Vector
-from eomc.derive.newton_euler import Inertia, Recursion
+from eomc.derive.newton_euler import Inertia, TreeDynamics
 from eomc.derive.tape import Stage
 from eomc.model.rational import Matrix
 
@@ -35,12 +35,12 @@ class MasslessError(Exception):
         self.link = link
 
 
-def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
+def accelerations(dynamics: TreeDynamics, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
     """Return the joint accelerations of a kinematic tree by the articulated-body algorithm.
 
     Parameters
     ----------
-    recursion : Recursion
+    dynamics : TreeDynamics
         The kinematic tree with the inertias of its links.
     drive : sequence of Expr
         For each joint, the generalized force along it (force in N or moment in N m). Inertial and
@@ -59,7 +59,7 @@ def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Exp
     MasslessError
         If a joint has no inertia along its axis.
     """
-    return _Articulated(recursion).solve(drive)
+    return _Articulated(dynamics).solve(drive)
 
 
 @dataclass
@@ -74,12 +74,12 @@ class _Inertia:
 class _Articulated:
     """The articulated-body algorithm: one pass eliminates the joints, another gives qdd."""
 
-    def __init__(self, recursion: Recursion) -> None:
-        self.recursion, self.links = recursion, recursion.links
-        self.tree, self.vectors = recursion.tree, recursion.vectors
+    def __init__(self, dynamics: TreeDynamics) -> None:
+        self.dynamics, self.links = dynamics, dynamics.links
+        self.tree, self.vectors = dynamics.tree, dynamics.vectors
 
     def solve(self, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-        r, V, tree = self.recursion, self.vectors, self.tree
+        r, V, tree = self.dynamics, self.vectors, self.tree
         n = r.n
         at_rest = r.forces(tree.speed, [S.Zero] * n)
         f, m = list(at_rest.force), list(at_rest.moment)
@@ -153,7 +153,7 @@ class _Articulated:
         p = self.links[k].parent
         parent = self.links[p]
         along_axis = parent.inertia[parent.axis] if parent.turns else parent.mass
-        if along_axis != 0 or self.recursion.armature[p] != 0:
+        if along_axis != 0 or self.dynamics.armature[p] != 0:
             return S.Zero
         mass = [body.M[i][i] for i in range(3)]
         if not parent.turns:
@@ -187,7 +187,7 @@ class _Articulated:
         J = self._symmetric(lambda i, j: minus_product(body.J[i][j], w_m[i], u_m[j]))
         M = self._symmetric(lambda i, j: minus_product(body.M[i][j], w_f[i], u_f[j]))
         H = [[minus_product(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
-        if self.recursion.armature[k] == 0:
+        if self.dynamics.armature[k] == 0:
             a = link.axis
             for i in range(3):
                 if link.turns:
@@ -245,7 +245,7 @@ class _Articulated:
         a = self.links[k].axis
         out = [list(row) for row in m]
         across = V.add(m[i][j], m[j][i])
-        t, off = self.recursion.half_turn(k, m[i][i], m[j][j], across)
+        t, off = self.dynamics.half_turn(k, m[i][i], m[j][j], across)
         change = V.add(off, V.minus(across))
         out[i][i], out[j][j] = V.add(m[i][i], V.minus(t)), V.add(m[j][j], t)
         out[i][j], out[j][i] = V.add(m[i][j], change), V.add(m[j][i], change)

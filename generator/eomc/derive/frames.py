@@ -79,7 +79,7 @@ def motions(system: System) -> Motions:
     """
     entries = wrenches(system)
     tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(entries, Stage.TIME))
-    kinematics = Sweep(tape, system, system.output_frames)
+    kinematics = TreeKinematics(tape, system, system.output_frames)
     frames = [kinematics.frame(f) for f in kinematics.frames]
     jacobians: list[Expr] = []
     for frame in frames:
@@ -134,7 +134,7 @@ class FrameKinematics:
     jacobian: Sequence[Twist]
 
 
-class Sweep:
+class TreeKinematics:
     """Kinematics of the links of a tree and of frames, computed from the base to the leaves.
 
     Components of vectors are along the world's axes.
@@ -407,46 +407,55 @@ def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
         If no moving body has mass.
     """
     tape = Tape(leaves(system, *system.qdd))
-    sweep = Sweep(tape, system, [f for f in system.frames if f.mass != 0])
-    V, parts = sweep.vectors, list(_parts(sweep))
+    kinematics = TreeKinematics(tape, system, [f for f in system.frames if f.mass != 0])
+    V, parts = kinematics.vectors, list(_parts(kinematics))
     mass = V.add(*(m for m, *_ in parts))
     if mass is S.Zero:
         raise SceneError([system.problem("run.momentum", "no body that moves has a mass")])
     moment, linear, angular = (V.plus(*(part[k] for part in parts)) for k in (1, 2, 3))
     center = V.scaled(moment, tape.define(1 / mass))
     about = V.plus(angular, V.scaled(V.cross(center, linear), S.NegativeOne))
-    return tape, (mass, *center[: sweep.d], *sweep.flat(linear, about))
+    return tape, (mass, *center[: kinematics.d], *kinematics.flat(linear, about))
 
 
 # position, axes, velocity and angular velocity of a body, along the world's axes
 _BodyMotion = tuple[Vector, Sequence[Vector], Vector, Vector]
 
 
-def _parts(sweep: Sweep) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
+def _parts(kinematics: TreeKinematics) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
     """Yield the mass, first moment, momentum and angular momentum of each body.
 
     The moments are about the world's origin.
     """
-    V = sweep.vectors
-    for k, link in enumerate(sweep.links):
-        motion = sweep.origin[k], sweep.columns[k], sweep.velocity[k], sweep.spin[k]
-        moment = sweep.world(k, V.vector(link.moment))
-        yield _part(sweep, motion, V.define(link.mass), moment, link.inertia)
-    for f in sweep.frames:
-        frame = sweep.frame(f)
+    V = kinematics.vectors
+    for k, link in enumerate(kinematics.links):
+        motion = (
+            kinematics.origin[k],
+            kinematics.columns[k],
+            kinematics.velocity[k],
+            kinematics.spin[k],
+        )
+        moment = kinematics.world(k, V.vector(link.moment))
+        yield _part(kinematics, motion, V.define(link.mass), moment, link.inertia)
+    for f in kinematics.frames:
+        frame = kinematics.frame(f)
         columns = list(zip(*frame.rotation, strict=True))
         motion = frame.at, columns, *frame.velocity
-        yield _part(sweep, motion, V.define(f.mass), ZERO, f.inertia)
+        yield _part(kinematics, motion, V.define(f.mass), ZERO, f.inertia)
 
 
 def _part(
-    sweep: Sweep, motion: _BodyMotion, mass: Expr, moment: Vector, inertia: Sequence[Expr]
+    kinematics: TreeKinematics,
+    motion: _BodyMotion,
+    mass: Expr,
+    moment: Vector,
+    inertia: Sequence[Expr],
 ) -> tuple[Expr, Vector, Vector, Vector]:
     """Return the same quantities for one body.
 
     `moment` (along the world's axes) and `inertia` refer to the position in `motion`.
     """
-    V, (at, columns, v, omega) = sweep.vectors, motion
+    V, (at, columns, v, omega) = kinematics.vectors, motion
     tensor = [[S.Zero] * 3 for _ in range(3)]
     for (i, j), entry in zip(ENTRIES, inertia, strict=True):
         tensor[i][j] = tensor[j][i] = V.define(entry)

@@ -32,7 +32,7 @@ from eomc.derive.articulated_body import MasslessError, accelerations
 from eomc.derive.constraints import Constraints, constraints
 from eomc.derive.energies import Energies, energies_on_tape, tangent_symbols
 from eomc.derive.ldl import Rows, Solution, SolveResult, Vector, count_operations, solve
-from eomc.derive.newton_euler import Recursion
+from eomc.derive.newton_euler import TreeDynamics
 from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, symbol, t
@@ -238,28 +238,28 @@ def _by_newton_euler(
     e = energies_on_tape(system, tree.other_kinetic, tree.other_potential)
     tape, q = e.tape, system.q
     rest = _lagrange(system, e)
-    recursion = Recursion(tape, tree)
+    dynamics = TreeDynamics(tape, tree)
 
     def by_coordinate(by_link: Sequence[Expr]) -> list[Expr]:
-        projected = recursion.tree.project_forces(by_link)
+        projected = dynamics.tree.project_forces(by_link)
         return [projected.get(x, S.Zero) for x in q]
 
-    bias = by_coordinate(recursion.bias())
+    bias = by_coordinate(dynamics.bias())
     motion = replace(
         rest,
         bias=_sums(tape, rest.bias, bias),
-        g=_sums(tape, rest.g, by_coordinate(recursion.gravity_forces())),
+        g=_sums(tape, rest.g, by_coordinate(dynamics.gravity_forces())),
         balance=_sums(tape, rest.balance, [-x for x in bias]),
     )
     constrained = bool(system.constraints)
-    articulated = None if constrained else _by_articulated_bodies(system, recursion, rest)
-    operations = recursion.count_elimination_operations()
+    articulated = None if constrained else _by_articulated_bodies(system, dynamics, rest)
+    operations = dynamics.count_elimination_operations()
     use_articulated = isinstance(articulated, Solution) and operations > _length(articulated)
     if use_articulated and len(q) > MAX_UNROLLED_COORDINATES:
-        direction = recursion.tree.joint_rates(tangent_symbols(system))
-        D: Rows = (tuple(by_coordinate(recursion.mass_times(direction))),)
+        direction = dynamics.tree.joint_rates(tangent_symbols(system))
+        D: Rows = (tuple(by_coordinate(dynamics.mass_times(direction))),)
     else:
-        columns = zip(*map(by_coordinate, recursion.mass_matrix()), strict=True)
+        columns = zip(*map(by_coordinate, dynamics.mass_matrix()), strict=True)
         matrix = [
             *map(by_coordinate, columns)
         ]  # by column; only one of two symmetric entries is used
@@ -270,30 +270,32 @@ def _by_newton_euler(
     composite: SolveResult = None if constrained else f"{operations} flops for elimination alone"
     if not use_articulated and not constrained:
         composite = solve(tape, D, motion.balance)
-    e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
-    e.potential = tape.total([e.potential, recursion.potential_energy()])
+    e.kinetic = tape.total([e.kinetic, dynamics.kinetic_energy()])
+    e.potential = tape.total([e.potential, dynamics.potential_energy()])
     result = equations(system, e, replace(motion, D=D))
     if constrained:
         _refuse_massless(system, D, result.rows)
     return result, articulated, composite
 
 
-def _by_articulated_bodies(system: System, recursion: Recursion, rest: MotionTerms) -> SolveResult:
+def _by_articulated_bodies(
+    system: System, dynamics: TreeDynamics, rest: MotionTerms
+) -> SolveResult:
     """Return accelerations by articulated bodies if all inertia belongs to joints with one
     coordinate each.
     """
-    q, links = system.q, recursion.links
-    if not recursion.tree.has_own_coordinates:
+    q, links = system.q, dynamics.links
+    if not dynamics.tree.has_own_coordinates:
         return "joints that move together"
     if len(links) < len(q) or any(x != 0 for column in rest.D for x in column):
         return None
     link_of = {link.q: k for k, link in enumerate(links)}
     try:
-        qdd, pivots = accelerations(recursion, [rest.balance[q.index(link.q)] for link in links])
+        qdd, pivots = accelerations(dynamics, [rest.balance[q.index(link.q)] for link in links])
     except MasslessError:  # D is singular; `program.inertia` reports the motion without inertia
         return MASSLESS
     order = tuple(q.index(link.q) for link in reversed(links))
-    return Solution(recursion.vectors.tape, tuple(qdd[link_of[x]] for x in q), order, pivots)
+    return Solution(dynamics.vectors.tape, tuple(qdd[link_of[x]] for x in q), order, pivots)
 
 
 def _by_multipliers(system: System) -> SolveResult:
@@ -561,11 +563,11 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     accelerations = dict(zip(system.qd, system.qdd, strict=True))
     terms_of = [[x] for x in _inertial_forces(system, e, accelerations)]
     if tree:
-        recursion = Recursion(e.tape, tree)
-        joint_accelerations = recursion.tree.joint_rates(
+        dynamics = TreeDynamics(e.tape, tree)
+        joint_accelerations = dynamics.tree.joint_rates(
             dict(zip(system.q, system.qdd, strict=True))
         )
-        tree_forces = recursion.tree.project_forces(recursion.inverse_dynamics(joint_accelerations))
+        tree_forces = dynamics.tree.project_forces(dynamics.inverse_dynamics(joint_accelerations))
         for terms, q in zip(terms_of, system.q, strict=True):
             terms.append(tree_forces.get(q, S.Zero))
     return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in terms_of]

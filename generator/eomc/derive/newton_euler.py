@@ -70,8 +70,8 @@ class _Forces:
     moment: list[Vector]
 
 
-class Recursion:
-    """A kinematic tree of links, with methods that return its dynamics as symbolic expressions.
+class TreeDynamics:
+    """Dynamics of a kinematic tree of links, as symbolic expressions.
 
     Expressions are defined on a tape, a list of elementary operations with named results. The
     recursive Newton-Euler algorithm gives bias, gravity forces and inverse dynamics. The

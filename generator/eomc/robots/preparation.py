@@ -59,7 +59,7 @@ def prepare_for_scene(robot: Robot) -> Robot:
         for b in robot.bodies
         if (why := indefinite_message(b.inertia))
     ]
-    if faults := [*faults, *without_inertia(robot)]:
+    if faults := [*faults, *massless_joint_messages(robot)]:
         raise EomcError("\n".join(faults))
     robot = _with_scene_names(robot)  # after the errors, which use the names that --lock expects
     notes = tuple(
@@ -67,7 +67,7 @@ def prepare_for_scene(robot: Robot) -> Robot:
         for body in robot.bodies
         if (why := triangle_message(body.inertia))
     )
-    if light := light_root(robot):
+    if light := massless_free_root(robot):
         notes += (
             f"body {light}: it is free and has neither mass nor inertia, so the joint that it "
             "carries moves nothing against it: give it both, or import with --base fixed; until "
@@ -250,7 +250,7 @@ def _described(loop: RobotLoop, robot: Robot, rows: list[str]) -> str:
 # --- motions without inertia ----------------------------------------------------------------------
 
 
-def without_inertia(robot: Robot) -> list[str]:
+def massless_joint_messages(robot: Robot) -> list[str]:
     """Return messages on the joints that move no mass or inertia.
 
     There is one message for each such joint; one last message proposes a remedy for all of them.
@@ -285,7 +285,7 @@ def without_inertia(robot: Robot) -> list[str]:
     return [*(faults[name] for name in names), f"add mass and inertia to the file{freeze}"]
 
 
-def light_root(robot: Robot) -> str:
+def massless_free_root(robot: Robot) -> str:
     """Return the name of a free body without mass that carries exactly one joint.
 
     Returns "" if there is none. Bodies fixed to the free body count as part of it. Such a body
