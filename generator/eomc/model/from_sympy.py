@@ -779,6 +779,6 @@ def formula_text(expr: Expr) -> str:
 
     >>> x = Symbol("x")
     >>> formula_text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))
-    'exp(1)*max(0, x) + abs(x)**2/2'
+    'abs(x)**2/2 + exp(1)*max(0, x)'
     """
     return str(_Formula().doprint(expr))
