@@ -149,9 +149,9 @@ def with_wrong(method: str, by: Callable[[Any], Any]) -> Callable[[pytest.Monkey
 
 # what is wrong in multibody.py, and the energy that tells
 WRONG = {
-    "the sign of gravity": (with_wrong("_weight", lambda P: -P), "potential_energy"),
-    "a term of K": (with_wrong("_kinetic", lambda terms: terms[:-1]), "kinetic_energy"),
-    "a factor in K": (with_wrong("_kinetic", lambda K: [2 * K[0], *K[1:]]), "kinetic_energy"),
+    "the sign of gravity": (with_wrong("_gravity_potential", lambda P: -P), "potential_energy"),
+    "a term of K": (with_wrong("_kinetic_terms", lambda terms: terms[:-1]), "kinetic_energy"),
+    "a factor in K": (with_wrong("_kinetic_terms", lambda K: [2 * K[0], *K[1:]]), "kinetic_energy"),
     "the length of a spring": (with_wrong("_length", lambda x: 2 * x), "potential_energy"),
     "the sense of a rotation": (
         lambda monkeypatch: monkeypatch.setattr(building, "rotation_about", wrong_rotation),
@@ -159,14 +159,14 @@ WRONG = {
     ),
     "products of inertia": (
         lambda monkeypatch: monkeypatch.setattr(
-            building.Builder, "_kinetic",
+            building.Builder, "_kinetic_terms",
             lambda self, m, inertia, *place: RIGHT(self, m, [*inertia[:3], *(-sympy.S(x) for x in
                                                    inertia[3:])], *place),
         ),
         "kinetic_energy",
     ),
 }  # fmt: skip
-RIGHT = building.Builder._kinetic
+RIGHT = building.Builder._kinetic_terms
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_a_fault_in_what_is_made_of_bodies_is_noticed(
 
 
 def test_a_damper_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(building.Builder, "_damper", lambda *line: None)
+    monkeypatch.setattr(building.Builder, "_add_damper", lambda *line: None)
     assert compared(single())["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 

@@ -95,8 +95,8 @@ class Problem:
         parts = (
             place,
             self.severity,
-            _cut(self.key, self.MAX_WIDTH),
-            _cut(self.message, self.MAX_MESSAGE),
+            _shorten(self.key, self.MAX_WIDTH),
+            _shorten(self.message, self.MAX_MESSAGE),
         )
         text = ": ".join(texts.line(part) for part in parts if part)
         if not self.source:
@@ -104,7 +104,7 @@ class Problem:
         # of a long line, the part around the fault
         most = self.MAX_WIDTH
         start = max(self.column - most // 2, 0) if len(self.source) > most else 0
-        shown = _shown(self.source[start : start + most])
+        shown = _printable(self.source[start : start + most])
         before = "…" if start else ""
         after = "…" if len(self.source) > start + most else ""
         gutter = f"  {self.line} | "
@@ -116,11 +116,11 @@ class Problem:
         return text
 
 
-def _cut(text: str, most: int) -> str:
+def _shorten(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def _shown(text: str) -> str:
+def _printable(text: str) -> str:
     """Return `text` in one line, with one printable character for each of its own."""
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 

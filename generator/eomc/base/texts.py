@@ -75,15 +75,15 @@ def line(text: str) -> str:
     >>> line("θ\x1b]0;x")
     'θ\\x1b]0;x'
     """
-    return _HIDDEN.sub(_escaped, text)
+    return _HIDDEN.sub(_escape, text)
 
 
 def lines(text: str) -> str:
     """Return `text` with hidden characters escaped, except for line breaks and tabs."""
-    return _HIDDEN_IN_LINES.sub(_escaped, text)
+    return _HIDDEN_IN_LINES.sub(_escape, text)
 
 
-def _escaped(match: re.Match[str]) -> str:
+def _escape(match: re.Match[str]) -> str:
     return match[0].encode("unicode_escape").decode("ascii")
 
 
@@ -209,24 +209,24 @@ class FreeText:
 
         Quotes are not escaped, because the docstring is later escaped as a whole.
         """
-        return line(self._one())
+        return line(self._single_text())
 
     @property
     def comment(self) -> str:
         """The text as one line that is escaped for a C comment."""
-        return comment(self._one())
+        return comment(self._single_text())
 
     @property
     def xml(self) -> str:
         """The text as one line that is escaped for the value of an XML attribute."""
-        return xml(self._one())
+        return xml(self._single_text())
 
     @property
     def python(self) -> str:
         """The text, or the dict of texts, as the source text of a Python literal."""
         return python(self.text)
 
-    def _one(self) -> str:
+    def _single_text(self) -> str:
         if not isinstance(self.text, str):
             raise TypeError("texts by name are printed as .python only")
         return self.text

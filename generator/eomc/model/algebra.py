@@ -89,18 +89,18 @@ class DigitBound:
     digits: float = 0.0
 
     def __add__(self, other: DigitBound) -> DigitBound:
-        return _bounded(lambda a, b: a + b, self.digits + other.digits, self, other)
+        return _apply_to_bounds(lambda a, b: a + b, self.digits + other.digits, self, other)
 
     def __sub__(self, other: DigitBound) -> DigitBound:
-        return _bounded(lambda a, b: a - b, self.digits + other.digits, self, other)
+        return _apply_to_bounds(lambda a, b: a - b, self.digits + other.digits, self, other)
 
     def __mul__(self, other: DigitBound) -> DigitBound:
-        return _bounded(lambda a, b: a * b, self.digits + other.digits, self, other)
+        return _apply_to_bounds(lambda a, b: a * b, self.digits + other.digits, self, other)
 
     def __truediv__(self, other: DigitBound) -> DigitBound:
         if other.value == 0:
             raise FormulaError("divides by zero")
-        return _bounded(lambda a, b: a / b, self.digits + other.digits, self, other)
+        return _apply_to_bounds(lambda a, b: a / b, self.digits + other.digits, self, other)
 
     def __neg__(self) -> DigitBound:
         return DigitBound(None if self.value is None else -self.value, self.digits)
@@ -118,13 +118,13 @@ class DigitBound:
             return VARIES
         root = 0.0 if other.value.is_integer() else _IRRATIONAL_DIGITS
         digits = 1.0 if self.value in (0, 1) else self.digits * max(abs(other.value), 1) + root
-        return _bounded(lambda a, b: a**b, digits, self, other)
+        return _apply_to_bounds(lambda a, b: a**b, digits, self, other)
 
 
 VARIES = DigitBound()
 
 
-def _bounded(function: Callable[..., Any], digits: float, *parts: DigitBound) -> DigitBound:
+def _apply_to_bounds(function: Callable[..., Any], digits: float, *parts: DigitBound) -> DigitBound:
     """Apply a function to bounded values. Raises FormulaError beyond MAX_DIGITS."""
     if not digits <= MAX_DIGITS:
         raise FormulaError(_TOO_LONG)
@@ -152,14 +152,14 @@ def _literal(text: str) -> DigitBound:
     return DigitBound(formulas.NUMERIC["number"](text), digits)
 
 
-def _bounded_call(name: str) -> Callable[..., DigitBound]:
+def _bound_call(name: str) -> Callable[..., DigitBound]:
     function = formulas.NUMERIC[name]
     rational = name in ("abs", "min", "max", "sign", "heaviside")
 
     def bound_of_call(*parts: DigitBound) -> DigitBound:
         if any(part.value is None for part in parts):
             return VARIES
-        return _bounded(
+        return _apply_to_bounds(
             function, sum(p.digits for p in parts) + (0 if rational else _IRRATIONAL_DIGITS), *parts
         )
 
@@ -170,7 +170,7 @@ _BOUND_ALGEBRA: Mapping[str, Any] = {
     "number": _literal,
     "pi": DigitBound(math.pi, _IRRATIONAL_DIGITS),
     "dot": lambda _: VARIES,
-    **{name: _bounded_call(name) for name in formulas.FUNCTIONS if name != "dot"},
+    **{name: _bound_call(name) for name in formulas.FUNCTIONS if name != "dot"},
 }
 
 

@@ -156,7 +156,7 @@ class ConstraintChecker:
                 holonomic.append(row)
             else:
                 if degree.exact:
-                    self.doubt(row, _DRIFTS + _instead(row.formula, self.coordinates))
+                    self.doubt(row, _DRIFTS + _position_advice(row.formula, self.coordinates))
                 others.append(replace(row, holonomic=False))
         return (*holonomic, *others)
 
@@ -167,9 +167,9 @@ class ConstraintChecker:
         warning is reported. If it is not zero, so that the loop can't close, or if no equation is
         left, an error is reported.
         """
-        fixed = [self._fixed(row.formula) for row in closed.rows]
+        fixed = [self._constant_value(row.formula) for row in closed.rows]
         if closed.points and None in fixed:
-            hardly = self._hardly_moved(closed)
+            hardly = self._nearly_constant_values(closed)
             fixed = [b if a is None else a for a, b in zip(fixed, hardly, strict=True)]
         reduced, constant = loops.without_constant_rows(closed, fixed)
         far = [(row, value) for row, value in constant if not abs(value) <= self.ZERO_RESIDUAL]
@@ -185,7 +185,7 @@ class ConstraintChecker:
             self.doubt(row, f"{why}; what they would carry is not determined, and counts as zero")
         return reduced
 
-    def _fixed(self, e: Expr) -> float | None:
+    def _constant_value(self, e: Expr) -> float | None:
         """Return the value of an expression that depends on no coordinate; None otherwise."""
         if self.velocity_degree.degree(e).moves == 2:
             return None
@@ -197,7 +197,7 @@ class ConstraintChecker:
             float(value) if value.is_number else math.inf
         )  # a function of t: the loop does not stay closed
 
-    def _hardly_moved(self, closed: LoopEquations) -> list[float | None]:
+    def _nearly_constant_values(self, closed: LoopEquations) -> list[float | None]:
         """Return the values of a loop's equations that change by rounding only, None for others.
 
         Axes of a planar mechanism that is tilted in space are parallel to sixteen digits only, if
@@ -232,7 +232,7 @@ class ConstraintChecker:
         ]
 
 
-def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:
+def _position_advice(rate: Expr, coordinates: Iterable[Coordinate]) -> str:
     """Return the advice to write the position in place of its time derivative."""
     positions: Mapping[Expr, Expr] = {c.qd: c.q for c in coordinates}
     terms = sympy.Add.make_args(rate)

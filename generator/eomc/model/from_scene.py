@@ -250,7 +250,16 @@ def from_scene(scene: Scene) -> System:
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
     rubs, sticks = scene_formulas.frictions(more)
     coordinates = tuple(
-        Coordinate(c.name, c.unit, q, qd, c.note, c.start_fixed, c.rate_fixed, *_follows(scene, c))
+        Coordinate(
+            c.name,
+            c.unit,
+            q,
+            qd,
+            c.note,
+            c.start_fixed,
+            c.rate_fixed,
+            *_parameter_formulas(scene, c),
+        )
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
     )
     rows, reactions = scene_formulas.constraints(coordinates, definitions, more.closed)
@@ -282,7 +291,7 @@ def from_scene(scene: Scene) -> System:
         note=scene.note,
         file=scene.file,
         digest=scene.digest,
-        warnings=(*scene.warnings, *scene_formulas.doubts, *_at_the_start(scene)),
+        warnings=(*scene.warnings, *scene_formulas.doubts, *_start_warnings(scene)),
         place=scene.problem,
         scene=scene,
     )
@@ -291,7 +300,7 @@ def from_scene(scene: Scene) -> System:
     return add_hybrid_dynamics(system, sticks)
 
 
-def _follows(scene: Scene, c: SceneCoordinate) -> Iterator[str]:
+def _parameter_formulas(scene: Scene, c: SceneCoordinate) -> Iterator[str]:
     """Yield the formulas of start and rate that depend on parameters, "" for others."""
     constants = {one.name: one.value for one in scene.constants}
     for formula in (c.start, c.rate):
@@ -299,7 +308,7 @@ def _follows(scene: Scene, c: SceneCoordinate) -> Iterator[str]:
         yield "" if free else fold_values(formula, constants)
 
 
-def _at_the_start(scene: Scene) -> list[Problem]:
+def _start_warnings(scene: Scene) -> list[Problem]:
     """Return warnings on springs and dampers of zero length at the start."""
     assembly = scene.assembly
     if not assembly or not any(

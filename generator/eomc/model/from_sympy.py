@@ -52,7 +52,9 @@ _OF_NUMBERS = (
 Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
 
 
-def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]) -> str:
+def _first_input(
+    expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]
+) -> str:
     """Return the first input by name on which an expression depends, also by definitions, or ""."""
     uses = expr.free_symbols.union(
         *(e.free_symbols for _, e in needed_definitions(definitions, [expr]))
@@ -265,7 +267,7 @@ class Maker:
             for role in ("kinetic", "potential", "dissipation")
         }
         for role, energy in expressions.items():
-            if used_input := _input_in(energy, definitions, inputs):
+            if used_input := _first_input(energy, definitions, inputs):
                 why = f"{used_input} is an input, and an energy can't depend on inputs"
                 raise argument_error(role, f"{why}: let it act through forces")
             what = f"the {role} energy"
@@ -368,7 +370,7 @@ class Maker:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
             api_arguments.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
-            if used_input := _input_in(expr, ordered, inputs):
+            if used_input := _first_input(expr, ordered, inputs):
                 why = (
                     f"{used_input} is an input, whose rate is not known: let it act through forces"
                 )
@@ -401,7 +403,7 @@ class Maker:
         for one, signal in signals.items():
             name, role = name_of(one), f"signal of {one}"
             value = self._expression(signal, role)
-            if used_input := _input_in(value, definitions, used.values()):
+            if used_input := _first_input(value, definitions, used.values()):
                 raise argument_error(
                     role, f"{used_input} is an input, and a signal can't depend on inputs"
                 )
@@ -620,14 +622,14 @@ def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Exp
 def _applicable_piece(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
     """Return the later piece that applies where a condition holds; None if undecided."""
     for piece, other in later:
-        if _never_both(condition, sympy.Not(other), fixed):
+        if _are_exclusive(condition, sympy.Not(other), fixed):
             return piece
-        if not _never_both(condition, other, fixed):
+        if not _are_exclusive(condition, other, fixed):
             return None
     return None
 
 
-def _never_both(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
+def _are_exclusive(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
     """Return True if two conditions exclude each other: d > 0 and e > 0 if d + s e <= 0, s > 0."""
     if isinstance(one, _ORDERS) and isinstance(other, _ORDERS):
         (d, varying), (e, against) = (

@@ -69,7 +69,7 @@ class Kinematics:
         # these depend on parameters only
         self.frames = {body.name: self.joint_frame(body) for body in self.tree}
         self.centers = {body.name: self.vector(body.center, self.values) for body in self.tree}
-        self.roots = {body.name: self._roots(body) for body in assembly.bodies}
+        self.roots = {body.name: self._inertia_roots(body) for body in assembly.bodies}
 
     def sample_null_spaces(self) -> Iterator[NullSpaces]:
         """Yield the null spaces of the Jacobians at up to three random configurations.
@@ -118,7 +118,7 @@ class Kinematics:
         for body in reversed(self.tree):
             (at, R), motions = frames[body.name]
             mass, root = self.roots[body.name]
-            own = _spatial(mass**2, R @ self.centers[body.name], root @ R.T)
+            own = _spatial_inertia(mass**2, R @ self.centers[body.name], root @ R.T)
             beyond = own + inertia.pop(body.name, 0)
             scale = max(float(np.abs(beyond).max()), size.pop(body.name, 0.0))
             for _, kind, axis, point in reversed(motions):
@@ -130,7 +130,7 @@ class Kinematics:
                 beyond = beyond - np.outer(u, u) / (s @ u)
             if body.parent != WORLD:
                 shift = np.eye(6)
-                shift[3:, :3] = -_cross(at - frames[body.parent][0][0])
+                shift[3:, :3] = -_cross_matrix(at - frames[body.parent][0][0])
                 inertia[body.parent] = inertia.get(body.parent, 0) + shift.T @ beyond @ shift
                 size[body.parent] = max(size.get(body.parent, 0.0), scale)
         return True
@@ -144,13 +144,13 @@ class Kinematics:
         """
         try:
             by_name = {name: pose for name, (pose, _) in self._frames(q).items()}
-            return by_name | (self._placed_at(q, 0.0) if self.placed else {})
+            return by_name | (self._poses_by_formulas(q, 0.0) if self.placed else {})
         except (ArithmeticError, ValueError, TypeError):
             return None
 
     def _frames(self, q: Array) -> dict[str, tuple[Pose, list[Motion]]]:
         """Return each body's frame and the motions of its joint, in the world."""
-        known = self._known(q)
+        known = self._quantity_values(q)
         out: dict[str, tuple[Pose, list[Motion]]] = {WORLD: ((np.zeros(3), np.eye(3)), [])}
         for body in self.tree:
             at, R = out[body.parent][0]
@@ -164,11 +164,11 @@ class Kinematics:
                 if kind == "t":
                     at = at + R @ axis * moved
                 else:
-                    R = R @ _about(axis, moved)
+                    R = R @ _rotation_matrix(axis, moved)
             out[body.name] = (at, R), motions
         return out
 
-    def _known(self, q: Array) -> dict[str, float]:
+    def _quantity_values(self, q: Array) -> dict[str, float]:
         """Return the values of parameters, constants and coordinates."""
         return {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True))}
 
@@ -230,13 +230,16 @@ class Kinematics:
         """
         if not self.placed:
             return
-        here = self._placed_at(q, t)
+        here = self._poses_by_formulas(q, t)
         v = {name: np.zeros((3, len(q))) for name in here}
         omega = {name: np.zeros((3, len(q))) for name in here}
         for k in range(len(q)):
             step = np.zeros(len(q))
             step[k] = self.STEP
-            after, before = self._placed_at(q + step, t), self._placed_at(q - step, t)
+            after, before = (
+                self._poses_by_formulas(q + step, t),
+                self._poses_by_formulas(q - step, t),
+            )
             for name in here:
                 v[name][:, k] = (after[name][0] - before[name][0]) / (2 * self.STEP)
                 # R(q + h) R(q - h)^T = 1 + 2 h [omega] + ..., antisymmetric up to h^3
@@ -246,9 +249,9 @@ class Kinematics:
         for body in self.placed:
             yield body, here[body.name][1], v[body.name], omega[body.name]
 
-    def _placed_at(self, q: Array, t: float) -> dict[str, Pose]:
+    def _poses_by_formulas(self, q: Array, t: float) -> dict[str, Pose]:
         """Return centre of mass and rotation of each body that is placed by formulas."""
-        known = {**self._known(q), "t": t}
+        known = {**self._quantity_values(q), "t": t}
         for name, ((at, R), _) in self._frames(q).items():
             if name != WORLD:
                 center = at + R @ self.centers[name]
@@ -278,7 +281,7 @@ class Kinematics:
         axes = map(np.array, JOINTS[body.joint].motion_axes(body.axes))
         return [axis / np.linalg.norm(axis) for axis in axes]
 
-    def _roots(self, body: RigidBody) -> tuple[float, Array]:
+    def _inertia_roots(self, body: RigidBody) -> tuple[float, Array]:
         """Return square roots of mass and inertia tensor: 2 K = |root_m v|^2 + |root_I omega|^2."""
         inertia = [self._number(entry, self.values) for entry in body.inertia]
         moments, axes = np.linalg.eigh(spatial.tensor(inertia))
@@ -305,7 +308,7 @@ class Kinematics:
         rotation = np.eye(3)
         for turn in turns:
             axis = np.eye(3)["xyz".index(turn.axis)]
-            rotation = rotation @ _about(axis, self._number(turn.angle, known))
+            rotation = rotation @ _rotation_matrix(axis, self._number(turn.angle, known))
         return rotation
 
     def _number(self, formula: Formula, known: dict[str, float]) -> float:
@@ -322,20 +325,20 @@ class Kinematics:
         return value
 
 
-def _cross(v: Array) -> Array:
+def _cross_matrix(v: Array) -> Array:
     """Return the matrix [v] with [v] w = v x w."""
     x, y, z = v
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _spatial(mass: float, center: Array, root: Array) -> Array:
+def _spatial_inertia(mass: float, center: Array, root: Array) -> Array:
     """Return the spatial inertia (6, 6) at a point, of angular velocity and velocity."""
-    c = _cross(center)
+    c = _cross_matrix(center)
     coupled = mass * c
     return np.block([[root.T @ root - coupled @ c, coupled], [-coupled, mass * np.eye(3)]])
 
 
-def _about(axis: Array, angle: float) -> Array:
+def _rotation_matrix(axis: Array, angle: float) -> Array:
     """Return the rotation by an angle about a unit axis."""
     return np.array(spatial.axis_angle_rotation(axis.tolist(), math.cos(angle), math.sin(angle)))
 
@@ -354,7 +357,7 @@ def null_space(columns: Array) -> Array:
         upper = np.linalg.qr(columns[:, there] / sizes[there], mode="r")
         _, values, vectors = np.linalg.svd(upper)
         rank = int((values > RANK_TOLERANCE * values[0]).sum())
-        for row in _eliminated(vectors[rank:]):
+        for row in _reduced_row_echelon_form(vectors[rank:]):
             full = np.zeros(n)
             full[there] = row / sizes[there]
             first = full[np.flatnonzero(np.abs(full) > 1e-3 * np.abs(full).max())[0]]
@@ -362,7 +365,7 @@ def null_space(columns: Array) -> Array:
     return np.array(rows).reshape(-1, n)
 
 
-def _eliminated(rows: Array) -> Array:
+def _reduced_row_echelon_form(rows: Array) -> Array:
     """Return the reduced row echelon form of linearly independent rows."""
     rows = rows.copy()
     for k in range(len(rows)):

@@ -48,13 +48,13 @@ class End:
 
 
 @dataclass(frozen=True)
-class _Pull:
+class _LoopEquation:
     """A constraint equation, and force and moment on the second body for a multiplier of one.
 
     rotation_error: see `Constraint`.
     """
 
-    row: Expr
+    formula: Expr
     force: Vector = ZERO
     moment: Vector = ZERO
     rotation_error: tuple[Expr, Expr] | None = None
@@ -103,18 +103,18 @@ def derive_loop_equations(
     R = (product(first.R, turned), second.R)
     p = plus(second.point, scaled(first.point, S.NegativeOne))
     kinds = loop.rows(plane)
-    pulls = {**_of_points(p, length), **dict(_of_frames(*R, plane=plane))}
+    equations = {**_point_equations(p, length), **dict(_frame_equations(*R, plane=plane))}
     if loop.axes:
-        pulls |= _of_axes(loop.axes, plane, (first.R, second.R), p)
+        equations |= _axis_equations(loop.axes, plane, (first.R, second.R), p)
     rows, force, moment = list[Constraint](), ZERO, ZERO
     for kind, name in kinds.items():
-        pull = pulls[kind]
+        equation = equations[kind]
         unit = {"length": "m^2"}.get(kind, "m" if kind in "xyzuv" else "")
-        row = Constraint(name, pull.row, True, unit, loop.note, loop.name)
-        row = replace(row, rotation_error=pull.rotation_error)
+        row = Constraint(name, equation.formula, True, unit, loop.note, loop.name)
+        row = replace(row, rotation_error=equation.rotation_error)
         rows.append(row)
-        force = plus(force, scaled(pull.force, row.multiplier))
-        moment = plus(moment, scaled(pull.moment, row.multiplier))
+        force = plus(force, scaled(equation.force, row.multiplier))
+        moment = plus(moment, scaled(equation.moment, row.multiplier))
     force, moment = apply(to_world, force), apply(to_world, moment)
     values = (*force[:2], moment[2]) if plane else (*force, *moment)
     branches = [*_branches(kinds, *R)]
@@ -125,46 +125,48 @@ def derive_loop_equations(
     return LoopEquations(rows, [reaction], (first.point, second.point))
 
 
-def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
+def _point_equations(p: Vector, length: Expr) -> dict[str, _LoopEquation]:
     """Return the equations of the vector between two points."""
-    along = {kind: _Pull(p[k], force=rational.ONE[k]) for k, kind in enumerate("xyz")}
-    return {**along, "length": _Pull((dot(p, p) - length**2) / 2, force=p)}
+    along = {kind: _LoopEquation(p[k], force=rational.ONE[k]) for k, kind in enumerate("xyz")}
+    return {**along, "length": _LoopEquation((dot(p, p) - length**2) / 2, force=p)}
 
 
-def _of_axes(
+def _axis_equations(
     axes: Sequence[Sequence[float]], plane: bool, R: tuple[Matrix, Matrix], p: Vector
-) -> dict[str, _Pull]:
+) -> dict[str, _LoopEquation]:
     """Return the equations of an axis of each body."""
     u, v, a = (apply(R[0], axis) for axis in perpendicular_axes(axes[0], plane))
     b = apply(R[1], _unit(axes[1]))
     half = (1 + dot(a, b)) / 2
     return {
-        "u": _Pull(dot(p, u), force=u),
-        "v": _Pull(dot(p, v), force=v),
-        "ru": _at_right_angles(scaled(v, S.NegativeOne), b, (-dot(v, b) / half, half)),
-        "rv": _at_right_angles(u, b, (dot(u, b) / half, half)),
-        "cross": _at_right_angles(a, b),
+        "u": _LoopEquation(dot(p, u), force=u),
+        "v": _LoopEquation(dot(p, v), force=v),
+        "ru": _perpendicularity(scaled(v, S.NegativeOne), b, (-dot(v, b) / half, half)),
+        "rv": _perpendicularity(u, b, (dot(u, b) / half, half)),
+        "cross": _perpendicularity(a, b),
     }
 
 
-def _of_frames(first: Matrix, second: Matrix, plane: bool) -> Iterator[tuple[str, _Pull]]:
+def _frame_equations(
+    first: Matrix, second: Matrix, plane: bool
+) -> Iterator[tuple[str, _LoopEquation]]:
     """Yield the equations of equal orientation of two frames."""
     mine, other = transposed(first), transposed(second)
     if plane:
         half = (1 + dot(mine[0], other[0])) / 2
-        yield "rz", _at_right_angles(mine[1], other[0], (dot(mine[1], other[0]) / half, half))
+        yield "rz", _perpendicularity(mine[1], other[0], (dot(mine[1], other[0]) / half, half))
         return
     R = [[dot(a, b) for b in other] for a in mine]
     half = (1 + R[0][0] + R[1][1] + R[2][2]) / 4
     for kind, i, k in (("rx", 2, 1), ("ry", 0, 2), ("rz", 1, 0)):
-        yield kind, _at_right_angles(mine[i], other[k], ((R[i][k] - R[k][i]) / (2 * half), half))
+        yield kind, _perpendicularity(mine[i], other[k], ((R[i][k] - R[k][i]) / (2 * half), half))
 
 
-def _at_right_angles(
+def _perpendicularity(
     a: Vector, b: Vector, rotation_error: tuple[Expr, Expr] | None = None
-) -> _Pull:
+) -> _LoopEquation:
     """Return the equation a.b = 0 of an axis of the first body and one of the second."""
-    return _Pull(dot(a, b), moment=cross(b, a), rotation_error=rotation_error)
+    return _LoopEquation(dot(a, b), moment=cross(b, a), rotation_error=rotation_error)
 
 
 def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterator[Expr]:

@@ -136,12 +136,12 @@ def compute_mobility(scene: Scene) -> Mobility:
     generic = min(samples, key=lambda null: (len(null.moves), len(null.weighs)))
     rank = len(names) - len(generic.moves)
     remarks = [
-        *_fixed(assembly),
-        *_shared(assembly, {*names}),
-        *_formulas_fix(placed, d, rank, tree),
-        *_moves_nothing(generic, names, scene),
-        *_in_a_row(assembly, kinematics),
-        *_singular_start(kinematics, generic),
+        *_report_fixed_joints(assembly),
+        *_report_shared_coordinates(assembly, {*names}),
+        *_report_bodies_by_formulas(placed, d, rank, tree),
+        *_report_idle_coordinates(generic, names, scene),
+        *_report_consecutive_joints(assembly, kinematics),
+        *_report_singular_start(kinematics, generic),
         *(f"{problem.key}: {problem.message}" for problem in find_coincident_ends(scene)),
     ]
     M, rows = tree - closed - len(scene.constraints), len(scene.constraints)
@@ -212,13 +212,13 @@ def _closure_freedoms(kind: str, d: int) -> int:
 # --- remarks -------------------------------------------------------------------------------------
 
 
-def _fixed(assembly: Assembly) -> Iterator[str]:
+def _report_fixed_joints(assembly: Assembly) -> Iterator[str]:
     rigid = [body.name for body in assembly.bodies if body.joint == "fixed" and not body.point]
     if rigid:
         yield f"fixed (f = 0), moving as one with what they are fixed to: {listed(rigid)}"
 
 
-def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
+def _report_shared_coordinates(assembly: Assembly, names: set[str]) -> Iterator[str]:
     names_before: set[str] = set()
     motions, together = 0, []
     for body in assembly.bodies:
@@ -235,7 +235,9 @@ def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
         )
 
 
-def _formulas_fix(placed: Sequence[RigidBody], d: int, rank: int, M: int) -> Iterator[str]:
+def _report_bodies_by_formulas(
+    placed: Sequence[RigidBody], d: int, rank: int, M: int
+) -> Iterator[str]:
     if placed:
         yield (
             f"{listed([b.name for b in placed])}: M counts {d} freedoms for each body that is "
@@ -243,7 +245,7 @@ def _formulas_fix(placed: Sequence[RigidBody], d: int, rank: int, M: int) -> Ite
         )
 
 
-def _moves_nothing(at: NullSpaces, names: Sequence[str], scene: Scene) -> Iterator[str]:
+def _report_idle_coordinates(at: NullSpaces, names: Sequence[str], scene: Scene) -> Iterator[str]:
     """Report coordinates that move no body, or that move bodies only in combinations."""
     ways = ["[energy] gives it inertia"] if any(scene.kinetic.names()) else []
     ways += ["a constraint decides it"] if scene.constrained else []
@@ -259,7 +261,7 @@ def _moves_nothing(at: NullSpaces, names: Sequence[str], scene: Scene) -> Iterat
             yield f"without inertia: {what} moves nothing that has inertia against it; {result}"
 
 
-def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
+def _report_consecutive_joints(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
     """Report consecutive joints about the same line or along the same direction."""
     by_name = {body.name: body for body in assembly.bodies}
     for body in assembly.bodies:
@@ -289,7 +291,7 @@ def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
         )
 
 
-def _singular_start(kinematics: Kinematics, generic: NullSpaces) -> Iterator[str]:
+def _report_singular_start(kinematics: Kinematics, generic: NullSpaces) -> Iterator[str]:
     at_start = kinematics.null_spaces(kinematics.start, 0.0)
     names = kinematics.coordinates
     if at_start is None:
@@ -311,13 +313,13 @@ def _singular_start(kinematics: Kinematics, generic: NullSpaces) -> Iterator[str
 
 def _combination(row: Array, names: Sequence[str]) -> str:
     """Return a motion as text: one coordinate, or velocities in a fixed ratio."""
-    those = _named(row, names)
+    those = _moving_names(row, names)
     if len(those) == 1:
         return f"'{those[0]}'"
     rates = dict(zip(names, row, strict=True))
     return "the motion " + ", ".join(f"{name}_dot = {rates[name]:.4g}" for name in those)
 
 
-def _named(row: Array, names: Sequence[str]) -> list[str]:
+def _moving_names(row: Array, names: Sequence[str]) -> list[str]:
     large = np.abs(row) > 1e-3 * np.abs(row).max()
     return [name for name, named in zip(names, large, strict=True) if named]

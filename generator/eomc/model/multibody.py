@@ -158,9 +158,9 @@ class Builder:
         """Add the bodies with joints, their energies and their definitions to `terms`."""
         for body in self.assembly.bodies:
             if body.joint:
-                self._join(body)
+                self._add_body_on_joint(body)
 
-    def _join(self, body: RigidBody) -> None:
+    def _add_body_on_joint(self, body: RigidBody) -> None:
         key = f"body.{body.name}"
         parent = self.places[body.parent]
         offset = self._vector(f"{key}.offset", body.offset) if body.offset else ZERO
@@ -168,7 +168,7 @@ class Builder:
         angle = parent.angle
         if self.assembly.plane:
             angle += sum(self.value(f"{key}.rotation", turn.angle) for turn in body.rotation)
-        at = self._world(f"{body.name}_joint", plus(parent.at, apply(parent.R, offset)))
+        at = self._define_position(f"{body.name}_joint", plus(parent.at, apply(parent.R, offset)))
         R = product(parent.R, rotation)
         place = _Place(
             parent.link,
@@ -181,17 +181,19 @@ class Builder:
         armature = [self.value(f"{key}.armature", a) for a in body.armature]
         kind, by = JOINTS[body.joint], [self._coordinate(key, c) for c in body.coordinates]
         for k, along in enumerate(zip(kind.motions, kind.motion_axes(body.axes), by, strict=True)):
-            place = self._move(body.name, place, *along, armature[k] if armature else S.Zero)
+            place = self._add_elementary_joint(
+                body.name, place, *along, armature[k] if armature else S.Zero
+            )
         moved = zip(
             kind.motions, kind.motion_axes(body.axes), self.moved.get(body.name, ()), strict=True
         )
         turned = sum((self.value(f"{key}.rotation", x.angle) for x in body.rotation), S.Zero)
         self.chains.steps[body.name] = Step(body.parent, offset, rotation, turned, tuple(moved))
         if not self.assembly.plane and body.joint != "fixed":
-            R = self._entries(body.name, place.R)
+            R = self._define_matrix(body.name, place.R)
             place = replace(place, R=R)
         self.places[body.name] = place
-        self._load(body, place)
+        self._add_mass(body, place)
 
     def _coordinate(self, key: str, formula: Formula) -> Expr:
         """Return a joint position over coordinates, and record their velocities."""
@@ -200,13 +202,13 @@ class Builder:
         self.terms.rates |= {q: self.coordinates[q] for q in by}
         return moved
 
-    def _move(
+    def _add_elementary_joint(
         self, name: str, place: _Place, motion: str, axis: Sequence[float], moved: Expr,
         armature: Expr,
     ) -> _Place:  # fmt: skip
         """Return the pose after one more elementary joint, which becomes a link."""
         terms = self.terms
-        q = self._named(f"{name}_q", moved)
+        q = self._define(f"{name}_q", moved)
         self.moved.setdefault(name, []).append(q)
         terms.tree_kinetic.append(armature * self.terms.rates.get(q, _rate(q)) ** 2 / 2)
         k, aligned = rational.aligned_with(axis)
@@ -220,17 +222,17 @@ class Builder:
         back = transposed(aligned)
         if motion == "t":
             way = scaled(apply(place.R, direction), q)
-            at = self._world(f"{name}_joint", plus(place.at, way))
+            at = self._define_position(f"{name}_joint", plus(place.at, way))
             return _Place(len(terms.links) - 1, ZERO, back, at, place.R, place.angle)
         if self.assembly.plane:
-            angle = self._named(f"{name}_angle", place.angle + q)
+            angle = self._define(f"{name}_angle", place.angle + q)
             R = rotation_about(2, angle)
             return _Place(len(terms.links) - 1, ZERO, back, place.at, R, angle)
         turn = product(product(aligned, rotation_about(k, q)), back)
-        R = self._entries(name, product(place.R, turn))
+        R = self._define_matrix(name, product(place.R, turn))
         return _Place(len(terms.links) - 1, ZERO, back, place.at, R)
 
-    def _load(self, body: RigidBody, place: _Place) -> None:
+    def _add_mass(self, body: RigidBody, place: _Place) -> None:
         """Add the body's mass to its link and to the energies."""
         key, terms = f"body.{body.name}", self.terms
         mass = self.value(f"{key}.mass", body.mass)
@@ -253,8 +255,8 @@ class Builder:
                 moment=plus(link.moment, moment),
                 inertia=tuple(a + b for a, b in zip(link.inertia, about, strict=True)),
             )
-            terms.tree_kinetic += self._kinetic(mass, inertia, position, place)
-        terms.tree_potential.append(self._weight(mass, position))
+            terms.tree_kinetic += self._kinetic_terms(mass, inertia, position, place)
+        terms.tree_potential.append(self._gravity_potential(mass, position))
 
     def add_forces(self) -> None:
         """Add the damping, friction and actuator forces of the joints to `terms`."""
@@ -290,24 +292,24 @@ class Builder:
         """
         for body in self.assembly.bodies:
             if not body.joint:
-                self._put(body)
+                self._add_body_by_formulas(body)
         for body in sorted(self.assembly.bodies, key=lambda body: body.point):
             self.terms.frames.append(self._frame(body.name, self.places[body.name]))
         for k, spring in enumerate(self.assembly.springs):
-            self._spring(f"spring.{k + 1}", spring)
+            self._add_spring(f"spring.{k + 1}", spring)
         for k, damper in enumerate(self.assembly.dampers):
-            self._damper(f"damper.{k + 1}", damper)
+            self._add_damper(f"damper.{k + 1}", damper)
         for k, force in enumerate(self.assembly.forces):
-            self._apply(f"force.{k + 1}", force)
+            self._add_force(f"force.{k + 1}", force)
         for loop in self.assembly.loops:
-            self.terms.closed.append(self._close(f"loop.{loop.name}", loop))
+            self.terms.closed.append(self._close_loop(f"loop.{loop.name}", loop))
 
     def _frame(self, name: str, place: _Place) -> BodyFrame:
         if name in self.loads:
             return BodyFrame(name, -1, place.at, place.R, place.angle, *self.loads[name])
         return BodyFrame(name, place.link, place.offset, place.rotation, place.angle)
 
-    def _apply(self, key: str, force: Force) -> None:
+    def _add_force(self, key: str, force: Force) -> None:
         """Add a force at a point of a body, or a torque; virtual work is F.dp + tau.(dR R^T)."""
         place, applied = self.places[force.body], self.terms.applied
         F, torque = (
@@ -325,7 +327,7 @@ class Builder:
                 applied += ((y, torque[axis] * x) for y, x in zip(row, other, strict=True))
         applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
 
-    def _close(self, key: str, loop: LoopJoint) -> LoopEquations:
+    def _close_loop(self, key: str, loop: LoopJoint) -> LoopEquations:
         """Add a joint that closes a loop, or a gear."""
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
@@ -335,7 +337,7 @@ class Builder:
             place, point = self.places[name], self._vector(f"{key}.points", given)
             at, R = place.at, place.R
             if base != WORLD:
-                at, R = self.chains.relative_pose(name, base, self._later(f"{loop.name}_"))
+                at, R = self.chains.relative_pose(name, base, self._pose_definer(f"{loop.name}_"))
             ends.append(loops.End(plus(at, apply(R, point)), R))
         length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
         turned = self._rotation(f"{key}.rotation", loop)
@@ -344,7 +346,7 @@ class Builder:
             loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R
         )
 
-    def _put(self, body: RigidBody) -> None:
+    def _add_body_by_formulas(self, body: RigidBody) -> None:
         assert body.position is not None
         key, terms = f"body.{body.name}", self.terms
         mass = self.value(f"{key}.mass", body.mass)
@@ -354,22 +356,22 @@ class Builder:
         R, angle = self._rotation(f"{key}.rotation", body), S.Zero
         if self.assembly.plane:
             angle = sum((self.value(f"{key}.rotation", t.angle) for t in body.rotation), S.Zero)
-            angle = self._named(f"{body.name}_angle", angle, later=True)
+            angle = self._define(f"{body.name}_angle", angle, later=True)
             R = rotation_about(2, angle)
         else:
-            R = self._entries(body.name, R, later=True)
+            R = self._define_matrix(body.name, R, later=True)
         place = _Place(-1, ZERO, ONE, position, R, angle)
         self.places[body.name] = place
         self.loads[body.name] = mass, tuple(inertia)
-        terms.kinetic += Add(*self._kinetic(mass, inertia, position, place))
-        terms.potential += self._weight(mass, position)
+        terms.kinetic += Add(*self._kinetic_terms(mass, inertia, position, place))
+        terms.potential += self._gravity_potential(mass, position)
 
-    def _spring(self, key: str, spring: Spring) -> None:
+    def _add_spring(self, key: str, spring: Spring) -> None:
         stiffness = self.value(f"{key}.stiffness", spring.stiffness)
         rest = self.value(f"{key}.length", spring.length)
         self.terms.potential += stiffness * (self._length(key, spring, rest == 0) - rest) ** 2 / 2
 
-    def _damper(self, key: str, damper: Damper) -> None:
+    def _add_damper(self, key: str, damper: Damper) -> None:
         damping = self.value(f"{key}.damping", damper.damping)
         self.terms.dissipation += damping * dot(self._length(key, damper, False)) ** 2 / 2
 
@@ -381,18 +383,18 @@ class Builder:
         one, other = (self.places[name] for name in end.bodies)
         name = f"{key.replace('.', '')}_length"
         if end.turning:
-            return self._named(name, other.angle - one.angle, later=True)
+            return self._define(name, other.angle - one.angle, later=True)
         assert end.points is not None
         a, b = (
             plus(place.at, apply(place.R, self._vector(f"{key}.points", point)))
             for place, point in zip((one, other), end.points, strict=True)
         )
         length = sympy.sqrt(sum((x - y) ** 2 for x, y in zip(b, a, strict=True)))
-        return length if square else self._named(name, length, later=True)
+        return length if square else self._define(name, length, later=True)
 
     # --- pieces ----------------------------------------------------------------------------------
 
-    def _kinetic(
+    def _kinetic_terms(
         self, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
     ) -> list[Expr]:
         """Return the kinetic energy of a body as terms of a sum.
@@ -413,7 +415,7 @@ class Builder:
         ]
         return energy + turning
 
-    def _weight(self, mass: Expr, position: Vector) -> Expr:
+    def _gravity_potential(self, mass: Expr, position: Vector) -> Expr:
         return -mass * spatial.dot(self.terms.gravity, position)
 
     def _vector(self, key: str, formulas: Sequence[Formula]) -> Vector:
@@ -433,35 +435,35 @@ class Builder:
         for k, x in enumerate(at[:2] if self.assembly.plane else at):
             wish = f"{name}_{'xyz'[k]}"
             if later:
-                symbols[k] = self._named(wish, x, later)
+                symbols[k] = self._define(wish, x, later)
             else:  # the symbol is defined even if it is a number
                 symbols[k] = symbol(wish) if x.free_symbols else x
                 self.terms.definitions.append((symbol(wish), x))
         x, y, z = symbols
         return (x, y, z)
 
-    def _world(self, name: str, at: Vector, later: bool = False) -> Vector:
+    def _define_position(self, name: str, at: Vector, later: bool = False) -> Vector:
         named = zip("xyz", at, strict=True)
-        x, y, z = (self._named(f"{name}_{letter}", e, later) for letter, e in named)
+        x, y, z = (self._define(f"{name}_{letter}", e, later) for letter, e in named)
         return (x, y, z)
 
-    def _later(self, begin: str) -> Named:
+    def _pose_definer(self, begin: str) -> Named:
         """Return the function that names a body's pose, after the user's definitions."""
 
         def named(body: str, at: Vector, R: Matrix) -> tuple[Vector, Matrix]:
-            R = R if self.assembly.plane else self._entries(begin + body, R, later=True)
-            return self._world(begin + body, at, later=True), R
+            R = R if self.assembly.plane else self._define_matrix(begin + body, R, later=True)
+            return self._define_position(begin + body, at, later=True), R
 
         return named
 
-    def _entries(self, name: str, R: Matrix, later: bool = False) -> Matrix:
+    def _define_matrix(self, name: str, R: Matrix, later: bool = False) -> Matrix:
         rows = enumerate(R, start=1)
         return spatial.matrix(
-            [self._named(f"{name}_r{i}{j}", e, later) for j, e in enumerate(row, start=1)]
+            [self._define(f"{name}_r{i}{j}", e, later) for j, e in enumerate(row, start=1)]
             for i, row in rows
         )
 
-    def _named(self, wish: str, e: Expr, later: bool = False) -> Expr:
+    def _define(self, wish: str, e: Expr, later: bool = False) -> Expr:
         """Return a definition of `e`, unless it is a number, a symbol or its negative."""
         if e.is_number or e.is_Symbol or (-e).is_Symbol:
             return e

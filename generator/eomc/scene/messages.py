@@ -112,7 +112,7 @@ def quantity_remedy(text: str, declared: Collection[str] = ()) -> str | None:
     if unit == "rpm":
         return f'nothing is converted: write "{number}*2*pi/60", in rad/s'
     if unit in _POWERS:
-        number, unit = _scaled(number, _POWERS[unit]), _SI[unit]
+        number, unit = _scale_decimal(number, _POWERS[unit]), _SI[unit]
     elif unit not in _SI and not _UNITS.fullmatch(unit):
         return None
     unit = _SI.get(unit, unit)
@@ -148,10 +148,10 @@ def number_remedy(text: object) -> str:
     ):
         return ""
     plain = match[1].replace("−", "-").replace(" ", "")
-    return f": write {_scaled(plain, _POWERS.get(match[2], 0))}, without quotes"
+    return f": write {_scale_decimal(plain, _POWERS.get(match[2], 0))}, without quotes"
 
 
-def _scaled(number: str, power: int) -> str:
+def _scale_decimal(number: str, power: int) -> str:
     try:
         return f"{float(f'{number}e{power}'):.15g}" if power else number
     except ValueError:  # it has an exponent already

@@ -68,7 +68,7 @@ class _Expansion:
             if isinstance(self.tree.get(written), (dict, list)) and array_name not in self.tree:
                 entries, unknown = self.tree.pop(written), f"unknown table '{written}': "
                 if not _is_array(entries):
-                    self._fault((written,), unknown + _array_remedy(array_name, entries))
+                    self._report((written,), unknown + _array_remedy(array_name, entries))
                     continue
                 self.check.report((written,), f"{unknown}write [[{array_name}]]")
                 self.tree[array_name] = entries
@@ -78,31 +78,31 @@ class _Expansion:
                 self.declared |= dict.fromkeys(self.tree[table], table)
         for table in _TABLES:
             if isinstance(self.tree.get(table), dict):
-                self.tree[table] = self._table(table, self.tree[table])
+                self.tree[table] = self._expand_table(table, self.tree[table])
         for array in ARRAYS:
             if array in self.tree:
-                self.tree[array] = self._array(array, self.tree[array])
+                self.tree[array] = self._expand_array(array, self.tree[array])
         for key in ("energy", "gravity"):
             if key in self.tree:
-                self.tree[key] = self._expanded_once((key,), self.tree[key])
+                self.tree[key] = self._expand_once((key,), self.tree[key])
         return self.sound
 
-    def _fault(
+    def _report(
         self, path: Path, message: str, at: FormulaError | None = None, text: str = ""
     ) -> None:
         self.sound = False
         self.check.report(path, message, at, text)
 
-    def _table(self, table: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    def _expand_table(self, table: str, entries: Mapping[str, Any]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for key, value in entries.items():
             path = (table, key)
             if not (isinstance(value, dict) and "repeat" in value):
-                name = self._expanded_once(path, key, bare=False)
-                new_entries = [(name, self._expanded_once(path, value))]
+                name = self._expand_once(path, key, bare=False)
+                new_entries = [(name, self._expand_once(path, value))]
             else:
                 if table in _PLAIN and "value" not in value:
-                    self._fault(path, 'missing: add value = "..." to repeat')
+                    self._report(path, 'missing: add value = "..." to repeat')
                     continue
                 new_entries = self._repeat_entry(path, key, value)
                 if table in _PLAIN:
@@ -110,7 +110,7 @@ class _Expansion:
             self.check.places.repeat(path, [(table, name) for name, _ in new_entries])
             for name, entry in new_entries:
                 if name in out:
-                    self._fault(path, f"'{name}' stands here a second time: remove one of the two")
+                    self._report(path, f"'{name}' stands here a second time: remove one of the two")
                 out[name] = entry
                 if table == "constants":
                     self._store_constant(name, entry)
@@ -126,9 +126,9 @@ class _Expansion:
         except (FormulaError, KeyError):
             return
 
-    def _array(self, array: str, entries: Any) -> dict[str, Any]:
+    def _expand_array(self, array: str, entries: Any) -> dict[str, Any]:
         if not _is_array(entries):
-            self._fault((array,), _array_remedy(array, entries))
+            self._report((array,), _array_remedy(array, entries))
             return {}
         out: dict[str, Any] = {}
         places = self.check.places
@@ -140,7 +140,7 @@ class _Expansion:
             if "repeat" in entry:
                 new_entries = [e for _, e in self._repeat_entry(shown, name, entry)]
             else:
-                new_entries = [self._expanded_once(shown, entry)]
+                new_entries = [self._expand_once(shown, entry)]
             labels = []
             for each in new_entries:
                 label = each.get("name") if array in _NAMED else None
@@ -156,24 +156,24 @@ class _Expansion:
         key = key if isinstance(key, str) else ""
         text = entry["repeat"]
         try:
-            index, first, last = self._span(text)
+            index, first, last = self._parse_repeat(text)
         except FormulaError as fault:
-            self._fault((*path, "repeat"), fault.message, fault, str(text))
+            self._report((*path, "repeat"), fault.message, fault, str(text))
             return []
         without_repeat = {k: v for k, v in entry.items() if k != "repeat"}
         out = []
         for number in range(first, last + 1):
-            expanded = self._expanded(path, without_repeat, {index: number})
-            name = self._expanded(path, key, {index: number}, bare=False)
+            expanded = self._expand(path, without_repeat, {index: number})
+            name = self._expand(path, key, {index: number}, bare=False)
             if expanded is None or name is None:
                 return []
             out.append((name, expanded))
         if len(out) > 1 and key and out[0][0] == out[-1][0]:
-            self._fault(path, f"each repetition needs a name of its own: write {key}[{index}]")
+            self._report(path, f"each repetition needs a name of its own: write {key}[{index}]")
             return []
         return out
 
-    def _span(self, text: Any) -> tuple[str, int, int]:
+    def _parse_repeat(self, text: Any) -> tuple[str, int, int]:
         """Return the index of a repetition, its first and its last value. Raises FormulaError."""
         if not isinstance(text, str):
             raise FormulaError(f'must be text, such as "i = 1..n", here {text!r:.40}')
@@ -207,38 +207,38 @@ class _Expansion:
             return f"'{index}' can't be an index: use another, such as i"
         return ""
 
-    def _expanded_once(self, path: Path, value: Any, bare: bool = True) -> Any:
+    def _expand_once(self, path: Path, value: Any, bare: bool = True) -> Any:
         """Return a value outside of repetition with its indices expanded."""
-        expanded = self._expanded(path, value, {}, bare)
+        expanded = self._expand(path, value, {}, bare)
         return value if expanded is None else expanded
 
-    def _expanded(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
+    def _expand(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
         """Return the value with its indices expanded; None after an error, which is reported."""
         if isinstance(value, str):
             try:
-                text = self._text(value, index, bare)
+                text = self._expand_text(value, index, bare)
             except FormulaError as fault:
-                self._fault(path, fault.message, fault, value)
+                self._report(path, fault.message, fault, value)
                 return None
             if text != value:
                 self.check.places.rewrite(text, value)
             return text
         if isinstance(value, list):
-            inside = [self._expanded(path, each, index, bare) for each in value]
+            inside = [self._expand(path, each, index, bare) for each in value]
             return None if None in inside else inside
         if isinstance(value, dict):
             out = {}
             for key, each in value.items():
                 expanded = each
                 if key not in _WORDS:
-                    expanded = self._expanded((*path, key), each, index, bare and key not in _NAMES)
+                    expanded = self._expand((*path, key), each, index, bare and key not in _NAMES)
                 if expanded is None:
                     return None
                 out[key] = expanded
             return out
         return value
 
-    def _text(self, text: str, index: Mapping[str, int], bare: bool) -> str:
+    def _expand_text(self, text: str, index: Mapping[str, int], bare: bool) -> str:
         """Return a formula or name with its indices expanded. Raises FormulaError."""
         if len(text) > formulas.MAX_LENGTH or not (index or "[" in text):
             return text  # too long ones are reported later
@@ -280,10 +280,10 @@ class _Expansion:
             )
         total = 0
         for sign, term in re.findall(rf"([+-]?)\s*({_TERM})", text, re.ASCII):
-            total += self._term(term, index) * (-1 if sign == "-" else 1)
+            total += self._term_value(term, index) * (-1 if sign == "-" else 1)
         return total
 
-    def _term(self, term: str, index: Mapping[str, int]) -> int:
+    def _term_value(self, term: str, index: Mapping[str, int]) -> int:
         if term.isdigit():
             if len(term) > 9:
                 raise FormulaError(f"{term:.12} is too large for an index")

@@ -64,7 +64,7 @@ def vector(value: object) -> tuple[float | str, ...]:
     return tuple(map(entry, value))
 
 
-def each(value: object) -> float | str | tuple[float | str, ...]:
+def scalar_or_list(value: object) -> float | str | tuple[float | str, ...]:
     """Check that a TOML value is a number or formula, or a list of these.
 
     Returns the single value, or a tuple with the values of the list, such as one for each
@@ -181,7 +181,7 @@ def points(value: object) -> tuple[tuple[float | str, ...], ...]:
 # --- [run] ---------------------------------------------------------------------------------------
 
 
-def linearized(value: object) -> bool | str:
+def linearization(value: object) -> bool | str:
     """Check the value of `linearize` in [run]: true, false or "parameters"; return it.
 
     Raises ValueError otherwise.
@@ -396,7 +396,7 @@ class _Run(_Table):
     methods: _Methods = pydantic.Field(default=("rk4",), alias="method")
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
-    linearize: Annotated[bool | str, pydantic.PlainValidator(linearized)] = False
+    linearize: Annotated[bool | str, pydantic.PlainValidator(linearization)] = False
     discretize: pydantic.StrictBool = False
     frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(frame_selection)] = False
     inverse_dynamics: pydantic.StrictBool = False
@@ -415,7 +415,7 @@ _Formula = Annotated[OutputTable, pydantic.BeforeValidator(partial(_as_table, "f
 
 
 _Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(vector)]
-_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(each)]
+_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(scalar_or_list)]
 _Rotation = Annotated[
     float | str | tuple[tuple[str, float | str], ...], pydantic.PlainValidator(rotation)
 ]

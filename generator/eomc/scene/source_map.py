@@ -54,7 +54,7 @@ class SourceMap:
                     counts[array] += array in tree
             paths = list(_paths(tree))
             if header:
-                paths = [_numbered(path, counts) for path in paths]
+                paths = [_number_entry(path, counts) for path in paths]
             for path in paths:
                 self._store((() if header else prefix) + path, (start, end))
             if header:
@@ -187,22 +187,22 @@ def _find_fault(
         column, width = at.column, at.width
     elif at is not None:
         column, width = at.col_offset, (at.end_col_offset or 0) - at.col_offset
-    for written in (str, _escaped) if text else ():
-        if quoted := _quoted(written(text), source):
+    for written in (str, _escape) if text else ():
+        if quoted := _find_quoted(written(text), source):
             return quoted.start(2) + len(written(text[:column])), width
-    if before and (quoted := _quoted(before.strip(), source)):
+    if before and (quoted := _find_quoted(before.strip(), source)):
         return quoted.start(2), len(quoted[2])
     match = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
     return (match.start(), len(key)) if match else (-1, 1)
 
 
-def _quoted(text: str, source: str) -> re.Match[str] | None:
+def _find_quoted(text: str, source: str) -> re.Match[str] | None:
     """Match the text in quotes; a blank may be a line break, so that columns stay the same."""
     body = re.sub(r"\\\s", r"\\s", re.escape(text))
     return re.search(rf"""(["'])\s*({body})\s*\1""", source)
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
@@ -221,7 +221,7 @@ def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[Path]:
                 yield (key, *rest)
 
 
-def _numbered(path: Path, counts: Mapping[str, int]) -> Path:
+def _number_entry(path: Path, counts: Mapping[str, int]) -> Path:
     """Return a header's path with its entry's number: [body.x] belongs to the last [[body]]."""
     if path[0] not in counts or len(path) < 2 or not counts[path[0]]:
         return path

@@ -107,14 +107,14 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
         raise SceneError([Problem(message, file=file)])
     if line := long_key(text):
         message = f"a key has more than {MAX_KEY_PARTS} parts: a scene's have three, a.b.c, at most"
-        raise _in_line(message, text, line, file)
+        raise _line_error(message, text, line, file)
     headers = [match.start() for match in _HEADER.finditer(text)]
     if len(headers) > MAX_TABLES:
         message = (
             f"this is table {MAX_TABLES + 1:,} of {len(headers):,}, and a scene has "
             f'{MAX_TABLES:,} at most: write alike ones once, with repeat = "i = 1..n"'
         )
-        raise _in_line(message, text, text.count("\n", 0, headers[MAX_TABLES]) + 1, file)
+        raise _line_error(message, text, text.count("\n", 0, headers[MAX_TABLES]) + 1, file)
     try:
         tree = tomllib.loads(text)
     except ValueError as fault:
@@ -126,7 +126,7 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
     return text, tree
 
 
-def _in_line(message: str, text: str, line: int, file: str) -> SceneError:
+def _line_error(message: str, text: str, line: int, file: str) -> SceneError:
     source = text.split("\n")[line - 1].rstrip()
     return SceneError([Problem(message, "", file, line, 0, len(source), source)])
 

@@ -525,7 +525,7 @@ def check_spring(values: ValueChecker, path: Path, entry: SpringTable) -> Spring
     return Spring(
         stiffness=values.formula((*path, "stiffness"), entry.stiffness),
         length=values.formula((*path, "length"), entry.length),
-        **_between(values, path, entry),
+        **_attachment(values, path, entry),
     )
 
 
@@ -535,7 +535,8 @@ def check_damper(values: ValueChecker, path: Path, entry: DamperTable) -> Damper
     path: keys of the table in the scene. entry: the table. Errors are reported to `values.check`.
     """
     return Damper(
-        damping=values.formula((*path, "damping"), entry.damping), **_between(values, path, entry)
+        damping=values.formula((*path, "damping"), entry.damping),
+        **_attachment(values, path, entry),
     )
 
 
@@ -586,7 +587,9 @@ def _world_vector(
     return x, y, third[0] if third else ZERO
 
 
-def _between(values: ValueChecker, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
+def _attachment(
+    values: ValueChecker, path: Path, entry: SpringTable | DamperTable
+) -> dict[str, Any]:
     """Return where a spring or damper acts, as arguments of `assembly.SpringDamper`."""
     check, kind = values.check, path[0]
     if (entry.coordinate is None) == (entry.bodies is None):
