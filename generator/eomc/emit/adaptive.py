@@ -1,4 +1,4 @@
-"""Adaptive steps in both forms of C: the shared code, given a form's iteration over the stages."""
+"""Adaptive steps in both forms of C, portable and optimised: data of the shared templates."""
 
 from __future__ import annotations
 

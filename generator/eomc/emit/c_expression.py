@@ -129,10 +129,18 @@ def _decimal(value: float) -> str:
 
 
 class Printer:
-    """Prints the values of one function of a program as C expressions.
+    """Translator of the values of one function of a program into C expressions.
 
-    where: the C expression of each variable that the function does not compute. in_order: whether
-    to keep the order of terms in sums.
+    Parameters
+    ----------
+    prefix
+        The scene's name, with which the names of generated C functions begin.
+    real
+        C type of the values.
+    where
+        The C expression of each variable that the function does not compute, by name.
+    in_order
+        Whether to keep the order of the terms of sums.
     """
 
     def __init__(
@@ -183,8 +191,8 @@ class Printer:
         return (text, strength) if strength >= binding else (f"({text})", 4)
 
     def _sum(self, value: Sum) -> str:
-        # A positive term comes first, if there is one and the order is free.
         """Return the text of a sum."""
+        # A positive term comes first, if there is one and the order is free.
         terms = sorted(value.terms, key=lambda p: not self.in_order and is_negative(p[0]))
         text = ""
         if value.constant is not S.Zero and not is_negative(value.constant):
@@ -265,7 +273,7 @@ class CBody:
     results
         The results of the function.
     failures
-        Conditions under which a factored matrix, such as D, is singular.
+        C conditions under which a factored matrix, such as D, is singular.
     sincos
         Whether the statements call the project's own sincos.
     """
@@ -273,8 +281,8 @@ class CBody:
     early: tuple[Block, ...]
     blocks: tuple[Block, ...]
     results: tuple[str, ...]
-    failures: tuple[str, ...]  # conditions under which D is singular
-    sincos: bool  # whether sines are computed by the generated code
+    failures: tuple[str, ...]
+    sincos: bool
 
     @property
     def lines(self) -> tuple[str, ...]:

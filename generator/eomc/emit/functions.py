@@ -1,6 +1,7 @@
 """C functions of mechanics for both forms: matrices, energies, forces, accelerations.
 
-State in arrays, parameters in a struct. Each is straight-line code, outlined where it is long.
+They take the state as arrays and the parameters as a struct. Each is straight-line code; long ones
+are divided into several C functions.
 """
 
 from __future__ import annotations

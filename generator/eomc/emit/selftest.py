@@ -1,7 +1,8 @@
-"""The cases of selftest.c: what each function of the header gives, computed in Python.
+"""The test cases of selftest.c: expected results of each C function, computed in Python.
 
-Functions are evaluated by `program.interpret`, steps by their tableaux on accelerations from there,
-jumps and events from states that lie on an event. Nothing of it runs the C or shares its text.
+Functions are evaluated by the interpreter of programs, and steps by the tableaux of their methods
+with accelerations from there. Jumps and events are computed from states at which an event function
+is zero. No generated C is run, and none of its text is used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The C header, and what the C sources of both forms share."""
+"""The C header, and the data that the C sources of both forms share."""
 
 from __future__ import annotations
 
