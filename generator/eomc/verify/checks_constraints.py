@@ -465,12 +465,12 @@ class ProjectionChecks:
 
     def _fails_to_refuse(self, s: State, fixed: tuple[int, int]) -> bool:
         """Return whether `project` does not refuse a state, or changes it."""
-        status, unchanged, _ = self._project_in_c(s, fixed)
+        status, unchanged, _ = self.project_in_c(s, fixed)
         return status not in (SINGULAR, NOT_FINITE, LOCKED) or not unchanged
 
     def _is_projected_or_refused(self, s: State) -> bool:
         """Return whether a state satisfies the constraints afterwards, or is refused unchanged."""
-        status, unchanged, projected = self._project_in_c(s, (0, 0))
+        status, unchanged, projected = self.project_in_c(s, (0, 0))
         if status:
             return unchanged
         holds = 1e-3 if self.check.dtype == np.float32 else 1e-9  # of the terms of a constraint
@@ -482,7 +482,7 @@ class ProjectionChecks:
         )[rows]
         return bool(np.all(np.isfinite(projected.q)) and np.all(off <= holds * level))
 
-    def _project_in_c(self, s: State, fixed: tuple[int, int]) -> tuple[int, bool, State]:
+    def project_in_c(self, s: State, fixed: tuple[int, int]) -> tuple[int, bool, State]:
         """Return the C function's status, whether the state is unchanged, and the new state."""
         model = self.module._model
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
@@ -534,9 +534,9 @@ class MasslessChecks:
                 wrong += run.steps != 0 or run.status != SINGULAR
             for q in (s.q + 1e-3 * self.check.sampler.spread, s.q):
                 x = replace(s, q=q, qd=s.qd + 1e-3 * self.check.sampler.speed)
-                status, unchanged, _ = ProjectionChecks(
-                    self.check, self.check.module
-                )._project_in_c(x, (0, 0))
+                status, unchanged, _ = ProjectionChecks(self.check, self.check.module).project_in_c(
+                    x, (0, 0)
+                )
                 wrong += (
                     status not in (OK, SINGULAR) or not unchanged
                 )  # OK: rows hold without lengths

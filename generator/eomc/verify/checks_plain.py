@@ -1,7 +1,7 @@
-"""Comparison of the portable form of C (plain) with the reference and the optimised form (fast).
+"""Checks of the portable C code ("plain"), against the reference and the optimised code ("fast").
 
-Values, one step and a run are compared with the reference, as for the optimised form; then all that
-both forms compute is compared. Errors are in units of rounding, as in `check`.
+Values, one step and a run are compared with the reference, as for the optimised code. Then values,
+derivatives and runs of both codes are compared with each other, in units of rounding.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
-"""Accelerations under constraints, and states put back onto them, by one dense matrix in NumPy.
+"""Accelerations under constraints, and projection onto constraints, by a dense KKT matrix in NumPy.
 
     [D  -A^T] [  qdd   ]   [tau - bias]
     [A    0 ] [ lambda ] = [ - gamma  ]
 
-Rows of A are those of the constraints that are not redundant; gamma is what the second rate of a
-position row, or the rate of a rate row, has without qdd. The matrix is scaled, and solved as it
-stands. Where rows depend on others in some position, the least scaled lambda of the least residual
-is taken: its singular values are about 1, and the square of those of A for rows that fade out.
+The rows of A belong to the constraint equations that are not redundant. gamma is the part without
+qdd of the second time derivative of a holonomic equation, or of the first time derivative of a
+nonholonomic one. The matrix is scaled and solved directly. At positions where equations depend on
+one another, the result is the least-squares solution with the smallest scaled lambda. The singular
+values of the scaled matrix are about 1; for an equation whose row of A vanishes at a position, they
+are the squares of those of A.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, V
 
 
 def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
-    """Solve at one state; zero rows of A are ignored and have the multiplier 0."""
+    """Return x and λ at one state; the multiplier of a zero row of A is 0."""
     multipliers, nonzero = np.zeros(len(A)), A.any(axis=1)
     A, level = A[nonzero], level[nonzero]
     n, m = len(D), len(A)

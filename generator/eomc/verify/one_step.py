@@ -1,7 +1,7 @@
 """One step of any Runge-Kutta method by its tableau, for a given acceleration function.
 
-The formulas of `steppers`, in NumPy, with all stages kept: what a generated stepper is compared
-with. Nothing is shared with the templates but the coefficients.
+Generated steppers are compared with it. It is written in NumPy, stores all stages, and has nothing
+in common with the templates except the coefficients of the methods.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""States at which a module is compared with the reference, and the sizes of what is rounded there.
+"""States at which a module is compared with the reference, and the units of rounding errors there.
 
-A unit of rounding is eps times the size of what was added up on the way. That size is not
-the result, which may cancel to nothing: it is |f| + sum_i |x_i df/dx_i|, what one rounding of
-each of the inputs x does to f, and in addition the size that the laws of motion give to the sums
-that f is made of: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, K and P for energies.
+A unit of rounding is eps times the size of the terms that are summed up to compute a value f. This
+size is not |f|, since terms may cancel. It is |f| + sum_i |x_i df/dx_i|; the sum is the effect of
+one rounding error of each input x_i. The laws of motion add the sizes of the sums of which f
+consists: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, and K and P for energies.
 """
 
 from __future__ import annotations
@@ -60,11 +60,10 @@ class SampleBudget:
 
 
 SMALL = SampleBudget(states=16, prediction_steps=50, stride=1, few=4, run=100)
-LARGE = SampleBudget(
-    states=6, prediction_steps=5, stride=10, few=4, run=4
-)  # a tenth of a second an answer
+# for a reference that takes a tenth of a second per evaluation
+LARGE = SampleBudget(states=6, prediction_steps=5, stride=10, few=4, run=4)
 
-# the module's name for a value, and the reference's
+# names of values: that of the module's function, and that of the reference
 VALUES = {
     "D": "D",
     "C": "C",
@@ -78,8 +77,8 @@ VALUES = {
     "power": "power",
 }
 
-OF_POSITIONS = ("D", "g", "potential_energy", "constraint_jacobian")  # what takes no rates
-OF_INPUTS = ("tau", "power", "acceleration", "multipliers")
+OF_POSITIONS = ("D", "g", "potential_energy", "constraint_jacobian")  # functions without q̇
+OF_INPUTS = ("tau", "power", "acceleration", "multipliers")  # functions of the inputs
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,7 @@ class Sampler:
         self.defaults = {p.name: p.value for p in system.parameters}
         self.rejected = 0
         self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
-        # how far things go: from the start, from what happens next, else 1 of the unit
+        # range of the motion: half a turn for angles; for others, from the first steps, else 1 m
         slides, turns = set[Symbol](), set[Symbol]()
         for link in system.tree.links if system.tree else ():
             (turns if link.turns else slides).update(link.q.free_symbols)
@@ -331,7 +330,7 @@ class Sampler:
         if with_inputs and self.system.inputs:
             signals = np.abs(self.reference.evaluate("signals", q, qd, t))
             u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
-        # a loop may not close with lengths that are far from the scene's
+        # a loop may not close if its lengths differ too much from the scene's
         some = nearness if self.system.constraints else 1.0
         by = some * random.uniform(-0.5, 0.5, len(self.defaults))
         params = {
@@ -339,7 +338,7 @@ class Sampler:
             for (name, value), x in zip(self.defaults.items(), by.tolist(), strict=True)
         }
         state = self.project(State(q, qd, t, u, None if with_defaults else params))
-        for mode in self.system.modes:  # the rows may have turned what slides
+        for mode in self.system.modes:  # the projection may have reversed a sliding direction
             state.q[mode.at] = np.sign(state.qd[mode.of]) * abs(q[mode.at])
         return state
 
@@ -460,13 +459,13 @@ class Sampler:
         if not all(np.all(np.isfinite(x)) for x in value.values()):
             return None
         diagonal = np.sqrt(np.diag(reach["D"]))
-        if self.system.constraints:  # a coordinate without inertia has that of its rows
+        if self.system.constraints:  # a coordinate without inertia gets one from its constraints
             scale = kkt.scales(D, self.rows("constraint_jacobian", s))[: len(qd)]
             diagonal = np.where(diagonal > 0, diagonal, 1 / scale)
         inertia = np.outer(diagonal, diagonal) + reach["D"]
         rate = np.max(qd / self.spread)  # of change of D, in 1/s
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
-        # a force that is zero along one coordinate may be the sum of what others have whole
+        # a force of 0 along one coordinate may be a sum of forces that cancel
         force = np.maximum(force, diagonal * np.max(force / diagonal))
         energy = np.maximum(
             reach["kinetic_energy"] + reach["potential_energy"],
@@ -498,13 +497,13 @@ class Sampler:
             """Return the effect on each constraint of x as if its largest part were along it."""
             return np.asarray(A @ np.abs(x) + np.max(np.abs(x) / scale[:n]) / scale[n:])
 
-        # an entry may be a sum that cancels, of terms that others of its row have whole
+        # an entry may be a sum of terms that cancel; other entries of the same row have their size
         size["constraint_jacobian"] = A + np.outer(1 / scale[n:], 1 / scale[:n])
         size["constraints"] = size["constraints"] + row_size(s.q)
         size["constraint_rates"] = size["constraint_rates"] + row_size(s.qd)
         motion = size["motion"] + np.abs(value["multipliers"]) @ A
         size["motion"] = np.maximum(motion, np.max(motion * scale[:n]) / scale[:n])
-        # of rows that move by themselves in time
+        # power of constraints that depend on time
         pushed = value["multipliers"] @ value["constraint_jacobian"] @ s.qd
         value["power"] = value["power"] + pushed
         size["power"] = size["power"] + np.abs(value["multipliers"]) @ A @ np.abs(s.qd)
@@ -513,13 +512,13 @@ class Sampler:
         rounded = [size["motion"], np.abs(solved) @ (size["gamma"] + row_size(a))]
         both = spread @ np.concatenate(rounded)
         size["acceleration"] = both[:n]
-        if self.system.modes:  # what sticks is held by forces that cancel what else moves it
+        if self.system.modes:  # forces on a sticking coordinate cancel those that would move it
             fixed_rows = np.where(self.reference.switched[:, None], 0.0, A_s)
             size["acceleration"] += (
                 kkt.absolute_inverse(value["D"], fixed_rows)[:n, :n] @ size["motion"]
             )
         size["multipliers"] = both[n:] @ np.abs(solved)
-        # what rounding of the rows makes of a state that is put onto them
+        # effect of rounding errors of the constraints on a projected state
         size["place"] = np.array([
             spread[:n, n:] @ np.abs(solved) @ size[name]
             for name in ("constraints", "constraint_rates")

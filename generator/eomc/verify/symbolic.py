@@ -1,8 +1,9 @@
 """Independent reference: textbook Euler-Lagrange equations in SymPy, NumPy and plain Python.
 
-It starts from the `System` and shares nothing else with the compiled way: definitions are
-substituted, everything is differentiated as it stands, evaluated in doubles,
-solved with NumPy and stepped in a Python loop. Slow, short, and meant to be believed.
+It starts from the `System` and has nothing else in common with the compiler: definitions are
+substituted, formulas are differentiated without simplification and evaluated in double precision,
+linear systems are solved by NumPy, and runs are loops in Python. It is slow, short and easy to
+verify.
 """
 
 from __future__ import annotations

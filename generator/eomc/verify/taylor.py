@@ -1,22 +1,24 @@
 """Independent reference for large systems, by numerical Taylor arithmetic along the definitions.
 
-Nothing is expanded and nothing is differentiated as a formula. Every quantity carries its value
-and those of its derivatives that are needed, as arrays, and the rules for sums, products and
-functions pass them on, from the coordinates to K, P, R and Q, along the definitions in their
-order (Griewank & Walther, *Evaluating Derivatives*, 2nd ed., ch. 13). It starts from the `System`
-and shares nothing else with the compiled way, which sweeps backwards over formulas.
+No formula is expanded or differentiated. The value of each expression and those of its derivatives
+that are needed are arrays of numbers. Rules for sums, products and functions compute those of a
+result from those of its arguments, from the coordinates to K, P, R and Q, along the definitions in
+their order (Griewank & Walther, *Evaluating Derivatives*, 2nd ed., ch. 13). The reference starts
+from the `System` and has nothing else in common with the compiler, which differentiates formulas
+backwards.
 
-With x = (q, t), v = qd and the direction d = (qd, 1), in which all things go at qdd = 0, these
-derivatives do; x is a row of nq + 1 numbers, v one of nq:
+Let e be an expression, x = (q, t), v = qd, and d = (qd, 1) the time derivative of x. At qdd = 0 the
+following derivatives are sufficient. Those by x have nq + 1 entries, those by v have nq.
 
-    s    e_x . d            of all          x    de/dx              of all
-    xs   e_xx d             of positions    v    de/dv              of what hangs on velocities
-    vs   e_vx d             (rate of e_v)   vv   d2e/dv2            (nq, nq)
-    vvs  rate of e_vv       (nq, nq)        N    e_vq - e_vq^T      (nq, nq)
+    s    e_x . d        time derivative          x    e_x            gradient by q and t
+    xs   e_xx d         rate of e_x              v    e_v            gradient by v
+    vs   e_vx d         rate of e_v              vv   e_vv           (nq, nq)
+    vvs  rate of e_vv   (nq, nq)                 N    e_vq - e_vq^T  (nq, nq)
 
-What a scene writes as dot(y) has the value y_s, and s = y_xs . d, x = y_xs, v = y_q, vs = the rate
-of y_q, which is y_xs without its last entry; vv, vvs and N of it are zero, N since y_qq is
-symmetric. So no full matrix of second derivatives is ever needed, nor a third derivative.
+xs is needed for expressions of positions only. For e = dot(y), the value is y_s, and s = y_xs . d,
+x = y_xs, v = y_q. vs is the rate of y_q, which is y_xs without its last entry. vv, vvs and N are
+zero, N since y_qq is symmetric. Therefore neither a full matrix of second derivatives nor a third
+derivative is needed.
 """
 
 from __future__ import annotations
@@ -38,14 +40,14 @@ from eomc.verify.reference import SCALARS, ReferenceModel, Values, Vector
 
 BLOCK = 2**16  # entries of the (nq, nq) matrices of all states evaluated at once, for the cache
 
-Jet = dict[str, Any]  # value and derivatives, rows by states; what is zero is left out
+Jet = dict[str, Any]  # value and derivatives by name, a row for each state; without zeros
 Fields = frozenset[str]
 
-PAIRS = ("vv", "vvs", "N")  # the (nq, nq) ones
+PAIRS = ("vv", "vvs", "N")  # derivatives that are (nq, nq) matrices
 _VELOCITY_FIELDS = {"v", "vs", *PAIRS}
 
-# what each answer takes of K, of T = K - a.qd with a.qd the linear potential, of P, R, of every
-# force Q and of every signal
+# for each value of `evaluate`, the derivatives that it requires: of K, of T = K - a.qd (a.qd is the
+# linear potential), P, R, the forces Q, and so on
 _REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "D": {"T": "vv"},
     "C": {"T": "vvs N"},
@@ -66,7 +68,7 @@ _REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
 }
 
 
-# what of a sum's, a product's or a function's arguments, and of e, makes a derivative of dot(e)
+# for each derivative of a product, or of dot(e), the derivatives of its arguments that it requires
 FEEDS: Mapping[str, Mapping[str, str]] = {
     "product": {
         "value": "value",
