@@ -86,7 +86,7 @@ def _report(comparison: Comparison, module: Any) -> CheckReport:
         add_property_checks(comparison)
         if system.constraints:
             checks_constraints.report(comparison)
-        if compiled:  # what is compiled has several ways to one answer
+        if compiled:  # compiled code has several ways to compute a value
             add_compiled_checks(comparison)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
@@ -121,7 +121,7 @@ def add_value_checks(comparison: Comparison) -> None:
     add, rounding = comparison.add_check, "units of rounding"
     for name in (*VALUES, "acceleration"):
         add(name, LIMIT, rounding, partial(comparison.value_error, name))
-    if comparison.methods[0] == "rk4":  # which is what the reference steps by
+    if comparison.methods[0] == "rk4":  # the method of the reference
         add("one step", LIMIT, rounding, comparison.rk4_step_error)
         add("run", LIMIT, rounding + ", times steps and growth", comparison.run_error)
     for method in comparison.methods[comparison.methods[0] == "rk4" :]:
@@ -136,13 +136,13 @@ def add_property_checks(comparison: Comparison) -> None:
     """
     add, rounding = comparison.add_check, "units of rounding"
     add("D = D^T", LIMIT, rounding, comparison.symmetry_error)
-    if not comparison.system.constraints:  # the KKT matrix has to be regular, D need not
+    if not comparison.system.constraints:  # otherwise D may be singular
         add("D > 0", 0, "least eigenvalue of D, scaled", comparison.least_eigenvalue, minimum=True)
     add("bias = C qd + g", LIMIT, rounding, comparison.bias_error)
     force = "tau + A^T lambda" if comparison.system.constraints else "tau"
     add(f"D qdd + bias = {force}", LIMIT, rounding, comparison.motion_error)
     checks_derivatives.report_acceleration_derivatives(comparison)
-    if comparison.dtype == np.float64:  # single precision leaves its differences too few digits
+    if comparison.dtype == np.float64:  # difference quotients need its digits
         # differences are exact to 1e-10; a wrong sign in C makes an error of 1
         add("Ddot - 2C + dD/dt skew", 1e-6, "of D's rate", comparison.skewness_error)
         comparison.add_convergence_checks()

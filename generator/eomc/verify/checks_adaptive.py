@@ -100,7 +100,7 @@ def _run_error(check: Comparison, module: Any, tol: float, stiff: bool, s: State
     x = np.concatenate([s.q, s.qd])
     spread = check.sampler.scale.ravel()
     first = _start_run(module, s, x, check.system.run.duration, tol, stiff)
-    if len(first) < 2:  # not a single step
+    if len(first) < 2:  # no step
         begins = np.isfinite(check.reference.acceleration(s.q, s.qd, s.t, s.u, s.params)).all()
         return math.inf if first.status == "not finite" and begins else None
     ends = [first.events[e.name].t for e in check.system.events if e.action != "record"]
@@ -113,7 +113,7 @@ def _run_error(check: Comparison, module: Any, tol: float, stiff: bool, s: State
     min_tolerance = 1e-15 if check.dtype == np.float64 else 5e-7
     for steps in (12, 6, 3):  # fewer if a difference grows too much
         T = min(float(first.t[min(steps, len(first) - 1)]), first_end) - s.t
-        T *= 1 if s.t + T < first_end else 0.9  # the reference knows of no events
+        T *= 1 if s.t + T < first_end else 0.9  # the reference has no events
         run = _simulate(module, s, x, T, tol, stiff=stiff)
         near = _simulate(module, s, nudged, T, tol, stiff=stiff)
         if run.status != "ok" or near.status != "ok":
@@ -153,7 +153,7 @@ def _reference_states(
             for k in range(2):
                 state = q, qd, t + k * h, h
                 end_state = one_step.step(GAUSS16, acceleration, *state)
-                if not np.isfinite(end_state).all():  # too long for sweeps
+                if not np.isfinite(end_state).all():  # fixed-point iteration diverges
                     end_state, _ = one_step.step_by_newton(GAUSS16, acceleration, *state)
                 q, qd = end_state
             t = float(end)

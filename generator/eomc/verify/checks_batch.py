@@ -39,7 +39,7 @@ class BatchChecks:
         self.random = np.random.default_rng(9)
         self.singular = singular
         self.instances = self.sample_instances()
-        # along which neighbours differ: each coordinate by a part of its own, so that none cancel
+        # direction of perturbed states, with different random parts so that no changes cancel
         shape, random = (2, self.model.nq), np.random.default_rng(10)
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
@@ -54,7 +54,7 @@ class BatchChecks:
                 partial(self.compare_with_single_steps, method))  # fmt: skip
             add(f"batch of {method}: places", 0, "batches with other bits",
                 partial(self.differing_batches, method))  # fmt: skip
-            if not self.check.system.constraints:  # which move the starts that fail
+            if not self.check.system.constraints:  # these would move the failing initial states
                 add(f"batch of {method}: failures", 0, "instances that end otherwise",
                     partial(self.wrong_failures, method))  # fmt: skip
 
@@ -73,7 +73,7 @@ class BatchChecks:
             x = np.array([s.q, s.qd]) * near
             if k % 29 == 7:
                 x[0] += sampler.angles * 2 * np.pi * np.round(TURNS / 2 / np.pi)
-            if k % 7 == 3:  # steps in which angles move too far to be rotated
+            if k % 7 == 3:  # angles move too far to update sines by rotations
                 x[1] = x[1] + self.random.choice(LONG) * sampler.spread / self.h
             params = s.params or sampler.defaults
             instance = replace(s, q=x[0], qd=x[1], t=t, u=None, params=params)
@@ -156,7 +156,7 @@ class BatchChecks:
         """
         x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
         spread = self.runs.sampler.scale
-        wide = float(np.max(1 + np.abs(x) / spread))  # the last digit, of what would be 1 elsewhere
+        wide = float(np.max(1 + np.abs(x) / spread))  # magnifies rounding errors
         if wide * self.check.eps > nudge:
             return None
         alone = run_in_c(self.model, method, s, self.h, 1)
@@ -164,7 +164,7 @@ class BatchChecks:
         moved = run_in_c(self.model, method, replace(s, q=q, qd=qd), self.h, 1)
         if alone.status or moved.status:
             return None
-        # what a change by all of the spread would make of each number
+        # change of each number by a perturbation of the size of the spread
         grown = np.max(np.abs(moved.rows - alone.rows), axis=1) / nudge
         size = wide * (grown + np.abs(alone.rows[:, 1]))
         return self.check.units(end, alone.rows[:, 1], size)
@@ -336,14 +336,14 @@ class BatchChecks:
         start = np.array([s.q, s.qd], rows.dtype)
         if (status == 0) != (steps == STEPS) or not np.array_equal(rows[:, 0], start):
             return True
-        # one that goes on at such a speed has no digit left
+        # a run that continues at such a speed has no correct digit
         if (
             alone.status != 0
             and 0 < steps <= alone.steps
             and self.differs_beyond_rounding(method, s, stored, alone)
         ):
             return True
-        # rounding may decide a step that all but fails; a first step is clear
+        # rounding may decide whether a later step fails, but not a first step
         return alone.steps == 0 and not METHODS[method].implicit and (
             steps != 0 or status != alone.status
         )  # fmt: skip
@@ -364,7 +364,7 @@ class BatchChecks:
             )
             for k in (-3, -2, -1, 1, 2, 3)
         ]
-        with np.errstate(all="ignore"):  # of runs that end before
+        with np.errstate(all="ignore"):  # runs may end earlier
             rounded = np.max([np.abs(x.rows[:, stored.shape[1] - 1] - known) for x in near], axis=0)
             off = np.abs(stored[:, -1] - known)
             return bool(np.any(off > far * np.abs(known) + 10 * rounded))

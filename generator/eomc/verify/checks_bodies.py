@@ -32,7 +32,8 @@ UNITS = 1e3  # largest error in units of rounding, if that is more, as in single
 
 _X, _Y, _Z = np.eye(3)
 
-# the elementary motions of a joint, "t" along an axis or "r" about it; None: the scene's axis
+# motions of each joint: "t" (translation) along or "r" (rotation) about an axis; None means the axis
+# that the scene defines
 _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
     "fixed": (),
     "revolute": (("r", None),),
@@ -103,7 +104,7 @@ class BodyChecks:
         """
         s, differences, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
-        if name == "power":  # that of forces alone
+        if name == "power":  # of forces only
             value = float(self.check.module_value("tau", s) @ s.qd)
             size = float(e.size["tau"] @ np.abs(s.qd))
         else:
@@ -189,9 +190,9 @@ class MotionLine:
     scene: Scene
     state: State
     width: float
-    stretch: float = 1.0  # of the velocities
-    bend: Vector | float = 0.0  # accelerations
-    slides: Mapping[str, float] = field(default_factory=dict)  # of what may stick: its mode
+    stretch: float = 1.0
+    bend: Vector | float = 0.0
+    slides: Mapping[str, float] = field(default_factory=dict)
     frames: dict[str, MovingFrame] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
 
@@ -204,7 +205,7 @@ class MotionLine:
         self.algebra = {**_ALGEBRA, "dot": lambda x: self.rate @ (x + zero)}
         known = self.known = {"t": s.t + self.nodes}
         motion = np.broadcast_arrays(s.q, s.qd * self.stretch, self.bend)
-        for c, q, qd, qdd in zip(self.scene.coordinates, *motion, strict=False):  # modes
+        for c, q, qd, qdd in zip(self.scene.coordinates, *motion, strict=False):  # modes follow
             rate = qd + qdd * self.nodes
             known |= {c.name: q + (qd + rate) / 2 * self.nodes, f"{c.name}_dot": rate + zero}
         for constant in self.scene.constants:
@@ -436,7 +437,7 @@ class MotionLine:
                     )
                 if body.actuator:
                     power = power + self.evaluate(body.actuator[k]) * rate
-        if self.assembly.forces:  # what moves with time alone is none of the coordinates' work
+        if self.assembly.forces:  # motion due to time alone does no work on the coordinates
             at_rest = MotionLine(self.scene, self.state, self.width, 0.0)
             power = power + sum(self.work(f, at_rest) for f in self.assembly.forces)
         return power

@@ -54,7 +54,7 @@ def report(check: Comparison) -> None:
     checks = ConstraintChecks(check, check.module)
     for name in VALUES:
         check.add_check(name, LIMIT, UNITS, partial(check.value_error, name))
-    if check.dtype == np.float64:  # single precision leaves differences too few digits
+    if check.dtype == np.float64:  # difference quotients need its digits
         check.add_check("A beside differences", SLOPE_LIMIT, "of A", checks.jacobian_error)
         if check.system.run.needs_derivatives and not check.system.modes:
             check.add_check("tangent", SLOPE_LIMIT, "of the rows' slopes", checks.tangent_error)
@@ -251,15 +251,13 @@ class ConstraintChecks:
         errors: list[float | None] = []
         for e in check.few(3):
             s = replace(e.state, u=None)
-            with np.errstate(
-                divide="ignore"
-            ):  # steps in which coordinates move by 2 % of their range
+            with np.errstate(divide="ignore"):  # coordinates move by 2 % of their range in a step
                 longest = 0.02 * float(np.min(check.sampler.spread / np.abs(s.qd)))
             how = {"h": min(check.system.run.h, longest), "steps": 200, "every": 5}
             run = simulate(self.module, s, t0=s.t, method=method, **how)
             for at in states_of_run(run, s)[1:]:  # fewer if the run stops early
                 far = np.abs([at.q - s.q, at.qd - s.qd])
-                if np.any(far >= MAX_DISTANCE * check.sampler.scale):  # as h is too long
+                if np.any(far >= MAX_DISTANCE * check.sampler.scale):  # h is too long
                     break
                 errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
         return largest(errors, "no step is taken, or all lead too far")
@@ -277,9 +275,8 @@ class ConstraintChecks:
         turned = self._rate_sensitivity(s) if name == "constraint_rates" else 0.0
         size = A @ scale + turned
         residual = self.check.units(off, 0 * off, size)
-        if (
-            residual > MAX_RESIDUAL
-        ):  # where rows all but depend on each other, those left out hold less
+        # redundant equations have larger residuals where the others are almost dependent
+        if residual > MAX_RESIDUAL:
             residual = self.check.units(
                 off, 0 * off, size + self._reference_residual(name, s)[: len(off)]
             )
@@ -384,7 +381,7 @@ class ProjectionChecks:
             )
             size = np.abs([expected_state.q, expected_state.qd]) + scale + expected.size["place"]
             displacement = np.abs(np.array([expected_state.q - s.q, expected_state.qd - s.qd]))
-            if np.any(displacement > (100 if fixed else 10) * part * scale):  # there may be several
+            if np.any(displacement > (100 if fixed else 10) * part * scale):  # another solution
                 return None
             start = np.array([s.q, s.qd], check.dtype)
             unchanged = all(np.array_equal(np.array(result)[:, i], start[:, i]) for i in fixed)
@@ -438,10 +435,9 @@ class ProjectionChecks:
                 wrong += not self._is_projected_or_refused(
                     replace(e.state, q=e.state.q + offset[0], qd=offset[1])
                 )
+                # near the origin, the gradient of an equation may vanish
                 near = replace(e.state, q=e.state.q / part + 1e-3 * offset[0])
-                wrong += not self._is_projected_or_refused(
-                    near
-                )  # to the origin, where rows may turn over
+                wrong += not self._is_projected_or_refused(near)
         return float(wrong)
 
     def _unreachable_states(
@@ -534,10 +530,8 @@ class MasslessChecks:
                 wrong += run.steps != 0 or run.status != SINGULAR
             for q in (s.q + 1e-3 * self.check.sampler.spread, s.q):
                 x = replace(s, q=q, qd=s.qd + 1e-3 * self.check.sampler.speed)
-                status, unchanged, _ = ProjectionChecks(self.check, self.check.module).project_in_c(
-                    x, (0, 0)
-                )
-                wrong += (
-                    status not in (OK, SINGULAR) or not unchanged
-                )  # OK: rows hold without lengths
+                projection = ProjectionChecks(self.check, self.check.module)
+                status, unchanged, _ = projection.project_in_c(x, (0, 0))
+                # OK if the equations hold everywhere, as with lengths of 0
+                wrong += status not in (OK, SINGULAR) or not unchanged
         return float(wrong)

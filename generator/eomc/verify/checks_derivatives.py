@@ -137,12 +137,12 @@ def largest_error(check: Comparison, name: str) -> float | Measurement:
         s, size = e.state, e.size["acceleration"] + NUDGE * scale[1] ** 2 / scale[0]
         derivatives = module_derivatives(check, name, s)
         if derivatives is None:
-            return math.inf  # not even dq/dt = qd
+            return math.inf  # dq/dt = qd is violated
         part = slice(0, 2 * n + nu) if name == "linearize" else slice(2 * n + nu, None)
         with np.errstate(all="ignore"):
             exact = differentiate(check.reference, s, scale, check.sampler.defaults)
             off = [relative_differences(derivatives, J[:, part], by[part], size) for J, by in exact]
-        least = np.fmin.reduce(off)  # each entry's: what is wrong is so at every width
+        least = np.fmin.reduce(off)  # a wrong entry is wrong at every width
         if check.dtype != np.float64:
             least /= max(1.0, _rounding_growth(check, name, e, derivatives))
         known.append(float(np.max(least, initial=0)) if np.all(least >= 0) else None)
@@ -185,7 +185,7 @@ def _rounding_growth(check: Comparison, name: str, e: Expected, derivatives: Vec
 
 # --- derivatives of steps -------------------------------------------------------------------------
 
-Differences = Callable[[str, int, float], list[Vector]]  # of a method, state and step
+Differences = Callable[[str, int, float], list[Vector]]  # for a method, state index and step size
 
 
 def report_step_derivatives(check: Comparison) -> None:

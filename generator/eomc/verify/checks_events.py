@@ -96,9 +96,8 @@ def _run_error(check: Comparison, module: Any, method: str, s: State) -> float |
             step_end = module.step(run.q[k], run.qd[k], h, run.t[k], s.u, s.params, method)
         except module.MotionError:
             return math.inf
-        moved = (
-            np.abs(np.concatenate(step_end) - run.x[k]) * (abs(t) + abs(h)) / h
-        )  # by rounding of t
+        # effect of the rounding of t
+        moved = np.abs(np.concatenate(step_end) - run.x[k]) * (abs(t) + abs(h)) / h
         off = np.abs(np.concatenate(step_end) - end) / (check.eps * (size + moved))
         worst = max(worst, float(np.nan_to_num(off.max(), nan=math.inf)))
     return worst

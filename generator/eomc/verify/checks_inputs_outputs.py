@@ -87,11 +87,11 @@ def compare_outputs(
         size = np.abs(value) + np.nansum([np.abs(x - value) / NUDGE for x in near], axis=0)
         qdd, forces = _solved(module, s)
         exact = formulas.evaluate(s, qdd, forces)
-        # terms that cancel against an acceleration leave its rounding error
+        # terms that cancel with an acceleration leave its rounding error
         for k in range(len(qdd)):
             moved = np.where(np.arange(len(qdd)) == k, 1 + NUDGE, 1.0) * qdd
             size += np.nan_to_num(np.abs(formulas.evaluate(s, moved, forces) - exact) / NUDGE)
-        real = np.isfinite(value) | np.isfinite(exact)  # sqrt(x) of x < 0 is neither
+        real = np.isfinite(value) | np.isfinite(exact)  # sqrt(x) for x < 0 is not finite in either
         return check.units(value[real], exact[real], size[real]) if np.any(real) else 0.0
 
     return check.largest(error, STATES)
@@ -117,9 +117,7 @@ def _slope_error(
             solved, module_slopes = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
         slopes, m = formulas.slopes(s, *_solved(module, s), by_parameters), module_slopes.shape[1]
         own, by_qdd, by_force = np.split(slopes, [m, m + n], axis=1)
-        least: Vector = np.full(
-            (1, 1), np.inf
-        )  # of all widths of differences: what is wrong is so at each
+        least: Vector = np.full((1, 1), np.inf)  # a wrong derivative is wrong at every width
         for forces in (
             _multiplier_slopes(check, s, by_parameters) if formulas.multipliers else [by_force[:0]]
         ):
@@ -284,7 +282,7 @@ class _Motion:
         if (x, time) not in self.known:
             if x in self.definitions:
                 value = self.value(self.definitions[x], time)
-            elif x in self.rates:  # at constant accelerations
+            elif x in self.rates:  # accelerations are constant
                 rate = self.rates[x]
                 half = self.symbol_values[self.rates[rate]] * time / 2 if rate in self.rates else 0
                 value = self.symbol_values[x] + (self.symbol_values[rate] + half) * time

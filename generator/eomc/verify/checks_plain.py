@@ -89,7 +89,7 @@ def _slopes(module: Any, s: State) -> Vector | None:
     for name in ("linearize", "sensitivity"):
         try:
             result = getattr(module, name)(s.q, s.qd, u=s.u, t=s.t, params=s.params)
-        except ValueError:  # built without it
+        except ValueError:  # the module does not have it
             continue
         derivatives += [
             x[-len(s.q) :] for x in (result if isinstance(result, tuple) else (result,))
@@ -108,7 +108,7 @@ def _linearization(check: Comparison, plain: Any) -> float:
             for s in perturb_each_input(e.state, check.sampler.defaults)[:64]
         ]
         size = np.abs(one) + sum(np.abs(x - one) / NUDGE for x in near if x is not None)
-        # entries that are 0 everywhere are sums of what cancels
+        # entries that are 0 everywhere are sums of terms that cancel
         scale = _inputs(check, e.state)[: one.shape[1]]
         size = np.maximum(size, e.size["acceleration"][:, None] / scale)
         return check.units(other, one, np.maximum(size, 1e-6 * np.max(size)))
@@ -162,7 +162,10 @@ def _run_off(check: Comparison, plain: Any, method: str, e: Expected, h: float) 
     both = min(len(one), len(other))
     rows, others = (np.stack([x.q, x.qd], axis=1)[:both].astype(float) for x in (one, other))
     growth = np.ones(both)
-    for sign in (1, np.where(np.arange(len(s.q)) % 2, -1, 1)):  # which excites the fastest modes
+    for sign in (
+        1,
+        np.where(np.arange(len(s.q)) % 2, -1, 1),
+    ):  # alternating signs excite fast modes
         near = run(check.module, NUDGE * sign * spread)
         grown = np.full(both, np.inf)
         known = min(both, len(near))
@@ -180,11 +183,11 @@ def _run_off(check: Comparison, plain: Any, method: str, e: Expected, h: float) 
         raise RuntimeError(f"{len(one) - 1} steps of the fast form, {len(other) - 1} of plain")
     if comparable < 2:
         return None
-    kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
+    kick = h * e.size["acceleration"]  # its rounding error changes the state after a step
     size = growth[:comparable, None, None] * (spread + np.array([h * kick, kick]))
     size = np.arange(1, comparable + 1)[:, None, None] * (size + np.abs(rows[:comparable]))
     off = check.units(others[:comparable], rows[:comparable], size)
-    if off > LIMIT and METHODS[method].implicit:  # others may be found to half their digits
+    if off > LIMIT and METHODS[method].implicit:  # a converging step may lose half its digits
         clear = (
             _next_step_converges(check, method, s, x, h, k + 1)
             for k, x in enumerate(rows[: comparable - 1])

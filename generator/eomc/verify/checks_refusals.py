@@ -89,7 +89,7 @@ class RefusalChecks:
         add("negative D along the rows", 0, unit, self.negative_inertia_errors)
         add("negative D along the rows: refusals", 0, unit, self.missing_refusals)
 
-    # where D is singular
+    # states with a singular D
 
     def negative_inertia_errors(self) -> float:
         """Return the number of states with negative inertia that the module does not refuse.
@@ -274,7 +274,7 @@ class RefusalChecks:
             return False
         try:
             run = self.check.simulate(s, method=method, steps=5)
-        except ArithmeticError:  # D puts a start onto the rows, too
+        except ArithmeticError:  # the projection of the initial state uses D too
             return bool(self.check.system.constraints)
         unchanged = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
         return bool(
@@ -332,12 +332,12 @@ class RefusalChecks:
         rows = run.rows[:, : run.steps + 1].astype(float)
         if not np.all(np.isfinite(rows)):
             return True
-        # an angle of 1e20 has no digit left that says what D is
+        # an angle of 1e20 rad has no digits that determine D
         digits = np.abs(rows[0]) * self.check.eps < EIGENVALUE_TOLERANCE * self.check.sampler.spread
         known = int(np.argmin([*np.all(digits, axis=1), False]))
         # the last state kept may be singular, but no step is made from it
         least = self.least_eigenvalues(rows[0, : min(known, run.steps)], s)
-        if METHODS[method].c[0]:  # no stage is where the step begins: all along it then
+        if METHODS[method].c[0]:  # no stage is at the start of a step
             starts_negative = np.flatnonzero(least[: max(0, known - 1)] < -EIGENVALUE_TOLERANCE)
             positions = self.positions_along_step(
                 rows[:, starts_negative], rows[:, starts_negative + 1]
@@ -369,7 +369,7 @@ class RefusalChecks:
             D = self.check.reference.evaluate("D", q, 0 * q, 0.0, None, s.params)
         return _least_eigenvalues(np.asarray(D))
 
-    # what is not finite
+    # states with nan or inf
 
     def nonfinite_errors(self) -> float:
         """Return the number of calls that return no error for a state with nan or infinity."""
@@ -377,7 +377,7 @@ class RefusalChecks:
         for field, i, what, at in with_nonfinite_entries(s):
             status, clean = self.accelerate(at)
             wrong += not clean
-            # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
+            # tanh and exp(-x) are finite at infinity, and a factor may be 0
             silent = math.isnan(what) and not status and self.depends_on(s, field, i)
             wrong += silent and not self.has_finite_reference(at)
             if self.check.system.constraints:
@@ -460,7 +460,7 @@ class RefusalChecks:
             wrong += bool(run.status == OK) != (run.steps == 12)
             wrong += run.status == NO_CONVERGENCE and not METHODS[method].implicit
             ended.append(run.status)
-        # one coordinate leaves the finite numbers at the very end, where forces let it
+        # one coordinate overflows at the end of the step, if forces permit it
         huge = float(np.finfo(self.model.dtype).max) / 2
         for unit in np.eye(len(s.q)):
             run = run_in_c(

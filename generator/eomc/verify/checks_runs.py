@@ -32,9 +32,8 @@ from eomc.verify.reference import Vector
 from eomc.verify.report import Measurement, largest
 from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State
 
-STEPS = (
-    200  # of a divided run: more than the C code waits after a long step to predict angles again
-)
+# steps of a divided run; after a long step, the C code predicts angles again before that many steps
+STEPS = 200
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)  # steps after which a call ends
 EVERY = 3  # no divisor of STEPS
 # Largest move of a coordinate in a long step, relative to its range (half a turn for an angle): too
@@ -130,7 +129,7 @@ def run_in_c(
     for end in (*(c for c in division.cuts if c < steps), steps):
         if division.moved and steps_done:
             row = rows[0, -(-steps_done // every)]
-            row[0] += division.moved * (1 + abs(row[0]))  # also where it has been thrown far out
+            row[0] += division.moved * (1 + abs(row[0]))  # also if it is large
         if division.fresh_memory and steps_done:
             work = model._ffi.new(work_type)
             work.completed = steps_done
@@ -333,7 +332,7 @@ class RunChecks:
         for e in self.check.few(2):
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
-            constrained = bool(self.check.system.constraints)  # which do not hold at another time
+            constrained = bool(self.check.system.constraints)  # these may not hold at another time
             t = 2.0**24 if _reads_time(self.check.system) and not constrained else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
             # beyond 2^26 rad, rounding errors of an angle hide all others
@@ -348,8 +347,8 @@ class RunChecks:
                 far = self.sampler.expected(at)
             if far is None or not self.sampler.regular(at):
                 continue
-            # springs that are wound up by so many turns have no motion to compare, and what they
-            # accelerate is as exact as the sums of angles in D, not in what it is without them
+            # a spring that is wound up by so many turns makes the motion too fast to compare; errors
+            # of its accelerations are relative to the forces of the spring
             wound = 10 * np.max(e.size["acceleration"]) < np.max(np.abs(far.value["acceleration"]))
             wide = max(TURNS, t, angle(at))
             energies = ("kinetic_energy", "potential_energy")
@@ -415,7 +414,7 @@ class RunChecks:
                 x = np.array(self.sampler.reference.step(x[0], x[1], h, s.t + n * h, u, s.params))
                 off = np.fmax(off, np.max(np.abs(x - x[:, :1]), axis=1) / EPS)
             if not np.all(np.abs(x[:, 0] - [s.q, s.qd]) < MAX_DISTANCE * scale):
-                return 0.0  # as where a force that is wound up throws another coordinate
+                return 0.0  # as with the force of a spring that is wound up
         gain = self.few * h * acceleration
         size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain]) + off
         end = run_in_c(self.model, "rk4", s, h, self.few).rows[:, -1]
@@ -464,7 +463,7 @@ class RunChecks:
                 step = self.sampler.reference.step
                 x = np.array(step(x[0], x[1], self.h, t, inputs, s.params))
                 if not np.all(np.abs(x[:, 0] - start) < MAX_DISTANCE * spread):
-                    break  # what blows up says nothing
+                    break  # the run diverges
                 growth = float(np.max(np.abs(x[:, 1] - x[:, 0]) / spread)) / NUDGE
                 sure = n + 1, x[:, 0], max(growth, 1.0)
         return sure
@@ -487,7 +486,7 @@ class RunChecks:
     def with_input_sequence(self, s: State) -> State:
         """Return a copy of the state with random inputs, (STEPS, nu), that change between steps."""
         u = self.random.normal(size=(STEPS, self.model.nu))
-        u[::2] = u[1::2]  # inputs that jump at some steps and not at others
+        u[::2] = u[1::2]  # inputs that change at every second step only
         return replace(s, u=u)
 
     def differing_variants(self, method: str, s: State, h: float) -> int:
@@ -508,7 +507,7 @@ class RunChecks:
         wrong = (not pieces.is_identical(whole)) + (
             not sparse.is_identical(replace(whole, rows=rows))
         )
-        # a state that is another than was left has no memory
+        # after a change of the state, the workspace of the call before must not be used
         by = max(1e-3 * float(self.sampler.spread[0]), 64 * self.check.eps)
         moved, fresh = (
             run_in_c(self.model, method, s, h, CUTS[3], division=RunDivision(CUTS, by, fresh))
@@ -553,7 +552,7 @@ class RunChecks:
             )
             if not (one.status or other.status):
                 size = np.abs([s.q, s.qd]) + np.array([T * (np.abs(s.qd) + gain), gain])
-                size = size + e.size.get("place", 0.0)  # onto which each step is put
+                size = size + e.size.get("place", 0.0)  # rounding errors of the projection
                 errors.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
         return float(median(errors)) if errors else 0.0
 
@@ -564,12 +563,11 @@ VANISHING_LIMIT = 100.0  # units of rounding; a wrong constant of the reduction 
 # doubles next to a multiple of a quarter turn, counted from it; some are far, since the rounding of
 # a sum may hardly change from one double to the next
 NEIGHBOURS = (-613, -2, -1, 0, 1, 2, 389)
-CONSTANT_TOLERANCE = (
-    0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
-)
-Errors = dict[tuple[str, int], float]  # of entries of D and g
-# of other coordinates, which change what sums round, no sine: also the power of two whose roundings
-# a sum has that all but cancels; in no proportion to each other, as roundings recur
+# relative difference of errors at neighbours up to which they are not rounding errors of a sum
+CONSTANT_TOLERANCE = 0.1
+Errors = dict[tuple[str, int], float]  # by name, "D" or "g", and index of an entry
+# Relative changes of the other coordinates. They change the rounding errors of sums, also the power
+# of two to which sums that almost cancel are rounded, but no error of a sine.
 MOVES = (1e-6, -0.43, 0.31, 0.77, -0.68)
 
 

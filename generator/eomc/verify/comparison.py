@@ -125,7 +125,7 @@ class Comparison:
         """
         try:
             result = measure()
-        except Exception as fault:  # whatever the module raises is an outcome of the check
+        except Exception as fault:  # an exception of the module is a result of the check
             self.results.append(
                 CheckResult(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}")
             )
@@ -231,7 +231,7 @@ class Comparison:
         """
         return float(np.max([error(e) for e in (self.few(few) if few else self.expected)]))
 
-    # against the reference
+    # comparison with the reference
 
     def metadata_differences(self) -> float:
         """Return how many names, defaults and initial values differ between module and system."""
@@ -253,7 +253,7 @@ class Comparison:
 
         name: "acceleration" or a key of VALUES, such as "D" or "energy".
         """
-        # energies in units of what they usually are: k - k cos(q) may be 0 at a state
+        # energies relative to their typical size, since k - k cos(q) may be 0 at a state
         typical = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
 
         def error(e: Expected) -> float:
@@ -348,7 +348,7 @@ class Comparison:
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
             if run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain]) + _corrected(e)
-                if METHODS[method].newton:  # stages end at what a rounding of q makes of rates
+                if METHODS[method].newton:  # rounding of q limits the accuracy of stages
                     size[1] += np.abs(s.q) / h
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
             refused, failures = True, failures + (run.status == "no convergence")
@@ -374,13 +374,13 @@ class Comparison:
         """
         s, h = e.state, h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
-        key = id(s), h, steps  # the states live as long
+        key = id(s), h, steps  # the states live as long as `self`
         if key not in self.reference_runs:
             self.reference_runs[key] = self._reference_run(s, h, steps)
         t, x, growth, rounded = self.reference_runs[key]
         if len(t) < 2:
             return None
-        kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
+        kick = h * e.size["acceleration"]  # its rounding error changes the state after a step
         moved = np.array([self.sampler.spread + h * kick, self.sampler.speed + kick])
         run = self.simulate(s, h=h, steps=len(t) - 1)
         size = growth * moved + np.abs(x) + _corrected(e) + rounded
@@ -401,7 +401,7 @@ class Comparison:
         own = self.system.run.h
         spread = self.sampler.scale
 
-        # of alternating signs, as what is rounded excites the fastest modes too
+        # alternating signs excite fast modes, as rounding errors do
         by = NUDGE * spread * (np.where(np.arange(len(s.q)) % 2, -1, 1) if h > own else 1)
         q, qd = self.sampler.rounded(s, np.add(by, [s.q, s.qd]))
         u = None if s.u is None else np.array([s.u] * len(q))
@@ -414,10 +414,10 @@ class Comparison:
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
             far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
             off = np.max([0 * x, *(np.abs(z - x) / EPS for z in near)], axis=0)
-        growth = np.where(far < MAX_DISTANCE, growth, math.inf)  # what blows up says nothing
+        growth = np.where(far < MAX_DISTANCE, growth, math.inf)  # the run diverges
         growth, off = (np.maximum.accumulate(each) for each in (growth, off))
         known = np.isfinite(off).all(axis=(1, 2))
-        sure = int(np.sum(known & (growth < GROWTH_LIMIT)))  # nan is not
+        sure = int(np.sum(known & (growth < GROWTH_LIMIT)))  # False for nan
         return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
     def start_time(self, s: State) -> float:

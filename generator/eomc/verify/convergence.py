@@ -149,7 +149,7 @@ class Convergence:
         """
         if method != self.methods[0]:
             how["method"] = method
-        if getattr(self.module, "constraint_names", ()):  # rows may stand in time
+        if getattr(self.module, "constraint_names", ()):  # they may depend on time
             how.setdefault("t0", s.t)
             s = projected_start(self.module, s)
         return simulate(self.module, s, **how)
@@ -209,7 +209,7 @@ class Convergence:
         for at in self.places:
             orders.append(self._order(at, method, least))
             if math.isfinite(orders[-1]) and orders[-1] >= least:
-                break  # a wrong stepper is nowhere right
+                break  # a wrong stepper has a low order at every state
         return _pick_order(orders, max, "too few halvings between rounding and a hundredth")
 
     def _order(self, at: Place, method: str, least: float) -> float:
@@ -237,9 +237,9 @@ class Convergence:
                 continue
             if not math.isnan(best := one.best(least)):
                 return best
-            if abs(one.agreed_order - before) <= ORDER_TOLERANCE:  # and nan is not
+            if abs(one.agreed_order - before) <= ORDER_TOLERANCE:  # False for nan
                 nonsmooth = nonsmooth or self._has_kink(at, method, one.span)
-                if not nonsmooth:  # which longer spans are too
+                if not nonsmooth:  # if it is, so are longer spans
                     return one.agreed_order
             before, moved = one.agreed_order, moved or not one.exact
         if not any(ladders.values()):

@@ -29,8 +29,8 @@ STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 DIFFERENCE_STEP = 0.02  # largest change of a coordinate in differences, m or rad
 
 Vector = NDArray[np.float64]
-Params = Mapping[str, Any] | None  # values in place of defaults
-Values = tuple[Any, ...]  # of the parameters, in the system's order: floats, or one a row
+Params = Mapping[str, Any] | None  # parameter values in place of defaults, by name
+Values = tuple[Any, ...]  # of all parameters, in the system's order: numbers, or arrays (b,)
 
 MATRICES = ("D", "C", "constraint_jacobian")
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", "power_terms")
@@ -252,7 +252,7 @@ class ReferenceModel(ABC):
         D, force = self.mass_and_force(q, qd, t, u, values)
         try:
             return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
-        except np.linalg.LinAlgError:  # of one of the states at least
+        except np.linalg.LinAlgError:  # D is singular at one of the states at least
             accelerations = np.full(force.shape, np.nan)
             for k in np.ndindex(force.shape[:-1]):
                 with suppress(np.linalg.LinAlgError):
@@ -315,7 +315,7 @@ class ReferenceModel(ABC):
                 return np.full_like(q, np.nan), np.full_like(q, np.nan)
         D, A = (self._constraint_values(name, q, qd, t, values) for name in ROWS[:2])
         D, A = kkt.with_fixed_coordinates(D, A, fixed)
-        for _ in range(2):  # linear in qd: the second takes what the first has rounded
+        for _ in range(2):  # linear in qd; the second time corrects rounding errors
             by, _ = kkt.solve(
                 D, A, np.zeros(len(q)), -self._constraint_values(RATES, q, qd, t, values)
             )

@@ -51,8 +51,8 @@ def units(values: Any, expected: Any, size: Any, eps: float) -> float:
         )
 
 
-# Correct builds differ by less than one unit in a value, by some tens in a stiff run. A wrong
-# sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
+# Limit of errors in units of rounding. Values of correct modules have errors below 1 unit, stiff
+# runs some tens. A wrong sign makes 1e15, or 1e5 in a term that is 1e-10 of the result.
 LIMIT = 1e3
 
 

@@ -244,7 +244,7 @@ class Sampler:
         start, h, steps = self.start, effort.stride * self.system.run.h, effort.prediction_steps
         q = np.array([start.q, start.q + self.angles])
         qd = np.array([start.qd, start.qd])
-        if self.system.constraints:  # off these a step's correction throws it
+        if self.system.constraints:  # far from them, the correction of a step would be large
             with np.errstate(all="ignore"):
                 q[1], qd[1] = self.reference.project(q[1], qd[1], nearest=False)
         ranges = np.full((2, *q.shape), math.inf)
@@ -264,7 +264,7 @@ class Sampler:
         others random ones. Every second state has random inputs.
         """
         states_: list[Expected] = []
-        nearness = 1.0  # every rejection moves the next draw closer to the start
+        nearness = 1.0  # each rejected state reduces the distance of the next one
         for attempt in range(20 * count):
             if len(states_) == count:
                 break
@@ -463,7 +463,7 @@ class Sampler:
             scale = kkt.scales(D, self.rows("constraint_jacobian", s))[: len(qd)]
             diagonal = np.where(diagonal > 0, diagonal, 1 / scale)
         inertia = np.outer(diagonal, diagonal) + reach["D"]
-        rate = np.max(qd / self.spread)  # of change of D, in 1/s
+        rate = np.max(qd / self.spread)  # at which D changes, 1/s
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
         # a force of 0 along one coordinate may be a sum of forces that cancel
         force = np.maximum(force, diagonal * np.max(force / diagonal))

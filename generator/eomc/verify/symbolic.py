@@ -35,7 +35,7 @@ from eomc.verify.reference import (
 from eomc.verify.taylor import TaylorReference
 from eomc.verify.trig_simplify import simplify_by_rates, simplify_trig
 
-MAX_SIZE = 10_000  # some seconds of SymPy at five links
+MAX_SIZE = 10_000  # operations: SymPy takes some seconds, for five links
 
 
 @lru_cache(maxsize=16)
@@ -327,7 +327,7 @@ class SymbolicReference(ReferenceModel):
         except (ArithmeticError, ValueError):
             return np.full(shape, math.nan)[()]
         array = np.array(values_)
-        if array.dtype.kind == "c":  # Python's power of a negative number
+        if array.dtype.kind == "c":  # a root of a negative number
             return np.full(shape, math.nan)[()]
         return array.astype(float, copy=False).reshape(shape)[()]
 
@@ -361,7 +361,7 @@ def _dirac_delta(x: float, order: int = 0) -> float:
     return math.inf if x == 0 else 0.0
 
 
-_SIZE = sympy.Function("size")  # not Abs, of which SymPy makes parts of complex numbers
+_SIZE = sympy.Function("size")  # SymPy splits Abs into real and imaginary parts
 
-# what `math` has no name for
+# functions that `math` does not have
 _NAMED = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta, "size": abs}

@@ -199,7 +199,7 @@ class TaylorReference(ReferenceModel):
             u = np.zeros((1, len(self.system.inputs)))
         elif u is None:
             u = self._rows("signals", q, qd, t, None, values)
-        if name == "C":  # in motion and, below, at rest
+        if name == "C":  # with and without velocities
             q, qd = np.concatenate([q, q]), np.concatenate([qd, 0 * qd])
             t, u, *values = map(_twice, (t, u, *values))
         if name == "g":
@@ -542,7 +542,7 @@ def _product(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Je
 def _times(a: Jet, b: Jet, fields: Fields) -> Jet:
     """Return the derivatives of a product (Leibniz's rule)."""
     x, y, g, h = a["value"], b["value"], a.get, b.get
-    if len(a) == 1:  # a number, or what hangs on parameters alone
+    if len(a) == 1:  # a number, or a function of parameters only
         large = x[..., None] if isinstance(x, np.ndarray) else x
         return {n: (large if n in PAIRS else x) * z for n, z in b.items() if n in fields}
     out: Jet = {}
@@ -588,7 +588,7 @@ def _chain(f: tuple[Any, Any, Any], a: Jet, fields: Fields) -> Jet:
         elif name in ("xs", "vs"):
             turn = None if g("s") is None else bend * g("s")
             out[name] = _weighted((slope, g(name)), (turn, g(name[0])))
-        else:  # of K alone, which is a polynomial in the velocities
+        else:  # for K only, which is a polynomial in the velocities
             raise AssertionError(name)
     return _without_none(out)
 
