@@ -32,8 +32,8 @@ UNITS = 1e3  # largest error in units of rounding, if that is more, as in single
 
 _X, _Y, _Z = np.eye(3)
 
-# motions of each joint: "t" (translation) along or "r" (rotation) about an axis; None means the axis
-# that the scene defines
+# motions of each joint: "t" (translation) along or "r" (rotation) about an axis; None means the
+# axis that the scene defines
 _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
     "fixed": (),
     "revolute": (("r", None),),

@@ -347,8 +347,8 @@ class RunChecks:
                 far = self.sampler.expected(at)
             if far is None or not self.sampler.regular(at):
                 continue
-            # a spring that is wound up by so many turns makes the motion too fast to compare; errors
-            # of its accelerations are relative to the forces of the spring
+            # a spring that is wound up by so many turns makes the motion too fast to compare;
+            # errors of its accelerations are relative to the forces of the spring
             wound = 10 * np.max(e.size["acceleration"]) < np.max(np.abs(far.value["acceleration"]))
             wide = max(TURNS, t, angle(at))
             energies = ("kinetic_energy", "potential_energy")
