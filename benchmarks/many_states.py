@@ -104,7 +104,7 @@ def functions(m: Any, states: int, table: Table) -> None:
         "t": 0.2 * np.ones(states),
         "params": {name: m.defaults[name] * np.ones(states)},
     }
-    wide = 3 if m._model._plane else 6
+    wide = 3 if m._model.info.plane else 6
     extra: dict[str, dict[str, Any]] = {
         "wrenches": {"wrenches": np.ones((len(m.frames), wide))},
         "qdd": {"qdd": qdd},

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from eomc.runtime.package import model_of
+
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
@@ -58,18 +60,18 @@ def adaptive_in_c(
     module: ModuleType, end: float, tol: float, u: Array | None = None
 ) -> Callable[[], object]:
     """A run in steps that fit the tolerance: the loop in C, called with nothing around it."""
-    model = module._model
-    (address, real, null), work = model._c, model._ffi.new("adaptive_work *")
-    start, nothing = np.concatenate(model.start), bytes(model._ffi.sizeof(work[0]))
+    model = model_of(module)
+    (address, real, null), work = model.c.tools, model.c.ffi.new("adaptive_work *")
+    start, nothing = np.concatenate(model.info.start), bytes(model.c.ffi.sizeof(work[0]))
     x, t = start.copy(), np.zeros(1)
-    at_x, at_t, at_p = address(real, x), address(real, t), model._at[2]
-    at_u, memory, many = model._pointer(u), model._ffi.buffer(work), 2**40
+    at_x, at_t, at_p = address(real, x), address(real, t), model.arguments.default_pointers[2]
+    at_u, memory, many = model.c.pointer(u), model.c.ffi.buffer(work), 2**40
 
     def run() -> None:
         x[:] = start
         t[0] = 0.0
         memory[:] = nothing
-        model._lib.adaptive(
+        model.c.lib.adaptive(
             at_x, at_t, end, tol, 0.0, at_u, many, null, 0, null, null, null, at_p, work
         )
 
@@ -78,10 +80,10 @@ def adaptive_in_c(
 
 def fixed_in_c(module: ModuleType, method: str, h: float, steps: int) -> Callable[[], object]:
     """A run in fixed steps, likewise; it keeps the start and the end."""
-    model = module._model
-    (address, real, null), loop = model._c, model._loops[method][1]
-    q0, qd0, p = model._at
-    rows = np.empty((2, 2, model.nq))
+    model = model_of(module)
+    (address, real, null), loop = model.c.tools, model.integrator.loops[method][1]
+    q0, qd0, p = model.arguments.default_pointers
+    rows = np.empty((2, 2, model.info.nq))
     to = address(real, rows)
 
     def run() -> Array:

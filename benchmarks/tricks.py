@@ -283,7 +283,7 @@ def calls(rounds: int) -> Iterator[str]:
         built(case, nullcontext(), extra, "with_calls") as full,
         built(case, nullcontext(), extra, "without_calls") as less,
     ):
-        loops = less._model._loops  # the third: up to how many steps there is one
+        loops = less._model.integrator.loops  # the third: up to how many steps there is one
         loops |= {name: (*loop[:2], -1, *loop[3:]) for name, loop in loops.items()}
         runtime = sys.modules[f"{less.__name__}._runtime.adaptive"]
         with patch.object(runtime, "simulate_short_run", return_value=None):

@@ -30,6 +30,7 @@ from instrument import Shipped, in_a_fork
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.assembly import assembled
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
 from eomc.verify import check as checking
 from eomc.verify import comparison
@@ -70,7 +71,7 @@ def variant(name: str) -> System:
 def outcomes(module: Any, check: Any) -> Vector:
     """What the module gives in RUNS random runs, at their states, and in a batch."""
     found: list[Vector] = []
-    model = module._model
+    model = model_of(module)
     draw = np.random.default_rng(99)
     names = ("D", "C", "g", "bias", "tau", "kinetic_energy", "potential_energy", "energy", "jacobi",
              "power")  # fmt: skip
@@ -92,7 +93,7 @@ def outcomes(module: Any, check: Any) -> Vector:
         qd = qd * np.exp(draw.uniform(-2, 6, (len(q), 1)))
         for method in module.methods:
             runs = module.simulate_batch(q, qd, steps=30, every=7, method=method, threads=1)
-            found += [runs.q, runs.qd, runs._codes]
+            found += [runs.q, runs.qd, runs.status_codes]
     return np.concatenate([np.asarray(x, float).ravel() for x in found])
 
 

@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from eomc.base.errors import EomcError, NoCompilerError
+from eomc.runtime.package import model_of
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem, SceneError
@@ -316,7 +317,7 @@ def load(
                 raise
     # the model draws pictures of its scene
     own = Path(os.path.abspath(scene)) if isinstance(scene, (str, os.PathLike)) else scene
-    module._model.source = own
+    model_of(module).source = own
     return module
 
 
@@ -346,7 +347,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     from eomc.scene import read as scenes
     from eomc.scene import toml_text
 
-    name, source, what = model.name, model.source, "simulate(events=)"
+    name, source, what = model.info.name, model.source, "simulate(events=)"
     if source is None:
         raise EomcError(f"{what}: {name} was imported without its scene: load it with eomc.load")
     if not isinstance(source, Path) and source.scene and read(source.file) == source:
@@ -358,7 +359,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         data = source.read_bytes()
     except OSError as fault:
         raise EomcError(f"{what}: {source}: can't be read ({fault.strerror})") from None
-    if hashlib.sha256(data).hexdigest() != model.digest:
+    if hashlib.sha256(data).hexdigest() != model.info.digest:
         raise EomcError(f"{what}: {source} has changed since it was built: load it again")
     text = data.decode() + toml_text.events_to_toml(events, what)
     root = folder / ".events" / hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -367,7 +368,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         try:
             scenes.parse(text, what)
         except SceneError as wrong:
-            raise _name_events(wrong, len(model.events), events) from None
+            raise _name_events(wrong, len(model.info.events), events) from None
         with writing(f"{what}: {file}"):
             root.mkdir(parents=True, exist_ok=True)
             with atomic_write(file) as new:

@@ -24,9 +24,9 @@ def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None)
     made = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
     held = None if u is None else np.ascontiguousarray(u, m.dtype)
     given = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
-    found = model._lib.linearization(
-        1, *map(model._pointer, made), *map(model._pointer, given), t, model._pointer(held),
-        model._pointer(model._p0), model._c[2],
+    found = model.c.lib.linearization(
+        1, *map(model.c.pointer, made), *map(model.c.pointer, given), t, model.c.pointer(held),
+        model.c.pointer(model.info.p0), model.c.tools[2],
     )  # fmt: skip
     assert found >> 3 == 1 - (found & 7 != 0)
     if found & 7:

@@ -151,7 +151,7 @@ def test_a_loaded_module_knows_its_scene(modules, tmp_path):
 
 def test_without_its_scene_a_run_says_what_to_do(modules, tmp_path, monkeypatch):
     run = modules("cartpole").simulate(duration=0.1)
-    monkeypatch.setattr(run._model, "source", None, raising=False)
+    monkeypatch.setattr(run.model, "source", None, raising=False)
     with pytest.raises(EomcError, match=r"cartpole: .* load it with eomc.load, or give scene=PATH"):
         run.animate()
     assert run.animate(scene="scenes/cartpole.toml").page

@@ -104,7 +104,7 @@ def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.Mon
     module = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"])
     monkeypatch.setattr(module, "_FIRST_CALL_STEPS", 1)
     monkeypatch.setattr(module, "_MAX_STEPS_PER_CALL", 3)
-    monkeypatch.setattr(kepler._model, "_room", 0)
+    monkeypatch.setattr(kepler._model.integrator, "room", 0)
     again = kepler.simulate(duration=50.0)
     assert again == run and np.array_equal(again.t, run.t) and again.steps == run.steps
     assert pickle.loads(pickle.dumps(run)) == run
@@ -126,7 +126,7 @@ def test_a_run_in_one_call_is_the_same(kepler: ModuleType, how: dict) -> None:
     """The way of what is asked again and again, beside the one that takes all questions."""
     kepler.simulate(duration=PERIOD)  # how many steps there are
     quick = kepler.simulate(duration=PERIOD, tol=1e-8, **how)
-    assert 0 < quick.steps + 1 <= kepler._model._room
+    assert 0 < quick.steps + 1 <= kepler._model.integrator.room
     long = kepler.simulate(duration=PERIOD, tol=1e-8, **how, progress=lambda done, of: None)
     assert quick == long and quick.message == long.message
     assert quick.evaluations == long.evaluations and quick.h == long.h
@@ -164,7 +164,7 @@ def test_a_distant_end_changes_no_step(kepler: ModuleType, end: float) -> None:
 
 def test_a_run_of_more_steps_than_the_last_is_whole(kepler: ModuleType) -> None:
     kepler.simulate(duration=0.1)
-    room = kepler._model._room
+    room = kepler._model.integrator.room
     run = kepler.simulate(duration=20 * PERIOD)
     assert run.steps > room and run.t[-1] == 20 * PERIOD
     assert run == kepler.simulate(duration=20 * PERIOD)
@@ -177,12 +177,12 @@ def test_a_run_in_one_call_has_its_room_whatever_others_do(
     run, model = kepler.simulate(q0=[0.2, 0.0], duration=1.0), kepler._model
 
     def meanwhile(x0: object, name: str) -> object:
-        model._room = 0
+        model.integrator.room = 0
         return type(model)._checked_half(model, x0, name)
 
     monkeypatch.setattr(model, "_checked_half", meanwhile, raising=False)
-    assert model._room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
-    assert model._room == 0  # the long way would have found it anew
+    assert model.integrator.room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
+    assert model.integrator.room == 0  # the long way would have found it anew
 
 
 def test_a_run_in_one_call_refuses_the_same(kepler: ModuleType) -> None:
@@ -204,7 +204,7 @@ def test_a_run_ends_at_a_time_that_single_precision_rounds(single: ModuleType) -
     """0.7 s is later than the float next to it, 0.3 s earlier."""
     for room in (0, 48):
         for t0, duration in ((0.0, 0.7), (0.0, 0.3), (0.7, 0.0), (0.1, 0.6)):
-            single._model._room = room
+            single._model.integrator.room = room
             run = single.simulate(duration=duration, t0=t0)
             assert run.status == "ok" and run.t[-1] == np.float32(t0 + duration)
 
@@ -225,14 +225,14 @@ def test_a_run_tells_the_state_at_any_time(kepler: ModuleType) -> None:
 
 def test_curves_and_sections_have_states_between_long_steps(kepler: ModuleType) -> None:
     run = kepler.simulate(duration=3.0)
-    coarse, fine = len(run), run._drawn
+    coarse, fine = len(run), run.curve_run
     assert coarse < 100 and len(fine) >= 1000 and len(run) == coarse
     assert np.isin(run.t, fine.t).all()
     assert np.allclose(fine["energy"], run.energy[0], rtol=1e-7)
     at = run.section("x")["t"]
     assert len(at) and np.abs(run(at)[0][:, 0]).max() < 1e-6
     held = kepler.simulate(times=np.linspace(0, 3, 2000))
-    assert held._drawn is held
+    assert held.curve_run is held
 
 
 def test_a_section_is_as_exact_as_the_steps(kepler: ModuleType) -> None:
@@ -362,13 +362,13 @@ def test_what_makes_no_sense_is_refused(kepler: ModuleType, how: dict, words: st
 
 def test_a_time_that_is_none_is_refused(kepler: ModuleType) -> None:
     model = kepler._model
-    null = model._c[2]
+    null = model.c.tools[2]
     for wrong in (math.nan, math.inf):
-        work, x = model._ffi.new("adaptive_work *"), np.array([0.1, 0, 0, 4.0])
+        work, x = model.c.ffi.new("adaptive_work *"), np.array([0.1, 0, 0, 4.0])
         t = np.array([wrong])
-        status = model._lib.adaptive(
-            model._pointer(x), model._pointer(t), 1.0, 1e-9, 0.0, null, 10, null, 0, null, null,
-            null, model._pointer(model._p0), work,
+        status = model.c.lib.adaptive(
+            model.c.pointer(x), model.c.pointer(t), 1.0, 1e-9, 0.0, null, 10, null, 0, null, null,
+            null, model.c.pointer(model.info.p0), work,
         )  # fmt: skip
         assert (status, work.rows, work.steps) == (STATUS.index("not finite"), 0, 0)
         assert x.tolist() == [0.1, 0, 0, 4.0]
@@ -376,7 +376,7 @@ def test_a_time_that_is_none_is_refused(kepler: ModuleType) -> None:
 
 def test_auto_is_by_a_tolerance(kepler: ModuleType, cartpole: ModuleType) -> None:
     run, same = kepler.simulate(method="auto", duration=1.0), kepler.simulate(duration=1.0)
-    assert run.tol == kepler._model.tolerance and np.array_equal(run.q, same.q)
+    assert run.tol == kepler._model.info.tolerance and np.array_equal(run.q, same.q)
     assert kepler.simulate(method="auto", tol=1e-6, duration=1.0).steps < run.steps
     with pytest.raises(ValueError, match="built without adaptive steps"):
         cartpole.simulate(method="auto")
@@ -394,7 +394,7 @@ def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
         match=r"tol: cartpole was built without adaptive steps.* \[run\] tolerance = 1e-9",
     ):
         cartpole.simulate(tol=1e-9)
-    assert not hasattr(cartpole._model._lib, "adaptive")
+    assert not hasattr(cartpole._model.c.lib, "adaptive")
 
 
 @pytest.mark.parametrize("given", ["0", "1", "1e-16", '"1e-9"', "true"])

@@ -44,7 +44,7 @@ def endless(modules: Modules) -> ModuleType:
 @pytest.fixture(autouse=True)
 def small(endless: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine of 5 MB."""
-    memory = sys.modules[f"{endless.__name__}._runtime.adaptive_memory"]
+    memory = sys.modules[f"{endless.__name__}._runtime.adaptive"]
     monkeypatch.setattr(memory, "machine_memory", lambda: MEMORY)
 
 

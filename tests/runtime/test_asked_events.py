@@ -117,7 +117,7 @@ def test_they_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
 
     oscillator.simulate(duration=1.0, events=BESIDE)
     before = dates()
-    vars(oscillator._model).pop("_eventful")  # as in another process
+    oscillator._model.extensions.clear()  # as in another process
     run = oscillator.simulate(duration=1.0, events=BESIDE)
     assert len(run.events["through"]) == 1 and dates() == before != {}
     assert pickle.loads(pickle.dumps(run)).events["through"].t == run.events["through"].t
@@ -138,7 +138,7 @@ def test_a_saved_run_is_loaded_with_them(oscillator: ModuleType, tmp_path: Path)
             np.testing.assert_array_equal(again.events["drop"].t, run.events["drop"].t)
             if not k:
                 assert np.array_equal(again(times), run(times)) and again(2.0)[0][2] == 4
-        vars(oscillator._model).pop("_eventful")
+        oscillator._model.extensions.clear()
 
 
 def test_a_saved_run_without_the_scene_is_told_how(
@@ -146,7 +146,7 @@ def test_a_saved_run_without_the_scene_is_told_how(
 ) -> None:
     file = tmp_path / "run.npz"
     oscillator.simulate(duration=1.0, events=BESIDE).save(file)
-    vars(oscillator._model).pop("_eventful")
+    oscillator._model.extensions.clear()
     monkeypatch.setattr(oscillator._model, "source", None)
     with pytest.raises(EomcError, match=r"load it with eomc\.load") as fault:
         oscillator.load_run(file)
@@ -247,7 +247,7 @@ def test_of_a_system_a_saved_run_finds_them(systems: Path, tmp_path: Path) -> No
     run.save(file)
     again = m.load_run(file)
     assert again == run and again.events["half"].t == run.events["half"].t
-    vars(m._model).pop("_eventful")
+    m._model.extensions.clear()
     with pytest.raises(ValueError, match=r"which files don't keep: call swinging\.simulate\(ev"):
         m.load_run(file)
 
@@ -256,7 +256,7 @@ def test_of_a_system_they_are_compiled_once(systems: Path) -> None:
     dates = []
     for _ in range(2):  # as in another process
         m = eomc.load(swinging(), systems)
-        vars(m._model).pop("_eventful", None)
+        m._model.extensions.clear()
         m.simulate(duration=1.0, events=beside_its_own())
         (extension,) = systems.glob("swinging/.events/*/swinging/_swinging_*")
         dates.append(extension.stat().st_mtime_ns)
@@ -274,7 +274,8 @@ def test_of_a_system_they_are_compiled_once(systems: Path) -> None:
     ],
 )  # fmt: skip
 def test_of_a_system_a_fault_is_named(events: dict, words: str, tmp_path: Path) -> None:
-    m = SimpleNamespace(name="swinging", source=swinging(), events=("turns",))
+    info = SimpleNamespace(name="swinging", events=("turns",))
+    m = SimpleNamespace(info=info, source=swinging())
     with pytest.raises(EomcError, match=words):
         pipeline.with_events(m, events, tmp_path)
 

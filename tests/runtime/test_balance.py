@@ -168,7 +168,7 @@ def test_a_conservative_run_has_its_error_only(cartpole: ModuleType) -> None:
     assert balance.is_resolved and balance.words.startswith(
         "nothing was put in or lost; numerical error"
     )
-    assert not cartpole._model.has_power
+    assert not cartpole._model.functions.has_power
 
 
 def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Modules) -> None:

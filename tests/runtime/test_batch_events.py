@@ -124,7 +124,7 @@ def test_jumps_for_ever_end_with_what_there_is_memory_for(
 ) -> None:
     text = ENDLESS.replace("endless_jumps", "endless_batch").replace("[run]", "[run]\nbatch = true")
     endless = modules.unoptimised(text)
-    monkeypatch.setattr(own(endless, "adaptive_memory"), "machine_memory", lambda: 1_000_000)
+    monkeypatch.setattr(own(endless, "adaptive"), "machine_memory", lambda: 1_000_000)
     run = endless.simulate_batch([[0.1, 0.0], [0.2, 0.0]], threads=1)
     assert set(run.status.tolist()) == {"out of memory"} and "2 out of memory" in run.message
     kept = len(run.events["again"]) * 5 * 8

@@ -36,7 +36,9 @@ INPUTS: dict[str, Any] = {
 def run(request: pytest.FixtureRequest, driven: ModuleType) -> Any:
     """Ten steps, of which five rows are kept."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driven._model, "_warned", {"u"})  # a function is slow: said elsewhere
+        patch.setattr(
+            driven._model.integrator, "warned", {"u"}
+        )  # a function is slow: said elsewhere
         return driven.simulate(Q, QD, steps=10, every=3, u=request.param, t0=0.5)
 
 
@@ -89,7 +91,7 @@ def test_inputs_are_those_that_were_applied(driven: ModuleType) -> None:
     expected, table = held.u.copy(), np.multiply(table, 0, out=table)
     assert np.array_equal(held.u, expected)  # whatever becomes of the caller's table
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driven._model, "_warned", {"u"})
+        patch.setattr(driven._model.integrator, "warned", {"u"})
         called = driven.simulate(steps=10, every=3, u=lambda t, q, qd: next(calls))
     assert np.array_equal(called.u, expected) and np.array_equal(called.q, held.q)
     own = driven.simulate(steps=10, every=3, t0=0.5)
@@ -110,7 +112,7 @@ def test_inputs_of_a_run_that_stopped(driven: ModuleType, steps: int) -> None:
     """A law that drives the state out of the numbers: as many inputs as rows."""
     given = [*np.arange(float(steps)), 1e308]
     with pytest.warns(RuntimeWarning, match="stopped"), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driven._model, "_warned", {"u"})
+        patch.setattr(driven._model.integrator, "warned", {"u"})
         run = driven.simulate(steps=20, every=3, u=lambda t, q, qd: given[round(t / 0.005)])
     assert (run.status, run.steps) == ("not finite", steps)
     assert run.u[:, 0].tolist() == {6: [0, 3, 1e308], 7: [0, 3, 6, 1e308]}[steps]
@@ -172,7 +174,7 @@ def test_a_saved_run_comes_back(driven: ModuleType, run: Any, tmp_path: Path) ->
     for name, column in run.to_dict().items():
         assert np.array_equal(other[name], column), name
     assert (other.evaluations, other.method, other.every) == (run.evaluations, run.method, 3)
-    if callable(run._u):
+    if callable(run.given_inputs):
         with pytest.raises(ValueError, match=r"u was a function.*simulate again"):
             other.estimate()
     else:

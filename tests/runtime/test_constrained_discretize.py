@@ -112,7 +112,7 @@ def test_against_differences_of_steps(modules: Modules, text: str, method: str, 
     u = INPUTS[given] if m.inputs else None
     q, qd = m.project(*m.start, t=t)
     for off in (0.0, 0.01):
-        x = np.hstack([q, qd]) + off * np.arange(2 * m._model.nq)
+        x = np.hstack([q, qd]) + off * np.arange(2 * m._model.info.nq)
 
         def end(x: Any) -> Any:
             return np.hstack(m.step(*np.split(x, 2), h, t, u, method=method))

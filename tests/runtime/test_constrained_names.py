@@ -12,6 +12,7 @@ import pytest
 
 import eomc
 from eomc.model.system import Constraint, Reaction, System
+from eomc.runtime.package import model_of
 
 FUNCTIONS = (
     "constraints constraint_rates constraint_jacobian multipliers project tangent reactions"
@@ -69,7 +70,11 @@ def test_where_something_is_not_finite_is_told(
         with pytest.raises(module.MotionError, match=r"at q = \[1\.7e\+308 .* slope is not finite"):
             module.tangent(*at)
     q[1] = 0.8, 0.6
-    monkeypatch.setattr(module._model, "_multipliers", lambda *_: np.array([[1.0], [np.inf]]))
+    monkeypatch.setattr(
+        model_of(module).constraints,
+        "multipliers_or_nan",
+        lambda *_: np.array([[1.0], [np.inf]]),
+    )
     words = r"at q = \[0\.8 0\.6\], qd = \[0\. 0\.\]: the multiplier of rod is not finite there"
     with pytest.raises(module.MotionError, match=words):
         module.multipliers(q, qd)

@@ -111,13 +111,13 @@ def test_parameters_that_leave_no_inertia(cartpole: ModuleType) -> None:
 def test_in_c_a_step_less_than_zero_goes_back(cartpole: ModuleType) -> None:
     """As docs/c.md says; Python refuses it."""
     model = cartpole._model
-    step, pointer, null = model._loops["rk4"][0], model._pointer, model._c[2]
+    step, pointer, null = model.integrator.loops["rk4"][0], model.c.pointer, model.c.tools[2]
     q, qd = np.array(Q[:2]), np.array(QD[:2])
 
     def stepped(h: float) -> int:
         at, moving = q.copy(), qd.copy()
         parts = pointer(q), pointer(qd), pointer(at), pointer(moving)
-        return int(step(*parts, 0.0, h, null, model._at[2]))
+        return int(step(*parts, 0.0, h, null, model.arguments.default_pointers[2]))
 
     begun = np.hstack([q, qd])
     assert stepped(-0.01) == 0 and np.abs(np.hstack([q, qd]) - begun).max() > 1e-4

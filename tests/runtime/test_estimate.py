@@ -15,7 +15,8 @@ from conftest import ROOT, Modules, tiers
 
 import eomc
 from eomc.model.system import System
-from eomc.runtime import estimate, growth
+from eomc.runtime import estimate
+from eomc.runtime.package import model_of
 
 SPRING = """
 eomc = 1
@@ -64,7 +65,7 @@ def compiled(name: str) -> ModuleType:
 def spring(modules: Modules) -> Any:
     """It has warned of nothing yet."""
     module = modules.unoptimised(SPRING)
-    module._model._warned.clear()
+    model_of(module).integrator.warned.clear()
     return module
 
 
@@ -176,13 +177,13 @@ def test_growth_is_that_of_the_linear_motion() -> None:
     t = np.linspace(0, 5, 400)[:, None]
     c, s = np.cos(omega * t), np.sin(omega * t)
     along, across = np.hstack([c, -omega * s]), np.hstack([s / omega, c])
-    root = growth.norm_root(D, [along, across], 5.0)
+    root = estimate.norm_root(D, [along, across], 5.0)
     np.testing.assert_allclose(root, np.sqrt(3) * np.diag([omega, 1.0]), rtol=0.05)
     ends = (np.stack([x[k] for x in (along, across)], axis=1) for k in (0, 333))
-    assert growth.growth(root, *ends) == pytest.approx(1, rel=0.05)
+    assert estimate.growth(root, *ends) == pytest.approx(1, rel=0.05)
     first, last = np.eye(2), np.diag([1e200, 1.0])
-    assert growth.growth(np.eye(2), first, last) == pytest.approx(1e200)
-    assert growth.growth(np.eye(2), first, np.diag([np.inf, 1.0])) == math.inf
+    assert estimate.growth(np.eye(2), first, last) == pytest.approx(1e200)
+    assert estimate.growth(np.eye(2), first, np.diag([np.inf, 1.0])) == math.inf
 
 
 QUICK = (

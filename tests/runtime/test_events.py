@@ -88,7 +88,7 @@ def test_several_at_once_happen_in_the_order_of_the_scene(ball: ModuleType) -> N
         run = ball.simulate(
             [0, height], [speed, 0], params={"wall": speed * end}, duration=1.2 * end
         )
-        which, rows = run._event_data
+        which, rows = run.event_data
         assert which.tolist() == [0, 2], (height, speed)
         assert rows[:, 0] == pytest.approx([end, end], abs=1e-14)
 

@@ -14,8 +14,13 @@ from states import QD, Q, same
 
 from eomc.emit.package import FUNCTIONS, OPTIONAL
 from eomc.model.system import System
-from eomc.runtime.batch import BatchModel
+from eomc.runtime.batch import Batch
+from eomc.runtime.constraints import Constraints
+from eomc.runtime.frames import Frames
+from eomc.runtime.functions import Functions
+from eomc.runtime.integrator import Integrator
 from eomc.runtime.package import CONSTRAINED
+from eomc.runtime.statics import Statics
 from eomc.verify.taylor import TaylorReference
 
 
@@ -42,8 +47,12 @@ def test_values_are_those_of_the_textbook(cartpole: ModuleType) -> None:
 def test_time_inputs_and_parameters_are_positional_in_this_order() -> None:
     """After the state and whatever else the function is of, in all functions of a state."""
     told = []
-    for name in [*FUNCTIONS, *CONSTRAINED, "reactions", *(n for x in OPTIONAL.values() for n in x)]:
-        found = list(signature(getattr(BatchModel, name)).parameters.values())
+    parts = (Functions, Frames, Constraints, Statics, Integrator, Batch)
+    methods = {name: method for part in parts for name, method in vars(part).items()}
+    names_of_parts = [name for names in FUNCTIONS.values() for name in names]
+    optional = [name for names in OPTIONAL.values() for name in names]
+    for name in [*names_of_parts, "step_batch", *CONSTRAINED, "reactions", *optional]:
+        found = list(signature(methods[name]).parameters.values())
         names = [p.name for p in found if p.kind is p.POSITIONAL_OR_KEYWORD]
         if "t" in [p.name for p in found] and name not in ("rhs", "step_batch"):
             told.append(name)

@@ -131,7 +131,7 @@ def test_mass_length_stiffness_and_drive_change_as_in_scipy(gripper: ModuleType,
 def test_values_stand_beside_the_rows(gripper: ModuleType) -> None:
     run = gripper.simulate()
     assert gripper.coordinates == ("x", "theta", "m", "l", "k", "on")
-    assert gripper._model.discrete_coordinates == ("m", "l", "k", "on")
+    assert gripper._model.info.discrete_coordinates == ("m", "l", "k", "on")
     assert gripper.parameters == ("m_p", "g") and gripper.units["m"] == "kg"
     before = run.t < CUTOFF
     assert set(run["k"][before]) == {4.0} and run["k"][-1] == 8.0

@@ -163,8 +163,8 @@ def test_the_command_tells(tmp_path: Path) -> None:
 
 
 def test_a_scene_without_has_nothing_of_it(limited: ModuleType, driven: ModuleType) -> None:
-    assert limited._model.has_limits
-    assert not driven._model.has_limits and not driven.simulate(steps=3).saturated.any()
+    assert limited._model.functions.has_limits
+    assert not driven._model.functions.has_limits and not driven.simulate(steps=3).saturated.any()
     q, qd = driven.start
     assert np.array_equal(driven.applied(q, qd, 0.3), driven.signal(q, qd, 0.3))
     assert driven.applied(q, qd, u=[1e9]).tolist() == [1e9]

@@ -105,9 +105,9 @@ class CountedCalls:
 @pytest.fixture
 def calls(crank: ModuleType, monkeypatch: pytest.MonkeyPatch) -> CountedCalls:
     model: Any = crank._model
-    counted = CountedCalls(model._lib)
-    monkeypatch.setattr(model, "_lib", counted)
-    monkeypatch.setattr(model, "_functions", {})
+    counted = CountedCalls(model.c.lib)
+    monkeypatch.setattr(model.c, "lib", counted)
+    monkeypatch.setattr(model.functions, "_bound", {})
     return counted
 
 

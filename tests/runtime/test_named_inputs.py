@@ -68,7 +68,7 @@ def test_symbols_of_sympy_are_names_too(driven: ModuleType) -> None:
 
 def test_numbers_of_instances_and_tables_go_together(everything: ModuleType) -> None:
     given = {"u": np.arange(3.0), "push": np.arange(12.0).reshape(3, 4)}
-    made = everything._model._by_name(given)
+    made = everything._model.arguments.inputs_by_name(given)
     assert made.shape == (3, 4, 2) and made.flags.c_contiguous
     assert np.array_equal(made[..., 1], given["push"])
     assert np.array_equal(made[..., 0], np.repeat(np.arange(3.0), 4).reshape(3, 4))

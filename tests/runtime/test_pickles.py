@@ -19,7 +19,7 @@ from conftest import MODULES
 from eventful import BALL, built
 
 import eomc
-from eomc.runtime.package import Identity
+from eomc.runtime.package import Identity, model_of
 
 TEXT = """
 eomc = 1
@@ -97,7 +97,7 @@ def test_each_version_is_read_as_it_was_pickled(
         module, run = read["module"], read["run"]
         assert module.defaults == {"m": m} and module.coordinates == order
         assert [run["x"][0], run["theta"][0]] == [0.5, 0.1]
-        assert run.to_dict()["x"][0] == 0.5 and run._model is module._model is read["model"]
+        assert run.to_dict()["x"][0] == 0.5 and run.model is model_of(module) is read["model"]
         assert read["function"](*module.start) == module.energy(*module.start)
         assert run.energy[0] == module.energy(*module.start)
         assert type(read["rest"]).__name__ == "Equilibrium" and read["rest"].q.shape == (2,)
@@ -145,7 +145,7 @@ def test_data_of_a_build_that_is_gone_are_read_by_their_names(
             len(pickle.loads(versions["reordered"][what]).q)
     with pytest.warns(RuntimeWarning):
         run = pickle.loads(versions["first"]["run"])
-    assert run["x"][0] == 0.5 and run.params == {"m": 0.1} and run._model.defaults == {"m": 0.3}
+    assert run["x"][0] == 0.5 and run.params == {"m": 0.1} and run.model.info.defaults == {"m": 0.3}
 
 
 def test_where_no_build_is_left_all_but_errors_is_refused(

@@ -81,7 +81,11 @@ def test_a_run_is_copied_and_compared(driven: ModuleType, copied: Callable[[Any]
 
 
 def test_a_run_under_a_function_keeps_all_but_the_function(driven: ModuleType) -> None:
-    with pytest.warns(RuntimeWarning) if "u" not in driven._model._warned else memoryview(b""):
+    with (
+        pytest.warns(RuntimeWarning)
+        if "u" not in driven._model.integrator.warned
+        else memoryview(b"")
+    ):
         run = driven.simulate(steps=10, u=lambda t, q, qd: [-qd[0]])
     other = pickle.loads(pickle.dumps(run))
     assert other == run and np.array_equal(other.energy, run.energy)

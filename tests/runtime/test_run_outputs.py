@@ -172,7 +172,7 @@ def test_a_name_is_not_taken_for_true(crane: ModuleType, how: Any) -> None:
 
 def test_a_scene_without_has_nothing_of_it(cartpole: ModuleType, crane: ModuleType) -> None:
     assert cartpole.outputs == () and cartpole.simulate(steps=3).outputs == {}
-    assert not hasattr(cartpole._model._lib, "outputs") and hasattr(crane._model._lib, "outputs")
+    assert not hasattr(cartpole._model.c.lib, "outputs") and hasattr(crane._model.c.lib, "outputs")
     with pytest.raises(ValueError, match=r"name them in \[outputs\]"):
         cartpole.output(*cartpole.start)
 

@@ -303,7 +303,7 @@ def test_a_notebook_shows_the_mechanism_where_there_is_one(modules: Modules, mon
     right = with_it[:, with_it.shape[1] // 2 :, :3]
     grey = np.abs(right - 0.3).max(axis=2) < 0.05  # the cart and the pole
     assert grey.sum() > 100
-    monkeypatch.setattr(run._model, "source", None)
+    monkeypatch.setattr(run.model, "source", None)
     alone = run._repr_html_()
     assert 'alt="over time: x, theta"' in alone and image(alone).shape[1] < with_it.shape[1]
 
@@ -315,9 +315,9 @@ def test_a_notebook_shows_curves_alone_of_what_says_nothing_of_its_shape(modules
 
 def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> None:
     run = modules("mass_spring").simulate(steps=5)
-    model = run._model
+    model = run.model
     monkeypatch.setattr(model, "title", "<script>$x$\x1b")
-    monkeypatch.setitem(model.units, "x", '"><b>')
+    monkeypatch.setitem(model.info.units, "x", '"><b>')
     page = html(run)
     assert "&lt;script&gt;$x$\\x1b" in page and "<script>" not in page and "<b>&" not in page[20:]
     assert "&quot;&gt;&lt;b&gt;" in page

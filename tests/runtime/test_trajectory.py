@@ -38,7 +38,7 @@ def test_a_few_steps_by_the_short_way_are_those_by_the_long(
     """Arguments that are all plain go straight into C; with one more they are looked at."""
     asked = {"steps": steps, "every": 3, "t0": 0.5, **how}
     long = driven.simulate(progress=lambda done, of: None, **asked)
-    monkeypatch.setattr(driven._model, "_trajectory", None)
+    monkeypatch.setattr(driven._model.integrator, "run", None)
     short = driven.simulate(**asked)
     assert same(long, short)
     for name in ("h", "steps", "status", "every", "method", "evaluations", "message"):
@@ -231,7 +231,7 @@ def test_a_function_sees_time_and_state_and_may_keep_them(driven: ModuleType, ev
 
 def test_a_function_is_said_to_be_slow_once(tmp_path: Path) -> None:
     driven = eomc.load(SCENES / "cartpole_driven.toml", MODULES)
-    driven._model._warned.discard("u")
+    driven._model.integrator.warned.discard("u")
     with pytest.warns(RuntimeWarning, match=r"cartpole_driven: u is a Python function.*slower"):
         driven.simulate(steps=2, u=lambda t, q, qd: 0.0)
     with warnings.catch_warnings(action="error"):

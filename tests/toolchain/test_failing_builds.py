@@ -124,7 +124,7 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
     monkeypatch.setattr(os, "replace", failing)
     if not links:
         monkeypatch.setattr(os, "link", no_links)
-    for last in ("simple_pendulum.c", "_runtime/slices.py", "__init__.py", "build.json"):
+    for last in ("simple_pendulum.c", "_runtime/status.py", "__init__.py", "build.json"):
         with pytest.raises(eomc.EomcError if isinstance(fault, OSError) else KeyboardInterrupt):
             eomc.build(scene, root)
         assert contents(folder) == before and leftovers(root) == []

@@ -194,7 +194,7 @@ def run(q, qd, h, steps, p):
 
 
 q, qd = cartpole.start
-status = run(q, qd, cartpole._model.h, 2000, np.array([*cartpole.defaults.values()]))
+status = run(q, qd, cartpole._model.info.h, 2000, np.array([*cartpole.defaults.values()]))
 print(status, abs(np.hstack([q, qd]) - cartpole.simulate().x[-1]).max())
 """
 SCIPY = """

@@ -59,14 +59,14 @@ class Bent:
 
 def lost(run: Any) -> None:
     """One event is not told."""
-    which, rows = run._event_data
-    run._event_data = which[which != 0], rows[which != 0]
+    which, rows = run.event_data
+    run.event_data = which[which != 0], rows[which != 0]
 
 
 def late(run: Any) -> None:
     """The state at each event is that of a moment later."""
-    which, rows = run._event_data
-    run._event_data = which, rows + np.array([0, 1e-9, 0])
+    which, rows = run.event_data
+    run.event_data = which, rows + np.array([0, 1e-9, 0])
 
 
 def aside(run: Any) -> None:
@@ -78,7 +78,7 @@ def row(module: Any) -> Any:
     made = Comparison(SWING, module, np.random.default_rng(0), 4, None)
     checks_events.report_fixed_steps(made)
     (found,) = made.results
-    assert found.name == "events in steps of rk4" and not module._model._passes_over
+    assert found.name == "events in steps of rk4" and not module._model.integrator.ignores_events
     return found
 
 

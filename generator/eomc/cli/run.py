@@ -21,6 +21,7 @@ from eomc.base.errors import EomcError, writing
 from eomc.cli import options
 from eomc.cli.options import parse_pairs
 from eomc.cli.terminal import escape_line, progress_bar, say, status_line, warn
+from eomc.runtime.package import model_of
 
 if TYPE_CHECKING:
     from eomc.runtime.balance import Balance
@@ -160,7 +161,7 @@ def run_command(arguments: RunArguments) -> None:
     if out:
         with writing(escape_line(out)):
             run.save(out)
-    has_work = module._model.has_power or len(run.events) > 0  # forces, or jumps
+    has_work = model_of(module).functions.has_power or len(run.events) > 0  # forces, or jumps
     balance = run.balance() if has_work and simulation.is_short else None
     if plot:
         from eomc.report.plot import RunCurves, write_figure
@@ -177,7 +178,7 @@ def run_command(arguments: RunArguments) -> None:
         say(json.dumps(summary, indent=1))
     elif not arguments.quiet:
         _print_summary(module, run, balance, summary)
-    complete = run.status in ("ok", "accumulated") and not run._broken
+    complete = run.status in ("ok", "accumulated") and not run.broken_constraints
     if run.status != "ok":
         say(f"eomc: {run.message}", err=True)
     if interrupted or not complete:
@@ -189,16 +190,16 @@ def _simulate(module: Any, arguments: RunArguments, start: Mapping[str, Any]) ->
 
     start: arguments of `simulate` for the parameters, the initial state and the inputs.
     """
-    from eomc.runtime.stability import beyond_end
+    from eomc.runtime.requests import beyond_end
 
-    h, method, tol, model = arguments.h, arguments.method, arguments.tol, module._model
+    h, method, tol, model = arguments.h, arguments.method, arguments.tol, model_of(module)
     beyond_stability = beyond_duration = None
     try:
-        adaptive = model.tolerance and h is None and method is None
+        adaptive = model.info.tolerance and h is None and method is None
         if tol is None and method != "auto" and not adaptive:
             beyond_stability = module.advice(**start, h=h, method=method)
-            span = model.duration if arguments.duration is None else arguments.duration
-            beyond_duration = beyond_end(model.h if h is None else h, span)
+            span = model.info.duration if arguments.duration is None else arguments.duration
+            beyond_duration = beyond_end(model.info.h if h is None else h, span)
         with progress_bar("running", arguments.silent) as progress:
             started_at = time.perf_counter()
             with _without_warnings():
@@ -225,7 +226,7 @@ def _with_events(module: ModuleType, arguments: Sequence[str]) -> ModuleType:
     if not events:
         return module
     try:
-        return pipeline.with_events(module._model, events, Path(str(module.__file__)).parent)
+        return pipeline.with_events(model_of(module), events, Path(str(module.__file__)).parent)
     except EomcError as fault:
         raise EomcError(str(fault).replace("simulate(events=)", "--event")) from None
 
@@ -251,7 +252,7 @@ def _overrides(
                 if coordinate in module.coordinates:
                     kind = (
                         "state that jumps set"
-                        if coordinate in module._model.discrete_coordinates
+                        if coordinate in model_of(module).info.discrete_coordinates
                         else kind
                     )
                     remedy = f", but a {kind}: --start {name}={value:g}"
@@ -358,7 +359,7 @@ def _summary(
     energy, jacobi = run.energy, run.jacobi
     q, qd = run.q[-1] + 0.0, run.qd[-1] + 0.0  # no -0
     return {
-        "scene": module._model.name,
+        "scene": model_of(module).info.name,
         "status": run.status,
         "message": run.message,
         "method": run.method,
@@ -381,7 +382,7 @@ def _summary(
         "error_estimate": _error(run),
         "beyond_stability": simulation.beyond_stability,
         "beyond_duration": simulation.beyond_duration,
-        "remark": run._remark if run.status == "ok" else "",
+        "remark": run.remark if run.status == "ok" else "",
         "seconds": seconds,
         "steps_per_second": run.steps / seconds if seconds else None,
         "files": files,
@@ -407,7 +408,9 @@ def _print_summary(
         unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
         going = (
-            "" if name in module._model.discrete_coordinates else f"   {name}_dot {qd: .9g} {rate}"
+            ""
+            if name in model_of(module).info.discrete_coordinates
+            else f"   {name}_dot {qd: .9g} {rate}"
         )
         say(f"  {name:{wide}} {q: .9g} {unit}{going}".rstrip())
     _print_energy(run, balance, summary)

@@ -17,16 +17,18 @@ from eomc.integrators.tableaux import METHODS, Method
 from eomc.runtime.package import CONSTRAINED
 from eomc.scene.formulas import fold_values, parse
 
-FUNCTIONS = (
-    "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
-    "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
-    "simulate_batch step step_batch tau"
-).split()
+FUNCTIONS = {  # public functions of each package, by the part of `runtime.model.Model`
+    "functions": "C D acceleration applied bias energy g jacobi kinetic_energy limits linearize "
+    "output potential_energy power rhs sensitivity signal tau".split(),
+    "integrator": "advice discretize simulate step".split(),
+    "statics": ["equilibrium"],
+}
 OPTIONAL = {  # functions by the option that brings them
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics", "drive_forces"),
     "momentum": ("momentum",),
 }
+_FRAMES = (*OPTIONAL["frames"], "inverse_dynamics", "momentum")  # functions of `Model.frames`
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ class FaceView:
     discrete
         Number of discrete coordinates that are parameters set by state jumps.
     functions
-        Names of the model's public functions in the package.
+        Public functions of the package: attributes of the model, such as "functions.D", by name.
     optional
         Option of [run] and the functions that it would add, for options that are off.
     from_python
@@ -244,7 +246,7 @@ class FaceView:
     reactions: tuple[str, ...]
     batch: bool
     methods: tuple[Method, ...]
-    functions: tuple[str, ...]
+    functions: Mapping[str, str]
     optional: tuple[tuple[str, tuple[str, ...]], ...]
     from_python: bool
 
@@ -256,7 +258,7 @@ class StubView:
     TEMPLATE: ClassVar[str] = "python/stub.pyi"
     stamp: tuple[FreeText, ...]
     batch: bool
-    functions: tuple[str, ...]
+    functions: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -510,11 +512,20 @@ def stub_view(target: Target) -> StubView:
     return StubView(tuple(stamp(target)), target.system.run.batch, _functions(target))
 
 
-def _functions(target: Target) -> tuple[str, ...]:
-    """Return the sorted names of the model's public functions in the Python package."""
+def _functions(target: Target) -> dict[str, str]:
+    """Return the public functions of the Python package: attributes of the model by name.
+
+    They are sorted by name. An attribute is a path, such as "functions.D" for the function D.
+    """
     s, run = target.system, target.system.run
-    functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
-    functions += CONSTRAINED if s.constraints else ()
-    functions += ["reactions"] if s.reactions else ()
-    functions += [n for key, names in OPTIONAL.items() if getattr(run, key) for n in names]
-    return tuple(sorted(functions))
+    functions = {name: f"{part}.{name}" for part, names in FUNCTIONS.items() for name in names}
+    functions["load_run"] = "load_run"
+    if run.batch:
+        functions |= {name: f"batch.{name}" for name in ("simulate_batch", "step_batch")}
+    constrained = (*(CONSTRAINED if s.constraints else ()), *(["reactions"] if s.reactions else ()))
+    functions |= {name: f"constraints.{name}" for name in constrained}
+    for option, names in OPTIONAL.items():
+        if getattr(run, option):
+            parts = {name: "frames" if name in _FRAMES else "statics" for name in names}
+            functions |= {name: f"{part}.{name}" for name, part in parts.items()}
+    return dict(sorted(functions.items()))

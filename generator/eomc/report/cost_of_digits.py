@@ -33,8 +33,9 @@ from eomc.model.nonsmooth import nonsmooth_functions
 from eomc.model.system import System
 from eomc.report import reference_solution
 from eomc.report.reference_solution import ReferenceSolution
-from eomc.runtime.growth import growth as growth_factor
-from eomc.runtime.growth import mean_mass_matrix, norm_root
+from eomc.runtime.estimate import growth as growth_factor
+from eomc.runtime.estimate import mean_mass_matrix, norm_root
+from eomc.runtime.package import model_of
 from eomc.verify.reference import Vector
 
 Complex = NDArray[np.complex128]
@@ -275,7 +276,7 @@ def measure(
     for k, name in enumerate(module.methods):
         progress(k + 2, total)
         lines.append(_line(module, baseline, name, values, system.run.duration, longest))
-    if module._model.tolerance:
+    if model_of(module).info.tolerance:
         lines.append(_adaptive(module, baseline, system.run.duration, longest))
     progress(total, total)
     points = [p for line in lines for p in line.points]
@@ -564,7 +565,7 @@ def compute_spectrum(
 
 def _project(module: ModuleType, x: Vector, t: float) -> Vector:
     """Project the state x = [q; q̇] onto the constraints, if the module has any."""
-    if not module._model.constraint_names:
+    if not model_of(module).info.constraints.names:
         return x
     n = len(x) // 2
     return np.hstack(module.project(x[:n], x[n:], t=t))

@@ -140,13 +140,13 @@ def _motion(system: System, report: WorkPrecisionReport, root: Path) -> tuple[Ma
     )
     finer = max(1, math.ceil(MIN_ROWS / best.steps))  # enough rows for smooth curves
     if best.adaptive:
-        run = module.simulate(tol=best.tol, duration=report.duration)._drawn
+        run = module.simulate(tol=best.tol, duration=report.duration).curve_run
         caption = f"By steps that fit a tolerance of {best.tol:.0e}"
     else:
         h, steps = best.h / finer, best.steps * finer
         run = module.simulate(h=h, steps=steps, method=best.method)
         caption = f"By {best.method}, h = {run.h:.3g} s"
-    balance = run.balance().words if run._model.has_power else ""
+    balance = run.balance().words if run.model.functions.has_power else ""
     figure = plot.make_figure(system, plot.RunCurves.from_run(run, balance), " ")
     if best.adaptive or finer == 1:
         caption += f", within {best.along:.1g} of the reference solution"

@@ -71,9 +71,9 @@ class RunCurves:
 
         balance: the energy balance of the run in words.
         """
-        drawn, model = run._drawn, run._model
-        jacobi = drawn.jacobi if model.has_jacobi else None
-        inputs = dict(zip(model.inputs, drawn.u.T, strict=True)) if model.inputs else {}
+        drawn, model = run.curve_run, run.model
+        jacobi = drawn.jacobi if model.functions.has_jacobi else None
+        inputs = dict(zip(model.info.inputs, drawn.u.T, strict=True)) if model.info.inputs else {}
         return cls(drawn.t, drawn.q, drawn.qd, drawn.energy, jacobi, drawn.outputs, inputs, balance)
 
     def thin(self, every: int) -> RunCurves:

@@ -80,7 +80,7 @@ class Timeline:
         run = self.run
         if not (hasattr(run, "_evenly") and len(run) > 1 and run.t[-1] > run.t[0]):
             return False
-        self.run = run._evenly(count)
+        self.run = run.resample(count)
         self.t = np.asarray(self.run.t, dtype=float)
         return True
 
@@ -131,9 +131,11 @@ class BatchTimeline(Timeline):
         numbers = choose_instances(len(batch), chosen)
         super().__init__(system, select_instances(batch, numbers))
         self.names = tuple(names) or self._default()
-        table = np.broadcast_to(self.run._params, (len(numbers), len(system.parameters)))
+        table = np.broadcast_to(self.run.parameter_values, (len(numbers), len(system.parameters)))
         self.systems = [
-            system.with_parameters(dict(zip(batch._model.parameters, map(float, row), strict=True)))
+            system.with_parameters(
+                dict(zip(batch.model.info.parameters, map(float, row), strict=True))
+            )
             for row in table
         ]
         self.key = tuple(
@@ -143,7 +145,7 @@ class BatchTimeline(Timeline):
         self.q = _hold_last_finite(np.asarray(self.run.q, dtype=float))
 
     def _default(self) -> tuple[str, ...]:
-        coordinates: tuple[str, ...] = self.run._model.coordinates
+        coordinates: tuple[str, ...] = self.run.model.info.coordinates
         return (
             (*coordinates, "energy") if len(coordinates) < MAX_PANELS else coordinates[:MAX_PANELS]
         )
@@ -193,22 +195,22 @@ def find_system(run: Any, scene: Source | None = None) -> System:
     EomcError
         If the scene is unknown, or is not the one that the module was built from.
     """
-    model = run._model
+    model = run.model
     source = model.source if scene is None else scene
     if source is None:
         raise EomcError(
-            f"{model.name}: was imported without its scene, which says what is drawn: load it "
+            f"{model.info.name}: was imported without its scene, which says what is drawn: load it "
             "with eomc.load, or give scene=PATH"
         )
     system = source if isinstance(source, System) else pipeline.read(source)
-    if system.digest != model.digest:
+    if system.digest != model.info.digest:
         where = texts.line(system.file) or system.name
         raise EomcError(
-            f"{where}: is not the scene that {model.name} was built from, or has changed since: "
-            "load it again with eomc.load"
+            f"{where}: is not the scene that {model.info.name} was built from, or has changed "
+            "since: load it again with eomc.load"
         )
-    values = np.atleast_2d(run._params)[0]
-    return system.with_parameters(dict(zip(model.parameters, map(float, values), strict=True)))
+    values = np.atleast_2d(run.parameter_values)[0]
+    return system.with_parameters(dict(zip(model.info.parameters, map(float, values), strict=True)))
 
 
 def choose_instances(count: int, chosen: int | Sequence[int]) -> list[int]:
@@ -257,7 +259,7 @@ def _hold_last_finite(q: Array) -> Array:
 def _instance_label(k: int, table: Array, row: int, run: Any, system: System) -> str:
     """Return the number of an instance, the parameters that differ, and its status if not "ok"."""
     varying = np.flatnonzero(np.ptp(table, axis=0) > 0)
-    units: Mapping[str, str] = run._model.units
+    units: Mapping[str, str] = run.model.info.units
     names = [p.name for p in system.parameters]
     labels = [
         f"{names[j]} = {table[row, j]:.4g} {units.get(names[j], '')}".rstrip()

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .adaptive_arguments import MIN_TOLERANCE
-from .adaptive_trajectory import AdaptiveTrajectory
 from .arguments import Array
-from .estimate import Estimate, growth_of, moving_mask, rounding_words, scales
-from .growth import mean_mass_matrix
-from .input_schedule import ZeroOrderHold
+from .estimate import Estimate, growth_of, mean_mass_matrix, moving_mask, rounding_words, scales
+from .inputs import ZeroOrderHold
+from .requests import MIN_TOLERANCE, AdaptiveRequest
 from .status import FULL, REMEDY
 
 GAUSS16_ORDER = 16
@@ -41,7 +39,7 @@ _MAX_STEP_RATIO = 100  # limit of the steps of a run from a perturbed start, rel
 
 
 def error_by_tighter_tolerance(
-    own: AdaptiveTrajectory, run: Callable[..., AdaptiveTrajectory],
+    own: Any, run: Callable[[Any, AdaptiveRequest], Any],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
     """Estimate the error of an adaptive run, or of a run with fixed steps and events.
@@ -55,7 +53,7 @@ def error_by_tighter_tolerance(
 
     Parameters
     ----------
-    own : AdaptiveTrajectory
+    own : Any
         The run whose error is estimated.
     run : callable
         The function `adaptive.run`, by which the run is repeated.
@@ -69,16 +67,16 @@ def error_by_tighter_tolerance(
     """
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
-    model, again = own._model, _Rerun(own, run, progress)
-    x, begin = again.x, np.ravel(own._begin).astype(float)
-    eps, least = float(np.finfo(model.dtype).eps) / 2, MIN_TOLERANCE[model.dtype.itemsize]
-    scale = scales(x, float(np.ptp(own.t)), eps, len(model.discrete_coordinates))
+    model, again = own.model, _Rerun(own, run, progress)
+    x, begin = again.x, np.ravel(own.initial_state).astype(float)
+    eps, least = float(np.finfo(model.info.dtype).eps) / 2, MIN_TOLERANCE[model.info.dtype.itemsize]
+    scale = scales(x, float(np.ptp(own.t)), eps, len(model.info.discrete_coordinates))
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
     finer, other = again.finer(begin, least)
-    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving_mask(model)
+    modes, moves = np.array(model.info.constraints.modes, int).reshape(-1, 2), moving_mask(model)
     # nor are the velocities of sticking friction perturbed
-    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0
+    moves[model.info.nq + modes[:, 1]] = begin[modes[:, 0]] != 0
     x = x[again.beside]
 
     base = again.curve()
@@ -91,7 +89,7 @@ def error_by_tighter_tolerance(
         """
         # the perturbed motion may differ, so its steps are limited
         most = _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
-        return again.states(tol, begin + nudge, own._h_most, most) - base
+        return again.states(tol, begin + nudge, own.h_most, most) - base
 
     differences = [moved(moves * size * scale * signs)]
     rows = _filled(np.abs(again.at_rows(differences[0]))) / size
@@ -101,32 +99,34 @@ def error_by_tighter_tolerance(
         left[-1] = np.abs(x[-1] - events.end)
     elif not events.stops:
         left[-1] = np.inf
-    if len(own._event_data[0]) or (left > _UNRESOLVED_ERROR * scale).any():
+    if len(own.event_data[0]) or (left > _UNRESOLVED_ERROR * scale).any():
         # motion between jumps may be exact for any tolerance; then only rounding errors matter
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
         if full.any():  # the first perturbation is too large for a linear estimate
             little = moves * _PERTURBATION_ROUNDINGS * eps * scale * signs
-            nearest = again.states(least, begin, own._h_most)
+            nearest = again.states(least, begin, own.h_most)
             differences.append(moved(little, least, nearest))
             near = _filled(np.abs(again.at_rows(differences[1]))) / (_PERTURBATION_ROUNDINGS * eps)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
-    exact = [*modes[:, 0], *(model.nq + modes[:, 0])]
+    exact = [*modes[:, 0], *(model.info.nq + modes[:, 0])]
     for some in (left, rounding):
         some[:, exact] = some[own.t == own.t0] = 0.0
     error = np.maximum(left, rounding)
     amplification = growth_of(
-        model, mean_mass_matrix(model, base[:, : model.nq], again.times, own._params),
+        model, mean_mass_matrix(model, base[:, : model.info.nq], again.times, own.parameter_values),
         [_finite(x) for x in differences], float(np.ptp(own.t)), moves,
-        (begin, own.t0, own._params), lambda nudge: _finite(moved(nudge)),
+        (begin, own.t0, own.parameter_values), lambda nudge: _finite(moved(nudge)),
     )  # fmt: skip
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
-    names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
+    names = [*model.info.coordinates, *(f"{c}_dot" for c in model.info.coordinates)]
     end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
+    method = own.fixed_method
+    order = model.info.method_table[method].order if method else GAUSS16_ORDER
     return Estimate(
-        error[:, : model.nq], error[:, model.nq :], end, right,
-        model.orders[own._by] if own._by else GAUSS16_ORDER, float("nan"),
+        error[:, : model.info.nq], error[:, model.info.nq :], end, right,
+        order, float("nan"),
         amplification, _verdict(own, left / scale, rounding / scale, amplification, events),
         events.errors, events.missed,
     )  # fmt: skip
@@ -137,12 +137,16 @@ class _Rerun:
 
     def __init__(
         self,
-        own: AdaptiveTrajectory,
-        run: Callable[..., AdaptiveTrajectory],
+        own: Any,
+        run: Callable[[Any, AdaptiveRequest], Any],
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.own, self.run, self.progress = own, run, progress
-        self.u: Any = ZeroOrderHold(own._u, own._period, own._periods) if own._period else own._u
+        self.u: Any = (
+            ZeroOrderHold(own.given_inputs, own._period, own._periods)
+            if own._period
+            else own.given_inputs
+        )
         self.x = own.x.astype(float)
         # a row at a jump may be on either side of the jump in another run
         jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
@@ -153,7 +157,7 @@ class _Rerun:
     def __call__(
         self, tol: float, start: Array, h_most: float, steps: float = np.inf,
         end: float | None = None,
-    ) -> tuple[Array, AdaptiveTrajectory | None]:  # fmt: skip
+    ) -> tuple[Array, Any]:  # fmt: skip
         """Repeat the run; return the new states at the rows of the original run, and the new run.
 
         tol: tolerance. start: initial state [q; qd]. h_most: longest step, s, or size of fixed
@@ -162,29 +166,30 @@ class _Rerun:
         no row. A row at a jump gets the state of the last row before that is not at a jump.
         """
         own = self.own
-        out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
+        out, start = np.full_like(self.x, np.nan), start.astype(own.model.info.dtype)
         out[own.t == own.t0] = start
         if not len(self.kept):
             return out[self.beside], None
         to = float(own.t[-1]) if end is None else end
-        rerun = self._rerun(tol, start, h_most, steps, to, own.t[self.kept])
+        rerun = self.rerun(tol, start, h_most, steps, to, own.t[self.kept])
         out[self.kept[: len(rerun)]] = rerun.x
         self._end(out, rerun)
         return out[self.beside], rerun
 
-    def _rerun(
+    def rerun(
         self, tol: float, start: Array, h_most: float, steps: float, end: float, times: Array
-    ) -> AdaptiveTrajectory:
-        own, nq = self.own, self.own._model.nq
-        rerun = self.run(
-            own._model, start[:nq], start[nq:], own.t0, end, tol, times.astype(own._model.dtype),
-            self.u, own._params, h_most, self.progress, own._stiff, steps, own._by,
+    ) -> Any:
+        own, nq = self.own, self.own.model.info.nq
+        request = AdaptiveRequest(
+            start[:nq], start[nq:], own.t0, end, tol, times.astype(own.model.info.dtype), self.u,
+            own.parameter_values, h_most, own.stiff, own.fixed_method, steps, self.progress,
         )  # fmt: skip
+        rerun = self.run(own.model, request)
         if rerun.status == "interrupted":
             raise KeyboardInterrupt
         return rerun
 
-    def _end(self, rows: Array, rerun: AdaptiveTrajectory) -> None:
+    def _end(self, rows: Array, rerun: Any) -> None:
         """Set the last row to the final state of the rerun if the same event ends both runs."""
         own = self.own
         if own.stopped and rerun.stopped == own.stopped and own.t[-1] == self.reached:
@@ -207,7 +212,7 @@ class _Rerun:
         """Return the states [q; qd] of the original run at `times`, (m, 2 nq)."""
         if len(self.kept) < _MIN_CURVE_ROWS:
             return np.concatenate(self.own(self.times), axis=1).astype(float)
-        return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
+        return np.concatenate([np.ravel(self.own.initial_state)[None], self.x[self.kept]])
 
     def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
         """Repeat the run from another start and return its states [q; qd] at `times`, (m, 2 nq).
@@ -217,11 +222,11 @@ class _Rerun:
         steps: number of steps after which the new run ends early. States after an early end are
         nan.
         """
-        own, start, times = self.own, start.astype(self.own._model.dtype), self.times
+        own, start, times = self.own, start.astype(self.own.model.info.dtype), self.times
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
         if len(times) > 1:
-            rerun = self._rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
+            rerun = self.rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
             out[1 : 1 + len(rerun)] = rerun.x
             self._end(out, rerun)
         return out
@@ -237,7 +242,7 @@ class _Rerun:
         out[self.kept] = states[np.searchsorted(self.times, self.own.t[self.kept].astype(float))]
         return np.asarray(out[self.beside])
 
-    def finer(self, begin: Array, least: float) -> tuple[Array, AdaptiveTrajectory | None]:
+    def finer(self, begin: Array, least: float) -> tuple[Array, Any]:
         """Repeat the run with a tighter tolerance and shorter steps, as the reference run.
 
         Return the states of the new run at the rows of the original run, (n, 2 nq), and the new run
@@ -252,7 +257,7 @@ class _Rerun:
         rows, rerun = self(tol, begin, shorter, end=end)
         if own.status == "ok" and rerun is not None and rerun.status not in COMPLETE_STATUSES:
             # this run had too short steps near singular positions
-            rows, rerun = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
+            rows, rerun = self(tol, begin, own.h / 2 if own.fixed_method else own.h_most, end=end)
         return rows, rerun
 
 
@@ -276,9 +281,7 @@ class _Events:
     end: Array | None
 
     @classmethod
-    def compare(
-        cls, own: AdaptiveTrajectory, other: AdaptiveTrajectory | None, left: Array, scale: Array
-    ) -> _Events:
+    def compare(cls, own: Any, other: Any | None, left: Array, scale: Array) -> _Events:
         """Pair the events of a run with those of a reference run and return their differences.
 
         Events are compared up to the time at which the states of the two runs differ by a tenth of
@@ -290,7 +293,7 @@ class _Events:
         the states of both runs at the rows, (n, 2 nq). scale: magnitude of the motion in each
         state, (2 nq,).
         """
-        names = own._model.events
+        names = own.model.info.events
         if other is None or not names:
             return cls({}, {}, {}, True, None)
         reached, came = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
@@ -313,7 +316,7 @@ class _Events:
         )
         until = min(until, *whole, np.inf)
         # sticking of friction is a part of the state; its error is one of the state
-        coordinates = (own._model.coordinates[k] for _, k in own._model._rows.modes)
+        coordinates = (own.model.info.coordinates[k] for _, k in own.model.info.constraints.modes)
         stick = {f"{c}_{what}" for c in coordinates for what in ("stops", "slips")}
         errors, missed, false = {}, {}, {}
         for name in names:
@@ -339,13 +342,13 @@ class _Events:
             None if event is None else np.concatenate([event.q[-1], event.qd[-1]]).astype(float),
         )
 
-    def words(self, own: AdaptiveTrajectory) -> list[str]:
+    def words(self, own: Any) -> list[str]:
         """Return phrases on events of the run `own` that were missed or falsely detected.
 
         The list is empty if the events of both runs agree.
         """
         finer, remedy = "shorter steps", "a smaller h"
-        if not own._by:
+        if not own.fixed_method:
             finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"
         messages = []
         if self.missed:
@@ -383,17 +386,17 @@ def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
     return np.flatnonzero(mutual), at[mutual]
 
 
-def _finer(own: AdaptiveTrajectory, least: float) -> tuple[float, float]:
+def _finer(own: Any, least: float) -> tuple[float, float]:
     """Return the tolerance and the longest step, s, of the reference run.
 
     For fixed steps, these are the tolerance of the run and h / 4. If the tolerance cannot be
     reduced, a larger one leads to other steps with other rounding errors. least: smallest
     tolerance of the module.
     """
-    if own._by:
+    if own.fixed_method:
         return own.tol, own.h / 4
     tol = max(own.tol / _TOLERANCE_RATIO, least) if own.tol >= 2 * least else 4 * least
-    longest = (own.h / 2, float(np.ptp(own.t)) / _MIN_REFERENCE_STEPS, own._h_most)
+    longest = (own.h / 2, float(np.ptp(own.t)) / _MIN_REFERENCE_STEPS, own.h_most)
     return tol, min((h for h in longest if h > 0), default=0.0)
 
 
@@ -413,9 +416,7 @@ def _filled(rows: Array) -> Array:
     return filled
 
 
-def _verdict(
-    own: AdaptiveTrajectory, left: Array, rounding: Array, amplification: float, events: _Events
-) -> str:
+def _verdict(own: Any, left: Array, rounding: Array, amplification: float, events: _Events) -> str:
     """Return the reasons why the run is not resolved as text; "" if there is none.
 
     left, rounding: difference from the reference run and rounding error at the rows, (n, 2 nq),
@@ -427,11 +428,11 @@ def _verdict(
     words += (event_messages := events.words(own))
     lost, wrong = (np.asarray((x > _UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
     if lost[-1]:
-        words.append(rounding_words(own._model, amplification, float(own.t[np.argmax(lost)])))
+        words.append(rounding_words(own.model, amplification, float(own.t[np.argmax(lost)])))
     if wrong.any() and not (event_messages and np.isinf(left[wrong]).all()):
         row = int(np.argmax(wrong))
         words.append(
             f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "
-            f"{'smaller h' if own._by else 'tighter tolerance'}, or a shorter duration"
+            f"{'smaller h' if own.fixed_method else 'tighter tolerance'}, or a shorter duration"
         )
     return "; ".join(words)

@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import isfinite
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .package import Defaults, initial_value_message, reduced, suggestion
+from .c_library import CLibrary
+from .info import SceneInfo
+from .package import initial_value_message, reduced, suggestion
 
 Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
@@ -68,7 +70,9 @@ class Params:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # also used by copy
-        return reduced("_model._create_params", dict(zip(self._names, self._values(), strict=True)))
+        return reduced(
+            "_model.arguments.create_params", dict(zip(self._names, self._values(), strict=True))
+        )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Params):
@@ -87,91 +91,43 @@ class Params:
 
 
 class Arguments:
-    """Names and dimensions of a compiled scene, and methods that convert arguments for C.
+    """Conversion of the arguments of a compiled scene to arrays and pointers for C.
+
+    info: facts about the scene. c: its compiled functions.
 
     Attributes
     ----------
-    name, title : str
-        Name and title of the scene.
-    digest : str
-        Hash of the content of the scene.
-    dtype : numpy.dtype
-        Number type of the module, float64 or float32.
-    coordinates, inputs, parameters, outputs : tuple of str
-        Names, in the order of the arrays.
-    defaults : Mapping
-        Value of each parameter in the scene, by name.
-    units : dict of str
-        Unit of each quantity, by the name of the quantity.
-    nq, nu : int
-        Numbers of coordinates and of inputs.
+    default_pointers : tuple
+        Pointers to the positions, velocities and parameters of the scene.
+    Params : type
+        Class of the scene's parameters, a subclass of `Params`.
     """
 
-    _follows: Mapping[str, str] = {}  # initial values that are formulas of parameters
-
-    def __init__(
-        self, extension: Any, *, name: str, title: str, dtype: str,
-        coordinates: Mapping[str, str], parameters: Mapping[str, float],
-        inputs: Mapping[str, str], outputs: Sequence[str], units: Mapping[str, str],
-        start: tuple[Sequence[float], Sequence[float]], digest: str,
-        frames: Sequence[str] = (), plane: bool = False, follows: Mapping[str, str] | None = None,
-    ) -> None:  # fmt: skip
-        # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
-        self._ffi, self._lib = extension.ffi, extension.lib
-        real = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
-        # for any call: address(real, array), and the null pointer
-        self._c = (self._ffi.from_buffer, real, self._ffi.NULL)
-        self.name, self.title, self.digest = name, title, digest
-        self.dtype = np.dtype(dtype)
-        self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
-        self.parameters, self.outputs = tuple(parameters), tuple(outputs)
-        self._frames = tuple(frames), plane
-        self.defaults = Defaults(parameters)
-        self.units = dict(units)
-        self.nq, self.nu = len(self.coordinates), len(self.inputs)
-        self._shape = (self.nq,) if self.nq <= _MAX_LIST_NUMBERS else None  # of a small state
-        self._start = (self._constant(start[0]), self._constant(start[1]))
-        self._p0 = self._constant(tuple(parameters.values()))
-        self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
-        self._functions: dict[str, Any] = {}  # by name: C function, shape, whether it reads qd
-        if follows:
-            self._follows = follows
+    def __init__(self, info: SceneInfo, c: CLibrary) -> None:
+        self.info, self.c, self.dtype, self.nq = info, c, info.dtype, info.nq
+        # shape of a state that is small enough for lists of numbers
+        self.small_shape = (info.nq,) if info.nq <= _MAX_LIST_NUMBERS else None
+        self.default_pointers = tuple(c.pointer(x) for x in (*info.initial_state, info.p0))
         names = {
-            "_names": self.parameters,
-            "_defaults": tuple(parameters.values()),
-            "_dtype": dtype,
+            "_names": info.parameters,
+            "_defaults": tuple(info.defaults.values()),
+            "_dtype": info.dtype.name,
             "__module__": str(__package__).rpartition(".")[0],  # where pickle finds the class
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 
-    def _create_params(self, values: Mapping[str, float]) -> Any:
+    def create_params(self, values: Mapping[str, float]) -> Any:
+        """Return `Params` with these values by name; an unpickled `Params` is created by it."""
         return self.Params(**values)
 
-    @property
-    def start(self) -> tuple[Array, Array]:
-        """Return copies of the scene's initial positions q and velocities qd, (nq,) each."""
-        q, qd = self._start
-        return q.copy(), qd.copy()
-
-    def _bytes(self, rows: int) -> int:
-        """Return the size in bytes of q and qd of `rows` rows."""
-        return rows * 2 * self.nq * self.dtype.itemsize
-
-    def _constant(self, values: Sequence[float]) -> Array:
-        array = np.array(values, self.dtype)
-        array.flags.writeable = False
-        return array
-
-    def _pointer(self, array: Array | None) -> Any:
-        address, real, null = self._c
-        return null if array is None else address(real, array)
-
-    def _input_pointers(self, u: Any, params: Any) -> tuple[Any, Any]:
+    def input_pointers(self, u: Any, params: Any) -> tuple[Any, Any]:
         """Return the pointers to inputs and parameters."""
-        inputs = self._c[2] if u is None else self._pointer(self._inputs(u))
-        return inputs, self._at[2] if params is None else self._pointer(self._parameters(params))
+        inputs = self.c.null if u is None else self.c.pointer(self.inputs(u))
+        return inputs, self.default_pointers[2] if params is None else self.c.pointer(
+            self.parameters(params)
+        )
 
-    def _listed(self, x: Any, shape: tuple[int | None, ...] | None) -> Any:
+    def as_list(self, x: Any, shape: tuple[int | None, ...] | None) -> Any:
         """Return x as a list, which C takes fastest; None if x needs further checks."""
         if type(x) is ndarray and x.dtype is self.dtype and x.shape == shape:
             numbers = x.tolist()
@@ -179,19 +135,19 @@ class Arguments:
                 return numbers
         return None
 
-    def _read(self, q: Any, qd: Any, many: bool = True) -> tuple[Any, Any, Array, Array]:
+    def read_state(self, q: Any, qd: Any, many: bool = True) -> tuple[Any, Any, Array, Array]:
         """Return what C reads q and qd from, of one or many states, and q and qd as arrays."""
         if (
-            type(q) is type(qd) is ndarray and q.shape == qd.shape == self._shape
+            type(q) is type(qd) is ndarray and q.shape == qd.shape == self.small_shape
             and q.dtype is qd.dtype is self.dtype
         ):  # fmt: skip
             from_q, from_qd = q.tolist(), qd.tolist()
             if isfinite(sum(from_q) + sum(from_qd)):
                 return from_q, from_qd, q, qd
-        at, moving = self._state(q, qd, many)
-        return self._pointer(at), self._pointer(moving), at, moving
+        at, moving = self.state(q, qd, many)
+        return self.c.pointer(at), self.c.pointer(moving), at, moving
 
-    def _numbers(self, value: ArrayLike, name: str) -> Array:
+    def numbers(self, value: ArrayLike, name: str) -> Array:
         """Return a C-contiguous, aligned array of the module's precision, of any shape."""
         if not isinstance(value, list):
             without_mask(value, name)
@@ -201,7 +157,7 @@ class Arguments:
                 raise TypeError
             return aligned(np.ascontiguousarray(array, self.dtype))
         except (TypeError, ValueError, OverflowError):
-            order = f": give them in order, {', '.join(self.coordinates)}"
+            order = f": give them in order, {', '.join(self.info.coordinates)}"
             remedy = order if isinstance(value, Mapping) else ""
             parts = value if isinstance(value, (list, tuple)) else [value]
             if callable(value) and name == "u":
@@ -210,12 +166,12 @@ class Arguments:
                 remedy = ": one function u(t, q, qd) gives all inputs, in order or as a dict"
             raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
 
-    def _array(self, value: ArrayLike, name: str, width: int, many: bool = True) -> Array:
+    def array(self, value: ArrayLike, name: str, width: int, many: bool = True) -> Array:
         """Return an array of finite numbers, (width,), or also (n, width) if `many`."""
         if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
             array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
-            array = self._numbers(value, name)
+            array = self.numbers(value, name)
         if (
             array.ndim == 1
             and array.size == width <= _MAX_LIST_NUMBERS
@@ -227,7 +183,7 @@ class Arguments:
             rates = array.shape == (2 * self.nq,) and name in ("q", "q0")
             raise ValueError(
                 f"{name}: {description}, expected ({width},){f' or (n, {width})' * many}: "
-                f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
+                f"{', '.join(self.info.inputs if name == 'u' else self.info.coordinates)}"
                 f"{'; velocities go to qd' + name[1:] if rates else ''}"
             )
         if array.size <= _MAX_LIST_NUMBERS and isfinite(sum(array.ravel().tolist())):
@@ -239,31 +195,34 @@ class Arguments:
             raise ValueError(f"{name}{place}: {array[tuple(place)]} in {self.dtype} is not finite")
         return array
 
-    def _state(self, q: ArrayLike, qd: ArrayLike, many: bool = True) -> tuple[Array, Array]:
-        at, moving = (self._array(x, n, self.nq, many) for x, n in ((q, "q"), (qd, "qd")))
+    def state(self, q: ArrayLike, qd: ArrayLike, many: bool = True) -> tuple[Array, Array]:
+        """Return positions and velocities as arrays of the same shape, (nq,) or (n, nq)."""
+        at, moving = (self.array(x, n, self.nq, many) for x, n in ((q, "q"), (qd, "qd")))
         if at.shape != moving.shape:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
 
-    def _checked_half(self, x0: Any, name: str) -> tuple[Array, Any]:
+    def initial_half(self, x0: Any, name: str) -> tuple[Array, Any]:
         """Return q0 or qd0, (nq,), as an array and what C reads it from."""
-        if (numbers := self._listed(x0, self._shape)) is not None:
+        if (numbers := self.as_list(x0, self.small_shape)) is not None:
             return x0, numbers  # _listed accepts arrays only
-        x = self._numbers(x0, name)
+        x = self.numbers(x0, name)
         if x.ndim == 2 and x.shape[1] == self.nq:
             raise ValueError(
                 f"{name}: shape {x.shape}, expected one state, ({self.nq},): "
-                f"{', '.join(self.coordinates)}; simulate_batch takes many"
+                f"{', '.join(self.info.coordinates)}; simulate_batch takes many"
             )
-        x = self._array(x0, name, self.nq, many=False)
-        return x, self._pointer(x)
+        x = self.array(x0, name, self.nq, many=False)
+        return x, self.c.pointer(x)
 
-    def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
-        return self._state(q, qd, many=False)
+    def one_state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
+        """Return positions and velocities of one state as arrays (nq,)."""
+        return self.state(q, qd, many=False)
 
-    def _parameters(self, params: Any) -> Array:
+    def parameters(self, params: Any) -> Array:
+        """Return all parameters as an array (np,): the given values, else those of the scene."""
         if params is None:
-            return self._p0
+            return self.info.p0
         if isinstance(params, self.Params):
             values: Array = params._array
             return values
@@ -272,61 +231,62 @@ class Arguments:
         if isinstance(params, Mapping):
             complete = self.Params()
             for name, value in by_name(params).items():
-                if name in self.coordinates:
+                if name in self.info.coordinates:
                     raise ValueError(f"params: {initial_value_message(self, name)}")
-                complete._set(name, value)
+                setattr(complete, name, value)
             return np.asarray(complete._array)
         without_mask(params, "params")
         try:
-            array = self._numbers(params, "params")
+            array = self.numbers(params, "params")
         except ValueError:
             array = empty(0, self.dtype)
-        if array.shape != self._p0.shape or not np.isfinite(array).all():
-            if not self.parameters:
+        if array.shape != self.info.p0.shape or not np.isfinite(array).all():
+            if not self.info.parameters:
                 raise ValueError("params: this scene has no parameters")
             raise ValueError(
-                f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
-                f"{', '.join(self.parameters)}"
+                f"params: expected a dict, Params or {len(self.info.p0)} finite numbers in the "
+                "order "
+                f"{', '.join(self.info.parameters)}"
             )
         return array
 
-    def _parameter_rows(self, params: Any) -> Array:
+    def parameter_rows(self, params: Any) -> Array:
         """Return parameters of many states or instances, (n, np), or (1, np) if they are equal."""
         if params is None or isinstance(params, Params):
-            return self._parameters(params)[None]
+            return self.parameters(params)[None]
         if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
             raise ValueError('params: give one dict of arrays, {"m": [1, 2]}, no list of dicts')
         if not isinstance(params, Mapping):
-            array = self._numbers(params, "params")
-            if array.ndim == 2 and array.shape[1] == len(self.parameters):
+            array = self.numbers(params, "params")
+            if array.ndim == 2 and array.shape[1] == len(self.info.parameters):
                 return _finite(array, "params: not all numbers are finite: {}")
-            return self._parameters(params)[None]
+            return self.parameters(params)[None]
         params = by_name(params)
         sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
         count = max(sizes.values(), default=1)
-        table = np.tile(self._p0, (count, 1))
+        table = np.tile(self.info.p0, (count, 1))
         for name, value in params.items():
-            if name not in self.parameters:
-                self._parameters({name: 0.0})  # raises, with the names there are
-            column = self._numbers(value, f"params: {name}")
+            if name not in self.info.parameters:
+                self.parameters({name: 0.0})  # raises, with the names there are
+            column = self.numbers(value, f"params: {name}")
             if np.ndim(value) > 1 or (np.ndim(value) and len(column) != count):
                 raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
             words = f"params: {name} is not finite everywhere: {{}}"
-            table[:, self.parameters.index(name)] = _finite(column, words)
+            table[:, self.info.parameters.index(name)] = _finite(column, words)
         return table
 
-    def _inputs(self, u: Any, many: bool = False) -> Array | None:
+    def inputs(self, u: Any, many: bool = False) -> Array | None:
         """Return inputs (nu,), or also (n, nu) if `many`; None for the scene's signals."""
         if u is None:
             return None
-        if not self.nu:
+        if not self.info.nu:
             raise ValueError("u: this scene has no inputs")
         if type(u) is not ndarray and isinstance(u, Mapping):
-            u = self._by_name(u)
+            u = self.inputs_by_name(u)
         u = u.reshape(1) if type(u) is ndarray and not u.ndim else u
-        return self._array(u, "u", self.nu, many)
+        return self.array(u, "u", self.info.nu, many)
 
-    def _by_name(self, u: Mapping[Any, Any]) -> Array:
+    def inputs_by_name(self, u: Mapping[Any, Any]) -> Array:
         """Return inputs from a dict by name as an array, (..., nu).
 
         All inputs are required: inputs that are constant over a step cannot be mixed with signals,
@@ -334,15 +294,15 @@ class Arguments:
         """
         u = by_name(u)
         for name in u:
-            if name not in self.inputs:
-                raise ValueError(not_one_of("u", name, self.inputs))
-        if missing := [name for name in self.inputs if name not in u]:
+            if name not in self.info.inputs:
+                raise ValueError(not_one_of("u", name, self.info.inputs))
+        if missing := [name for name in self.info.inputs if name not in u]:
             raise ValueError(
                 f"u: no value for {', '.join(missing)}: give all inputs, or None for the signals "
                 "of the scene"
             )
-        columns = [self._numbers(u[name], f"u: {name}") for name in self.inputs]
-        shapes = [np.shape(u[name]) for name in self.inputs]
+        columns = [self.numbers(u[name], f"u: {name}") for name in self.info.inputs]
+        shapes = [np.shape(u[name]) for name in self.info.inputs]
         most = max(map(len, shapes))
         lined = [  # (batch,) beside (batch, steps) is one number a row
             c.reshape(shape + (1,) * (most - len(shape) if shape else 0))
@@ -353,10 +313,26 @@ class Arguments:
         except ValueError:
             raise ValueError(
                 "u: "
-                + ", ".join(f"{n} has shape {s}" for n, s in zip(self.inputs, shapes, strict=True))
+                + ", ".join(
+                    f"{n} has shape {s}" for n, s in zip(self.info.inputs, shapes, strict=True)
+                )
             ) from None
 
-    def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
+    def for_each_state(
+        self, x: ArrayLike, name: str, shape: tuple[int, ...], q: ArrayLike
+    ) -> Array:
+        """Return x as an array with a row for each state; one row is repeated for all."""
+        array, rows = self.numbers(x, name), np.shape(q)[:-1]
+        expected = rows + shape
+        if array.shape not in (expected, shape):
+            raise ValueError(f"{name}: shape {array.shape}, expected {expected}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: not all numbers are finite")
+        full = np.broadcast_to(array, expected).reshape(*rows, -1)
+        return np.ascontiguousarray(full)
+
+    def output_array(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
+        """Return the array `out` of the user if it fits, or a new one if it is None."""
         if out is None:
             return empty(shape, self.dtype)
         without_mask(out, name)
@@ -369,7 +345,7 @@ class Arguments:
         array: Array = out
         return array
 
-    def _movable(self, x: Array, name: str) -> None:
+    def check_writable(self, x: Array, name: str) -> None:
         """Raise ValueError unless C can overwrite these states in place."""
         description = f"a {type(x).__name__}"
         if isinstance(without_mask(x, name), np.ndarray):
@@ -386,13 +362,15 @@ class Arguments:
             f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
         )
 
-    def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    def output_pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Return arrays for positions and velocities: those of `out`, or new ones."""
         if out is None:
             return empty(shape, self.dtype), empty(shape, self.dtype)
         if not isinstance(out, (tuple, list)) or len(out) != 2:
             raise ValueError("out: expected a pair of arrays, (q, qd)")
-        return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
+        return self.output_array(out[0], shape, "out[0]"), self.output_array(
+            out[1], shape, "out[1]"
+        )
 
 
 class StateArguments:
@@ -425,18 +403,18 @@ class StateArguments:
     """
 
     def __init__(
-        self, model: Arguments, rows: tuple[int, ...], t: Any, u: Any, params: Any,
+        self, arguments: Arguments, rows: tuple[int, ...], t: Any, u: Any, params: Any,
         replacement: Array | None = None,
     ) -> None:  # fmt: skip
-        address, real, null = model._c
+        address, real, null = arguments.c.tools
         self.t, self.own, self.u_rows = 0.0, null, None
-        self.times = row_times(model, t, rows)
+        self.times = row_times(arguments, t, rows)
         if self.times is None:
             self.t = as_number(t, "t")
         if u is not None:
-            self.u_rows = model._inputs(u, many=bool(rows))
+            self.u_rows = arguments.inputs(u, many=bool(rows))
             if self.u_rows is not None and self.u_rows.ndim == 2:
-                _check_rows("u", self.u_rows.shape, (*rows, model.nu))
+                _check_rows("u", self.u_rows.shape, (*rows, arguments.info.nu))
         inputs = self.u_rows if replacement is None else replacement
         self.u = null if inputs is None else address(real, inputs)
         u_stride = inputs.shape[-1] if inputs is not None and inputs.ndim == 2 else 0
@@ -446,15 +424,15 @@ class StateArguments:
             for name in [name for name, value in params.items() if np.ndim(value)]:
                 without_mask(params[name], f"params: {name}")
                 _check_rows(f"params: {name}", np.shape(params[name]), rows)
-                p_stride = len(model.parameters)
+                p_stride = len(arguments.info.parameters)
         elif rows and isinstance(params, ndarray) and params.ndim == 2:
-            _check_rows("params", params.shape, (*rows, len(model.parameters)))
-            p_stride = len(model.parameters)
-        table = model._parameter_rows(params) if p_stride else model._parameters(params)
+            _check_rows("params", params.shape, (*rows, len(arguments.info.parameters)))
+            p_stride = len(arguments.info.parameters)
+        table = arguments.parameter_rows(params) if p_stride else arguments.parameters(params)
         self.p = address(real, table)
         self._arrays = inputs, table  # C reads them
         if self.times is not None or u_stride or p_stride:
-            self.own = model._ffi.new("row_strides *", {"u": u_stride, "p": p_stride})
+            self.own = arguments.c.ffi.new("row_strides *", {"u": u_stride, "p": p_stride})
             self._from_t = null if self.times is None else address(real, self.times)
 
     def time(self, k: int) -> float:
@@ -481,7 +459,7 @@ class StateArguments:
         return self.t, u, p, self.own
 
 
-def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
+def row_times(arguments: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
     """Return the times of many states as an array (n,), s, or None if t is a single number.
 
     t: the caller's time or times. rows: shape of the states without the coordinate axis, () for one
@@ -493,7 +471,7 @@ def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
     without_mask(t, "t")
     if np.shape(t) != rows:
         raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
-    return _finite(model._numbers(t, "t"), "t: {} is not a finite number")
+    return _finite(arguments.numbers(t, "t"), "t: {} is not a finite number")
 
 
 def _check_rows(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
@@ -710,3 +688,27 @@ def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> st
     while used < len(parts) and (room := room - len(parts[used]) - 2) >= 0:
         used += 1
     return f"{start}{', '.join([*parts[:used], f'... {len(parts) - used} more'])}{end}"
+
+
+class ByName(dict[str, Any]):
+    """Dict of values by name, whose KeyError for an unknown name lists the known names.
+
+    Parameters
+    ----------
+    what : str
+        What the dict contains, such as "events"; part of the error message.
+    names : sequence of str
+        The known names.
+    values : iterable
+        One value for each name.
+    """
+
+    def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
+        super().__init__(zip(names, values, strict=True))
+        self.what = what
+
+    def __missing__(self, name: object) -> NoReturn:
+        raise KeyError(not_one_of(self.what, str(name), tuple(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)

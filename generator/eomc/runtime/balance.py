@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
+from .interfaces import CompiledModel
 from .package import reduced
-from .stepping import Stepping
 from .trajectory_data import Trajectory
 
 _MAX_ORDER = 8  # of the interpolating polynomials, and so of the quadrature
@@ -87,7 +87,7 @@ class _PowerSamples:
     t : (n,) times, s. q, qd : (n, nq) states. u : (nu,) or (n, nu) inputs; None: the signals.
     """
 
-    model: Stepping
+    model: CompiledModel
     params: Array
     t: Array
     q: Array
@@ -95,7 +95,7 @@ class _PowerSamples:
     u: Array | None
 
     def values(self, function: Callable[..., Any], **inputs: Any) -> Array:
-        """Evaluate a function of the model, such as `model.power`, at all samples: (n, ...).
+        """Evaluate a function of the model, such as `functions.power`, at all samples: (n, ...).
 
         inputs: further arguments of the function, such as u.
         """
@@ -115,13 +115,14 @@ def balance(run: Trajectory) -> Balance | None:
     rows = _rows(run)
     if rows is None:
         return None
-    model, energy = run._model, rows.values(run._model.jacobi)
-    none = np.zeros(model.nu) if model.nu else None
-    power, rest = (rows.values(model.power, u=u) for u in (rows.u, none))
+    model, energy = run.model, rows.values(run.model.functions.jacobi)
+    none = np.zeros(model.info.nu) if model.info.nu else None
+    power, rest = (rows.values(model.functions.power, u=u) for u in (rows.u, none))
     reverse = _velocity_reversal(model)
     forward, backward = (
         rows.values(
-            lambda q, qd, transform=transform, **how: model.tau(*transform(q, qd), **how), u=none
+            lambda q, qd, transform=transform, **how: model.functions.tau(*transform(q, qd), **how),
+            u=none,
         )
         for transform in (lambda q, qd: (q, qd), reverse)
     )
@@ -136,30 +137,30 @@ def balance(run: Trajectory) -> Balance | None:
     jump_energy[jumps] = energy[jumps] - energy[jumps - 1]
     inputs, forces = float(work[-1] - other[-1]), float(other[-1] + lost[-1])
     parts, jump_work = (inputs, forces, float(lost[-1])), np.cumsum(jump_energy)
-    off, rounding = max(off, blur), float(np.finfo(model.dtype).eps * np.max(np.abs(energy)))
+    off, rounding = max(off, blur), float(np.finfo(model.info.dtype).eps * np.max(np.abs(energy)))
     left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
     jumped = float(jump_work[-1])
     is_resolved = off <= max(_MAX_RELATIVE_ERROR * max(map(abs, (*parts, jumped))), 10 * rounding)
     return Balance(*parts, left, off + rounding, is_resolved=is_resolved, jumps=jumped)
 
 
-def _velocity_reversal(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
+def _velocity_reversal(model: CompiledModel) -> Callable[[Array, Array], tuple[Array, Array]]:
     """Return the function that reverses the velocities of a state.
 
     The modes of Coulomb friction are signs of velocities and change their sign as well.
     """
-    signs = np.ones(model.nq, model.dtype)
-    signs[[at for at, _ in model._rows.modes]] = -1
+    signs = np.ones(model.info.nq, model.info.dtype)
+    signs[[at for at, _ in model.info.constraints.modes]] = -1
     return lambda q, qd: (signs * q, -qd)
 
 
 def _rows(run: Trajectory) -> _PowerSamples | None:
     """Return samples whose power is smooth between jumps of the state or the inputs."""
-    model, u = run._model, run._u
+    model, u = run.model, run.given_inputs
     if u is None or np.ndim(u) == 1:
         # all rows: a few of them may look smooth although the power is not
         states = _in_steps(run) or _between_jumps(run)
-        return _PowerSamples(model, run._params, *states, u)
+        return _PowerSamples(model, run.parameter_values, *states, u)
     run = with_jumps(run)
     ends, values = _piecewise_inputs(run)
     if not len(values):
@@ -176,7 +177,7 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
             t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
         q[first], qd[first] = run.q[row], run.qd[row]
     piece = np.minimum(np.arange(len(t)) // count, len(values) - 1)
-    return _PowerSamples(model, run._params, t, q, qd, values[piece])
+    return _PowerSamples(model, run.parameter_values, t, q, qd, values[piece])
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
@@ -193,19 +194,19 @@ def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
 
     n = 0 if the inputs are unknown.
     """
-    unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
+    unknown, last = (np.zeros(1), np.zeros((0, run.model.info.nu))), float(run.t[-1])
     if hasattr(run, "tol"):
         values = run._period_inputs
         if values is None:
             return unknown
         starts = run.t0 + run._period * np.arange(len(values))
-    elif (values := getattr(run, "_law_values", None)) is not None:
-        starts = run.t0 + run.h * run._hold * np.arange(len(values))
+    elif (values := getattr(run, "law_values", None)) is not None:
+        starts = run.t0 + run.h * run.hold * np.arange(len(values))
     else:
-        values = run._u if np.ndim(run._u) == 2 else run._applied
-        if values is None or (np.ndim(run._u) != 2 and run.every > 1):
+        values = run.given_inputs if np.ndim(run.given_inputs) == 2 else run.applied_inputs
+        if values is None or (np.ndim(run.given_inputs) != 2 and run.every > 1):
             return unknown
-        first = np.arange(0, min(run.steps, len(values)), run._hold)
+        first = np.arange(0, min(run.steps, len(values)), run.hold)
         starts, values = run.t0 + run.h * first, values[first]
     started = starts < last
     return np.append(starts[started], last), values[started]
@@ -217,12 +218,16 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     Such steps are short where power is not smooth, as in a joint stop. Steps of a few roundings of
     the time have no inner rows. None for fixed steps, or if there are too many steps.
     """
-    if not hasattr(run, "tol") or run.steps * _MIN_ROWS > _MAX_ROWS or not run._model.has_power:
+    if (
+        not hasattr(run, "tol")
+        or run.steps * _MIN_ROWS > _MAX_ROWS
+        or not run.model.functions.has_power
+    ):
         return None
     run = with_jumps(run)
     if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows are at requested times
         run = _after_steps(run)
-    t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
+    t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run.model.info.dtype).eps
     intervals = np.diff(t)
     long = np.flatnonzero(intervals > _MIN_ROWS * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
     inner = np.arange(1, _MIN_ROWS - 1) / (_MIN_ROWS - 1)
@@ -239,11 +244,11 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     """Return equidistant t, q, qd in each piece between jumps; each jump has two rows."""
     run = with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
-    if not len(jumps) or not run._model.has_power:
-        even = run if len(jumps) else run._equidistant()
+    if not len(jumps) or not run.model.functions.has_power:
+        even = run if len(jumps) else run.equidistant()
         return even.t, even.q, even.qd
     firsts, lasts = np.array([0, *jumps]), np.array([*(jumps - 1), n - 1])
-    times, grain = [], 16 * np.finfo(run._model.dtype).eps
+    times, grain = [], 16 * np.finfo(run.model.info.dtype).eps
     for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True):
         rows = min(
             max(_ROWS_PER_STEP * (b - a + 1), _MIN_PIECE_ROWS), max(_MAX_ROWS // len(firsts), 2)
@@ -253,8 +258,8 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
             times.append(np.linspace(begin, end, rows)[1:-1])
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
-    bare = adaptive._with_rows(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    dense: Trajectory = bare._insert_rows(np.concatenate(times)) if times else bare
+    bare = adaptive.with_rows(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
+    dense: Trajectory = bare.insert_rows(np.concatenate(times)) if times else bare
     return dense.t, dense.q, dense.qd
 
 
@@ -264,7 +269,7 @@ def with_jumps(run: Any) -> Any:
     A run with events whose rows are at requested times is repeated with a row after each step. Any
     other run is returned unchanged.
     """
-    event_indices = getattr(run, "_event_data", ((),))[0]
+    event_indices = getattr(run, "event_data", ((),))[0]
     if not len(event_indices) or (np.diff(run.t) == 0).any():
         return run
     return _after_steps(run)
@@ -272,7 +277,7 @@ def with_jumps(run: Any) -> Any:
 
 def _after_steps(run: Any) -> Any:
     """Return the run with a row after each step and both rows of each jump."""
-    return run._rerun(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
+    return run.rerun(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:

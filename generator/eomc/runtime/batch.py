@@ -13,37 +13,60 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import batch_adaptive, batch_fixed
-from .adaptive_arguments import as_progress, uses_adaptive_steps
-from .arguments import (
-    Array,
-    Start,
-    as_count,
-    as_number,
-    as_step_size,
-    row_times,
-    without_mask,
-)
-from .batch_instances import Instances
-from .batch_run import BatchRun
-from .batch_work import MIN_STEPS_FOR_THREADS, Work
-from .metadata import SOME
-from .model import RARELY
-from .output_times import as_times_and_steps
-from .package import warn
-from .plugins import with_events
+from .arguments import Array, Start, as_count, as_number, as_step_size, row_times, without_mask
+from .batch_trajectory import BatchRun
+from .batch_work import MIN_STEPS_FOR_THREADS, BatchSteps, Instances, Work
+from .integrator import MAX_EVERY, MIN_CHECKED_NUMBERS
+from .model import Model
+from .package import Component, warn, with_events
+from .requests import SimulationArguments, as_progress, step_count
+from .stability import MIN_STEPS
+from .starts import initial_state_for_parameters, is_by_name
 from .status import Interrupted
 
 
-class BatchModel(Instances):
+class BatchModel(Model):
     """Compiled scene that simulates many instances (independent copies) at once.
 
-    The instances differ in their initial states, parameters or inputs.
+    Attributes
+    ----------
+    batch : Batch
+        Steps and runs of many instances. The other attributes are those of `Model`.
     """
 
+    def __init__(self, extension: Any, **scene: Any) -> None:
+        super().__init__(extension, **scene)
+        self.batch = Batch(self)
+
     @property
-    def _kinds(self) -> dict[str, Any]:
+    def trajectory_classes(self) -> dict[str, Any]:
+        """The classes of runs and batches by their names."""
         own = (BatchRun, batch_fixed.TimedBatchRun, batch_adaptive.AdaptiveBatchRun)
-        return super()._kinds | {x.__name__: x for x in own}
+        return super().trajectory_classes | {x.__name__: x for x in own}
+
+
+class Batch(Component):
+    """Steps and simulations of many instances, which differ in states, parameters or inputs.
+
+    Attributes
+    ----------
+    count_types : tuple
+        C types of arrays of numbers of steps and of status numbers.
+    step_functions : dict
+        C functions that step many instances, by method; None: the first.
+    step_seconds : dict
+        Measured seconds per step and instance, by function and log2 of the number of instances (few
+        instances do not fill a register). They determine the size of chunks, no result.
+    """
+
+    path = "batch"
+
+    def __init__(self, model: BatchModel) -> None:
+        self.model, self.info, self.c, self.arguments = model, model.info, model.c, model.arguments
+        self.count_types = (self.c.ffi.typeof("long[]"), self.c.ffi.typeof("int[]"))
+        function = model.integrator.c_function
+        self.step_functions = {x: function(x, "batch_step") for x in (None, *self.info.methods)}
+        self.step_seconds: dict[Any, float] = {}
 
     def simulate_batch(
         self, q0: Start = None, qd0: Start = None, h: float | None = None,
@@ -120,51 +143,51 @@ class BatchModel(Instances):
             At Ctrl-C; its attribute `run` is the run up to that moment.
         """
         if events is not None or unknown:
-            other, given = with_events(self.simulate_batch, dict(locals()))
-            return cast(BatchRun, other.simulate_batch(**given))
-        progress = as_progress(progress)
-        if uses_adaptive_steps(self, h, steps, method, tol, h_most, stiff):
-            fitted, whole = batch_adaptive.simulate(
-                self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
-                stiff, control_period, (h, steps, method, every, None), max_evaluations,
-            )  # fmt: skip
-            return self._finish(fitted, whole)
+            other, arguments = with_events(self.simulate_batch, dict(locals()))
+            return cast(BatchRun, other.batch.simulate_batch(**arguments))
+        given = SimulationArguments(
+            q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, None,
+            as_progress(progress), tol, times, h_most, stiff, threads, max_evaluations,
+        )  # fmt: skip
+        if given.uses_adaptive_steps(self.info):
+            return self._finish(*batch_adaptive.simulate(self.model, given))
         if max_evaluations is not None:
             raise ValueError("max_evaluations: belongs to adaptive steps: give tol=, and no h=")
-        if self.events and not self._passes_over:
-            seen, whole = batch_adaptive.stepped(
-                self, q0, qd0, h, duration, steps, every, params, u, threads, method, t0, progress,
-                times, control_period,
-            )  # fmt: skip
-            return self._finish(seen, whole)
-        step = self._stepper(method, "batch")
-        h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
-        at = None
-        if times is not None:
-            at, steps = as_times_and_steps(self, times, t0, h, duration, steps, every, None)
-        steps = self._steps(h, duration if at is None else None, steps)
-        every = min(as_count(every, "every", 1), RARELY)
-        u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at, 1)
-        batch_adaptive.no_signals(self, u, control_period)
-        starts, table, inputs, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
+        if self.info.events and not self.model.integrator.ignores_events:
+            return self._finish(*batch_adaptive.simulate_fixed_steps(self.model, given))
+        return self._finish(*self._fixed_steps(given))
+
+    def _fixed_steps(self, given: SimulationArguments) -> tuple[BatchRun, bool]:
+        """Check the arguments of a batch with fixed steps and simulate.
+
+        Return the batch, and False if Ctrl-C interrupted it.
+        """
+        method = self.info.method_name(given.method)
+        h = self.info.h if given.h is None else as_step_size(given.h, self.info.dtype)
+        t0 = as_number(given.t0, "t0")
+        times, steps = given.output_times(t0, h)
+        steps = step_count(self.info, h, given.duration if times is None else None, steps)
+        every = min(as_count(given.every, "every", 1), MAX_EVERY)
+        u, hold = given.inputs_and_hold(self.info, t0, h, steps, 1)
+        batch_adaptive.no_signals(self.model, u, given.control_period)
+        instances = self.instances(given._replace(u=u), -(-steps // hold), t0)
+        inputs = instances.inputs
         if inputs is not None and hold > 1 and inputs.shape[1] > 1:
             inputs = np.ascontiguousarray(np.repeat(inputs, hold, axis=1)[:, :steps])
-        method = self._method(method)
-        if steps >= SOME and (method, h) not in self._warned:
-            first, u0 = (starts[0][0], starts[1][0]), None if inputs is None else inputs[0, 0]
-            self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
-        request = batch_fixed.FixedStepRequest(
-            step, h, t0, steps, every, at, method, threads, progress, codes
-        )
-        run, whole = batch_fixed.simulate(self, starts, inputs, table, request)
-        return self._finish(run, whole)
+            instances = instances._replace(inputs=inputs)
+        if steps >= MIN_STEPS and (method, h) not in self.model.integrator.warned:
+            state = instances.first_state(t0)
+            self.model.integrator.check_step_size(state, h, method, "the first instance: ")
+        plan = BatchSteps(method, h, t0, steps, every)
+        request = batch_fixed.BatchRequest(plan, times, given.threads, given.progress)
+        return batch_fixed.simulate(self.model, instances, request)
 
     def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
         """Return the run, with a warning if instances failed. Raises Interrupted unless `whole`."""
         if not whole:
             raise Interrupted(run)
-        if words := run._no_convergence_message:
-            warn(f"{self.name}: {words}")
+        if words := run.failure_summary:
+            warn(f"{self.info.name}: {words}")
         return run
 
     def step_batch(
@@ -211,26 +234,29 @@ class BatchModel(Instances):
         KeyboardInterrupt
             At Ctrl-C.
         """
-        if not isinstance(method, (str, NoneType)) or method not in self._batch_steps:
-            self._method(method)  # raises, with those there are
+        if not isinstance(method, (str, NoneType)) or method not in self.step_functions:
+            self.info.method_name(method)  # raises, with those there are
         if out is not None:
-            into = self._pair(out, np.shape(q))
+            into = self.arguments.output_pair(out, np.shape(q))
             into[0][...], into[1][...] = without_mask(q, "q"), without_mask(qd, "qd")
             q, qd = into
-        self._movable(q, "q")
-        self._movable(qd, "qd")
+        self.arguments.check_writable(q, "q")
+        self.arguments.check_writable(qd, "qd")
         count = len(q)
         if count != len(qd):
             raise ValueError(f"qd: {len(qd)} instances where q has {count}")
         views = q.base is not None or qd.base is not None
         if count and (q is qd or (views and np.may_share_memory(q, qd))):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
-        h, steps = self.h if h is None else as_step_size(h, self.dtype), as_count(steps, "steps", 0)
-        times = row_times(self, t, (count,))
+        h, steps = (
+            self.info.h if h is None else as_step_size(h, self.info.dtype),
+            as_count(steps, "steps", 0),
+        )
+        times = row_times(self.arguments, t, (count,))
         if times is None:
             t = as_number(t, "t")
-        inputs = None if u is None else self._input_rows(u, 1)
-        table = None if params is None else self._parameter_rows(params)
+        inputs = None if u is None else self.input_rows(u, 1)
+        table = None if params is None else self.arguments.parameter_rows(params)
         for name, rows in (("params", table), ("u", inputs)):
             if rows is not None and len(rows) not in (1, count):
                 raise ValueError(f"{name}: {len(rows)} instances where q has {count}")
@@ -238,23 +264,104 @@ class BatchModel(Instances):
             as_count(threads, "threads", 1)
         if (
             count * steps >= MIN_STEPS_FOR_THREADS
-            or count * steps * self.nq > 8 * MIN_STEPS_FOR_THREADS
+            or count * steps * self.info.nq > 8 * MIN_STEPS_FOR_THREADS
         ):
-            table, step = self._parameter_rows(params), self._stepper(method, "batch")
-            begin = t if times is None else times
-            work = Work(self, step, q, qd, h, begin, steps, 0, inputs, table, None, None)
+            table = self.arguments.parameter_rows(params)
+            plan = BatchSteps(method, h, t if times is None else times, steps)
+            work = Work(self.model, plan, (q, qd), Instances(None, table, inputs))
             if not work.run(threads, None):
                 raise KeyboardInterrupt
             return work.status
         # too few steps for threads and for checks of Ctrl-C: call C directly
-        address, real, null = self._c
+        address, real, null = self.c.tools
         status = np.empty(count, "i")
-        self._batch_steps[method](
+        self.step_functions[method](
             count, address(real, q), address(real, qd),
             [t] if times is None else address(real, times), int(times is not None), h, steps,
             null if inputs is None else address(real, inputs),
-            self.nu if inputs is not None and len(inputs) > 1 else 0,
-            self._at[2] if table is None else address(real, table),
-            1 if table is not None and len(table) > 1 else 0, address(self._whole[1], status),
+            self.info.nu if inputs is not None and len(inputs) > 1 else 0,
+            self.arguments.default_pointers[2] if table is None else address(real, table),
+            1 if table is not None and len(table) > 1 else 0, address(self.count_types[1], status),
         )  # fmt: skip
         return status
+
+    def instances(self, given: SimulationArguments, steps: int | None, t0: float) -> Instances:
+        """Check the initial states, parameters and inputs of a batch.
+
+        steps: number of rows of a table of inputs. t0: time, s, at which the initial states are
+        assembled on the constraints.
+        """
+        q0, qd0, params, u = given.q0, given.qd0, given.params, given.u
+        start, table = self.info.initial_state, self.arguments.parameter_rows(params)
+        if (params is not None and self.info.start_formulas) or is_by_name(q0, qd0):
+            q0, qd0 = initial_state_for_parameters(self.model, q0, qd0, table, many_values=True)
+        q = self._state_rows(start[0] if q0 is None else self.info.with_discrete(q0, 0), "q0")
+        qd = self._state_rows(start[1] if qd0 is None else self.info.with_discrete(qd0, 1), "qd0")
+        inputs = self.input_rows(u, steps)
+        sizes = {
+            "q0": 1 if q.ndim == 1 else len(q),
+            "qd0": 1 if qd.ndim == 1 else len(qd),
+            "params": len(table),
+            "u": 1 if inputs is None else len(inputs),
+        }
+        if empty := [name for name, size in sizes.items() if not size]:
+            raise ValueError(f"{empty[0]}: no instances")
+        whose, count = next((x for x in sizes.items() if x[1] > 1), ("q0", 1))
+        for name, size in sizes.items():
+            if size not in (1, count):
+                hint = ": a table over time for all is (1, steps, nu)" if name == "u" else ""
+                raise ValueError(f"{name}: {size} instances where {whose} has {count}{hint}")
+
+        if whose == "u" and inputs is not None and np.ndim(u) == 2 and len(inputs) == steps:
+            one, each = f"(1, {steps}, {self.info.nu})", f"({steps}, 1, {self.info.nu})"
+            raise ValueError(
+                f"u: shape {np.shape(u)} may be a table over time or one row an instance: give "
+                f"{one} for a table, {each} for as many instances"
+            )
+
+        whole = (count, self.info.nq)  # broadcast_to is slow even without effect
+        q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
+        q, qd, codes = self.model.constraints.assemble_rows(q, qd, table, t0)
+        return Instances((q, qd), table, inputs, codes)
+
+    def _state_rows(self, values: ArrayLike, name: str) -> Array:
+        """Return states (nq,) or (n, nq); an array (n, nq) is returned without further checks."""
+        if isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == self.info.nq:
+            without_mask(values, name)
+            if values.dtype in (self.info.dtype, np.float64) and values.flags.aligned:
+                return values
+        return self.arguments.array(values, name, self.info.nq)
+
+    def input_rows(self, u: Any, steps: int | None) -> Array | None:
+        """Return inputs (batch or 1, steps or 1, nu); steps None: constant during the run."""
+        if u is None:
+            return None
+        if not self.info.nu:
+            raise ValueError("u: this scene has no inputs")
+        if callable(u):
+            raise ValueError(
+                "u: a Python function can't be called for many at once: give a table, or step all "
+                "instances by step_batch in a loop that computes u from their states"
+            )
+        if type(u) is not np.ndarray and isinstance(u, Mapping):
+            u = self.arguments.inputs_by_name(u)
+        if type(u) is np.ndarray and u.dtype is self.info.dtype and u.flags.carray:
+            array = u
+        else:
+            array = self.arguments.numbers(u, "u")
+        if array.ndim < 3:
+            array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
+        if array.ndim != 3 or array.shape[2] != self.info.nu or array.shape[1] not in (1, steps):
+            shapes, wide = (
+                f"({self.info.nu},), (batch, {self.info.nu})",
+                f"(batch, {steps}, {self.info.nu})",
+            )
+            table = ": rows, each held over a control period, take control_period=, in s"
+            rows = ", a row for each step or control period of duration="
+            over = f" or {wide}{rows}" if steps else table
+            raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")
+        at = self.c.pointer(array)
+        for k in range(0, array.size, MIN_CHECKED_NUMBERS):
+            if not self.c.lib.all_finite(min(MIN_CHECKED_NUMBERS, array.size - k), at + k):
+                raise ValueError("u: not all numbers are finite")
+        return array

@@ -6,24 +6,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .adaptive_arguments import as_end, as_limits, as_times
-from .adaptive_memory import room_for
-from .adaptive_trajectory import failure_message
-from .arguments import Array, Start, as_count, as_number, as_step_size, check_time, cut_table
-from .batch_instances import Instances
-from .batch_run import BatchRun, initial_failures
-from .batch_work import as_threads, run_groups
-from .by_name import ByName
+from .adaptive import failure_message, room_for
+from .arguments import (
+    Array,
+    ByName,
+    as_count,
+    as_number,
+    as_step_size,
+    check_time,
+    cut_table,
+)
+from .batch_trajectory import BatchRun, initial_failures
+from .batch_work import Instances, as_threads, run_groups
+from .c_library import next_chunk
 from .events import BatchEventBuffer, BatchEventLog
-from .fixed_step_events import as_hold, as_rows
-from .input_schedule import count_periods, period_end, sample_zero_order_hold
-from .metadata import SOME
-from .slices import next_chunk
+from .inputs import count_periods, period_end, sample_zero_order_hold
+from .interfaces import CompiledBatchModel
+from .requests import SimulationArguments, as_end, as_times
+from .stability import MIN_STEPS
 from .status import FULL, STATUS
 
 # instances that a thread simulates at once, of many and of few
@@ -33,8 +37,8 @@ MAX_EVALUATIONS = 2**31 - 1  # of an instance; fits in long on every machine
 _EVALUATIONS_PER_STATE = 8 * 64  # for a state between two steps: stages times iterations, at most
 _FIRST_CHUNK_STEPS = 64  # steps of an instance before the first check of Ctrl-C
 _NAMES = (
-    "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
-    "_stiff", "_period", "_by", "_max_evaluations",
+    "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "initial_state", "h_most",
+    "stiff", "_period", "fixed_method", "_max_evaluations",
 )  # fmt: skip
 _EVENT_FIELDS = ("event_instances", "which", "event_rows")  # of a saved run
 _ENDS = np.array([*STATUS, FULL])
@@ -67,13 +71,13 @@ class AdaptiveBatchRun(BatchRun):
     stiff_steps: Array = field(kw_only=True)
     reached: Array = field(kw_only=True)
     _times: Array = field(kw_only=True)
-    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
-    _h_most: float = field(kw_only=True)
-    _stiff: bool = field(kw_only=True)
+    initial_state: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
+    h_most: float = field(kw_only=True)
+    stiff: bool = field(kw_only=True)
     _period: float = field(default=0.0, kw_only=True)  # control period, s; 0 without one
-    _by: str = field(default="", kw_only=True)  # the method of fixed steps
+    fixed_method: str = field(default="", kw_only=True)  # the method of fixed steps
     _max_evaluations: int = field(default=0, kw_only=True)  # 0: no limit
-    _event_data: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
+    event_data: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + index of the event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
 
@@ -85,7 +89,7 @@ class AdaptiveBatchRun(BatchRun):
     @cached_property
     def status(self) -> Array:
         """Return the status of each instance as text, (batch,), such as "ok" or "singular"."""
-        return np.asarray(_ENDS[self._codes])
+        return np.asarray(_ENDS[self.status_codes])
 
     @cached_property
     def events(self) -> dict[str, BatchEventLog]:
@@ -94,28 +98,30 @@ class AdaptiveBatchRun(BatchRun):
         A log has the times t (m,), s, the states q, qd (m, nq) and the indices of the instances
         (m,).
         """
-        if self._event_data is None:
+        if self.event_data is None:
             return ByName("events", (), ())
-        nq, (instances, which, rows) = self._model.nq, self._event_data
+        nq, (instances, which, rows) = self.model.info.nq, self.event_data
         logs = []
-        for k in range(len(self._model.events)):
+        for k in range(len(self.model.info.events)):
             own = which == k
             t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
             logs.append(BatchEventLog(t[:, 0], q, qd, instances[own], len(self)))
-        return ByName("events", self._model.events, logs)
+        return ByName("events", self.model.info.events, logs)
 
     def _states(self, times: Array) -> Array:
-        model: Any = self._model
-        p, limits = self._params, (float(self._times[-1]), self.tol, self._h_most)
-        inputs = self._row_inputs if self._u is None else self._u
-        work = _Work(
-            model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
-            (inputs, self._period), p, self._stiff, self._by,
+        inputs = self.row_inputs if self.given_inputs is None else self.given_inputs
+        limit = self._max_evaluations
+        if limit:  # without those of states between steps
+            each = _EVALUATIONS_PER_STATE + 2 * self.model.info.nq + 1
+            limit += each * (len(times) + len(self.t))
+        # the end may be later than the last of the times
+        plan = _Plan(
+            self.t0, self.tol, times.astype(self.model.info.dtype), self.h_most, self.stiff,
+            self._period, self.fixed_method, limit,
         )  # fmt: skip
-        work.leave(initial_failures(self))
-        if self._max_evaluations:  # without those of states between steps
-            each = _EVALUATIONS_PER_STATE + 2 * model.nq + 1
-            work.limit(self._max_evaluations + each * (len(times) + len(self.t)))
+        instances = Instances(None, self.parameter_values, inputs, initial_failures(self))
+        work = _Work(self.model, self.initial_state.copy(), plan, instances)
+        work.limits = float(self._times[-1]), self.tol, self.h_most
         if len(times) and not work.run(None, None):
             raise KeyboardInterrupt
         work.rows[:, self._late(times)] = np.nan
@@ -123,14 +129,14 @@ class AdaptiveBatchRun(BatchRun):
 
     def _late(self, times: Array) -> Array:
         """True at times after the end of instances with status "too long", (batch, n)."""
-        ended = np.where(self._codes == STATUS.index("too long"), self.reached, np.inf)
+        ended = np.where(self.status_codes == STATUS.index("too long"), self.reached, np.inf)
         return np.asarray(times > ended[:, None])
 
     @property
     def stopped(self) -> Array:
         """Return the name of the event that ended each instance, (batch,); "" if none did."""
         codes = np.zeros(len(self), int) if self._stopped is None else self._stopped
-        return np.asarray(np.array(["", *self._model.events])[codes])
+        return np.asarray(np.array(["", *self.model.info.events])[codes])
 
     @property
     def limit(self) -> Array:
@@ -150,186 +156,170 @@ class AdaptiveBatchRun(BatchRun):
         names, counts = np.unique(self.stopped, return_counts=True)
         ends = zip(counts, names, strict=True)
         stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
-        how = f" of {self.h:g} s" if self._by else f", tolerance {self.tol:g}"
+        how = f" of {self.h:g} s" if self.fixed_method else f", tolerance {self.tol:g}"
         return f"{len(self)} instances, {step_count} steps{how}: {statuses}{stops}"
 
     def _end(self, k: int) -> float:
         return float(self.reached[k])
 
     def _why(self, k: int) -> str:
-        status, event = str(_ENDS[self._codes[k]]), self.stopped[k]
+        status, event = str(_ENDS[self.status_codes[k]]), self.stopped[k]
         if status == "not finite" and event:
             return f"event '{event}' jumps to no finite state"
         if status == "accumulated":
             return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
-        return failure_message(self._model, status, self._by)
+        return failure_message(self.model, status, self.fixed_method)
 
-    def _all(self) -> tuple[Any, ...]:
+    def field_values(self) -> tuple[Any, ...]:
+        """Return the values of the fields that the base class `BatchRun` has, in order."""
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
-    def _to_arrays(self) -> dict[str, Any]:
-        arrays = super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
-        if self._event_data is not None:
-            arrays |= zip(_EVENT_FIELDS, self._event_data, strict=True)
+    def to_arrays(self) -> dict[str, Any]:
+        """Return the arrays and numbers that a file of the run contains, by name."""
+        arrays = super().to_arrays() | {name: getattr(self, name) for name in _NAMES}
+        if self.event_data is not None:
+            arrays |= zip(_EVENT_FIELDS, self.event_data, strict=True)
             arrays |= {"stopped": self._stopped, "limit": self._limit}
         return arrays
 
     @classmethod
-    def _from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> AdaptiveBatchRun:
-        fields_of_batch = BatchRun._from_arrays(model, arrays)._all()
+    def from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> AdaptiveBatchRun:
+        """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
+        fields_of_batch = BatchRun.from_arrays(model, arrays).field_values()
         run = cls(*fields_of_batch, **{name: arrays[name] for name in _NAMES if name in arrays})
         if "which" in arrays:
-            run._event_data = tuple(arrays[name] for name in _EVENT_FIELDS)
+            run.event_data = tuple(arrays[name] for name in _EVENT_FIELDS)
             run._stopped, run._limit = arrays["stopped"], arrays["limit"]
         return run
 
-    def _settings(self) -> tuple[Any, ...]:
-        return (*super()._settings(), self.tol, self._times.tolist())
+    def settings(self) -> tuple[Any, ...]:
+        """Return the settings of the run that have to agree for two runs to be equal."""
+        return (*super().settings(), self.tol, self._times.tolist())
+
+
+class _Plan(NamedTuple):
+    """Checked arguments of a batch that are the same for all instances.
+
+    t0: start time, s. tol: tolerance. times: times of the rows, s. h_most: longest adaptive step,
+    s, or size of fixed steps. stiff: whether to begin with Newton's method. period: control period
+    of the inputs, s; 0: none. method: method of fixed steps; "": adaptive steps. max_evaluations:
+    maximum of evaluations of an instance; 0: none.
+    """
+
+    t0: float
+    tol: float
+    times: Array
+    h_most: float
+    stiff: bool
+    period: float
+    method: str = ""
+    max_evaluations: int = 0
+
+    @property
+    def duration(self) -> float:
+        """Time from the start to the last row, s."""
+        return float(self.times[-1]) - self.t0
 
 
 def simulate(
-    model: Instances, q0: Start, qd0: Start, duration: float | None,
-    params: Any, u: ArrayLike | None, threads: int | None, t0: float,
-    progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
-    h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
-    max_evaluations: int | None,
-) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """Check the arguments of `BatchModel.simulate_batch` and simulate with adaptive steps.
+    model: CompiledBatchModel, given: SimulationArguments
+) -> tuple[AdaptiveBatchRun, bool]:
+    """Check the arguments of `Batch.simulate_batch` and simulate with adaptive steps.
 
-    Parameters
-    ----------
-    fixed : tuple
-        The values that the caller gave for the arguments in `FIXED_STEP_DEFAULTS`, which only fixed
-        steps use. Each must have its default value.
-
-    The other arguments are those of `simulate_batch`.
-
-    Returns
-    -------
-    run : AdaptiveBatchRun
-    completed : bool
-        False if Ctrl-C interrupted the run.
-
-    Raises
-    ------
-    ValueError
-        If an argument is invalid.
+    Return the batch, and False if Ctrl-C interrupted it, else True. Raises ValueError if an
+    argument is invalid.
     """
-    tol, most = as_limits(model, tol, h_most, stiff, fixed)
+    info = model.info
+    tol, most = given.adaptive_limits(info)
     limit = 0
-    if max_evaluations is not None:
-        limit = min(as_count(max_evaluations, "max_evaluations", 1), MAX_EVALUATIONS)
-    t0 = as_number(t0, "t0")
-    length = duration
+    if given.max_evaluations is not None:
+        limit = min(as_count(given.max_evaluations, "max_evaluations", 1), MAX_EVALUATIONS)
+    t0, times, duration = as_number(given.t0, "t0"), given.times, given.duration
     if times is None:
-        end = as_end(model, t0, duration)
+        end = as_end(info, t0, duration)
         times, duration = [t0, end] if end > t0 else [t0], None
-    rows = as_times(times, t0, model.dtype, duration)
+    rows = as_times(times, t0, info.dtype, duration)
     period = 0.0
-    if control_period is not None:
-        period = as_step_size(control_period, model.dtype, "control_period")
-    span = float(rows[-1]) - t0
-    check_time(model.dtype, t0, span)
-    if period and length is not None:
-        u = cut_table(u, model.nu, count_periods(length, period), count_periods(span, period), 1)
-    return _run(
-        model,
-        q0,
-        qd0,
-        params,
-        u,
-        threads,
-        t0,
-        progress,
-        tol,
-        rows,
-        most,
-        stiff,
-        period,
-        span,
-        limit=limit,
-    )
+    if given.control_period is not None:
+        period = as_step_size(given.control_period, info.dtype, "control_period")
+    check_time(info.dtype, t0, float(rows[-1]) - t0)
+    return _run(model, given, _Plan(t0, tol, rows, most, given.stiff, period, "", limit))
 
 
-def stepped(
-    model: Instances, q0: Start, qd0: Start, h: float | None,
-    duration: float | None, steps: int | None, every: int, params: Any, u: ArrayLike | None,
-    threads: int | None, method: str | None, t0: float,
-    progress: Callable[[int, int], None] | None, times: ArrayLike | None,
-    control_period: float | None,
-) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """Check the arguments of `BatchModel.simulate_batch`; simulate with fixed steps and events.
+def simulate_fixed_steps(
+    model: CompiledBatchModel, given: SimulationArguments
+) -> tuple[AdaptiveBatchRun, bool]:
+    """Check the arguments of `Batch.simulate_batch`; simulate with fixed steps and events.
 
-    Return (run, completed); completed is False if Ctrl-C interrupted the run. The arguments are
-    those of `simulate_batch`. Raises ValueError if an argument is invalid.
+    Return the batch, and False if Ctrl-C interrupted it, else True. Raises ValueError if an
+    argument is invalid.
     """
-    h = model.h if h is None else as_step_size(h, model.dtype)
-    method, t0 = model._method(method), as_number(t0, "t0")
-    rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
-    period = as_hold(u, control_period, h) or 0.0
-    if period and duration is not None:
-        u = cut_table(u, model.nu, count_periods(duration, period), count_periods(span, period), 1)
-    return _run(
-        model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, span, method
-    )
+    info = model.info
+    h = info.h if given.h is None else as_step_size(given.h, info.dtype)
+    method, t0 = info.method_name(given.method), as_number(given.t0, "t0")
+    rows, _ = given.event_rows(info, t0, h, listed=True)
+    assert rows is not None
+    period = given.input_period(h) or 0.0
+    return _run(model, given, _Plan(t0, 0.0, rows, h, False, period, method))
 
 
 def _run(
-    model: Instances, q0: Start, qd0: Start, params: Any,
-    u: ArrayLike | None, threads: int | None, t0: float,
-    progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
-    stiff: bool, period: float, span: float, method: str = "", limit: int = 0,
-) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """Simulate from checked arguments.
-
-    period: control period of the rows of u, s; 0: none. span: duration, s. method: method of fixed
-    steps of size `most`; "": adaptive steps. limit: maximum of evaluations of an instance; 0: none.
-    """
-    no_signals(model, u, period or None)
-    count = count_periods(span, period) if period else None
-    starts, table, inputs, codes = model._instances(q0, qd0, params, u, count, t0)
-    q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
-    begin = np.array([q, qd])
-    limits, over = (float(rows[-1]), tol, most), inputs is not None and inputs.shape[1] > 1
-    if method and span >= SOME * most and (method, most) not in model._warned:
-        first = None if inputs is None else inputs[0, 0]
-        model._look(q[0], qd[0], most, t0, first, table[0], method, "the first instance: ")
-    work = _Work(model, begin.copy(), t0, rows, limits, (inputs, period), table, stiff, method)
-    work.limit(limit)
-    work.leave(codes)
-    whole = work.run(threads, progress)
+    model: CompiledBatchModel, given: SimulationArguments, plan: _Plan
+) -> tuple[AdaptiveBatchRun, bool]:
+    """Simulate from checked arguments."""
+    u, span, method, h = given.u, plan.duration, plan.method, plan.h_most
+    count = count_periods(span, plan.period) if plan.period else None
+    if count is not None and given.duration is not None:
+        u = cut_table(u, model.info.nu, count_periods(given.duration, plan.period), count, 1)
+    no_signals(model, u, plan.period or None)
+    instances = model.batch.instances(given._replace(u=u), count, plan.t0)
+    _, table, inputs, _ = instances
+    q, qd = (
+        model.arguments.array(x, name, model.info.nq)
+        for x, name in zip(instances.starts, ("q0", "qd0"), strict=True)
+    )
+    begin, over = np.array([q, qd]), inputs is not None and inputs.shape[1] > 1
+    instances = instances._replace(starts=(q, qd))
+    if method and span >= MIN_STEPS * h and (method, h) not in model.integrator.warned:
+        state = instances.first_state(plan.t0)
+        model.integrator.check_step_size(state, h, method, "the first instance: ")
+    work = _Work(model, begin.copy(), plan, instances)
+    whole = work.run(given.threads, given.progress)
     counts = work.counts
     cut = len(STATUS) if work.full else STATUS.index("interrupted")
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
     row_inputs = None if inputs is None else inputs.copy()
     if inputs is not None and over:
-        row_inputs = sample_zero_order_hold(rows, t0, period, inputs)
-    h, evaluations = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
+        row_inputs = sample_zero_order_hold(plan.times, plan.t0, plan.period, inputs)
+    mean_step = span / max(1.0, float(counts["steps"].mean()))
+    evaluations = counts["evaluations"]
     if method:
-        h, evaluations = most, model._called(method, counts["steps"], evaluations)
+        mean_step = h
+        evaluations = model.info.count_evaluations(method, counts["steps"], evaluations)
     batch = AdaptiveBatchRun(
-        model, t0, work.rows[0], work.rows[1], h, counts["steps"], codes, 1, 0, table.copy(),
-        row_inputs, method or "gauss16", inputs.copy() if inputs is not None and over else None,
-        tol=tol, evaluations=evaluations, rejected=counts["rejected"],
-        stiff_steps=counts["stiff_steps"],
-        reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
-        _period=period, _by=method, _max_evaluations=limit,
+        model, plan.t0, work.rows[0], work.rows[1], mean_step, counts["steps"], codes, 1, 0,
+        table.copy(), row_inputs, method or "gauss16",
+        inputs.copy() if inputs is not None and over else None,
+        tol=plan.tol, evaluations=evaluations, rejected=counts["rejected"],
+        stiff_steps=counts["stiff_steps"], reached=work.t, _times=plan.times, initial_state=begin,
+        h_most=h, stiff=bool(plan.stiff), _period=plan.period, fixed_method=method,
+        _max_evaluations=plan.max_evaluations,
     )  # fmt: skip
     if work.events:
-        batch._event_data = work.events.all()
+        batch.event_data = work.events.all()
         batch._stopped = work.counts["stopped"]
         at_limit = codes == STATUS.index("accumulated")
         batch._limit = np.where(at_limit, work.counts["limit"], np.nan)
     return batch, whole
 
 
-def no_signals(model: Instances, u: Any, control_period: Any) -> None:
+def no_signals(model: CompiledBatchModel, u: Any, control_period: Any) -> None:
     """Raise ValueError if a batch has a control period, but no inputs u, for a scene with inputs.
 
     The scene's signals (formulas for the inputs) would then be the inputs. A batch cannot hold
     signals constant over control periods.
     """
-    if u is None and control_period is not None and model.nu:
+    if u is None and control_period is not None and model.info.nu:
         raise ValueError("control_period: a batch follows the signals: give u, a row a period")
 
 
@@ -337,47 +327,35 @@ class _Work:
     """State of a simulation: times, states, workspaces and rows of all instances."""
 
     def __init__(
-        self, model: Instances, begin: Array, t0: float, times: Array,
-        limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
-        stiff: bool, method: str,
-    ) -> None:  # fmt: skip
-        """Initialise the simulation at t0.
+        self, model: CompiledBatchModel, begin: Array, plan: _Plan, instances: Instances
+    ) -> None:
+        """Initialise the simulation.
 
-        begin: initial [q, qd], (2, batch, nq). times: times of the rows, (n,). limits: end time,
-        tolerance and longest step. inputs: inputs of the control periods, (batch or 1, periods or
-        1, nu), or None for the signals, and the period. table: parameters, (batch or 1, np).
-        method: name of the method of fixed steps; "": adaptive steps.
+        begin: initial [q, qd], (2, batch, nq), which are overwritten.
         """
-        self.model, (self.q, self.qd), self.times = model, begin, times
-        (self.inputs, self.period), self.table, self.limits = inputs, table, limits
-        (count, _), n = self.q.shape, len(times)
-        self.t0, self.t = t0, np.full(count, t0, model.dtype)
-        self.rows = np.empty((2, count, n, model.nq), model.dtype)
+        self.model, (self.q, self.qd), self.times = model, begin, plan.times
+        self.inputs, self.table, self.period = instances.inputs, instances.parameters, plan.period
+        # end time, tolerance and longest step
+        self.limits = float(plan.times[-1]), plan.tol, plan.h_most
+        (count, nq), n = self.q.shape, len(plan.times)
+        self.t0, self.t = plan.t0, np.full(count, plan.t0, model.info.dtype)
+        self.rows = np.empty((2, count, n, nq), model.info.dtype)
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
-        self.memory = model._ffi.new("adaptive_memory[]", count)
-        for memory in self.memory if stiff else ():
-            memory.stiff = 1
-        if method:
-            model._lib.adaptive_fixed(count, self.memory, 1 + model.methods.index(method))
+        if instances.codes is not None:  # the others make no step
+            self.status[:] = instances.codes
+        self.memory = model.c.ffi.new("adaptive_memory[]", count)
+        for memory in self.memory if plan.stiff or plan.max_evaluations else ():
+            memory.stiff, memory.max_evaluations = int(bool(plan.stiff)), plan.max_evaluations
+        if plan.method:
+            index = model.info.methods.index(plan.method)
+            model.c.lib.adaptive_fixed(count, self.memory, 1 + index)
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
-        self.events = BatchEventBuffer(model, room_for(model) - count * n) if model.events else None
-        if times[0] == t0:
+        self.events = None
+        if model.info.events:
+            self.events = BatchEventBuffer(model, room_for(model) - count * n)
+        if plan.times[0] == plan.t0:
             self.kept[:] = 1
             self.rows[:, :, 0] = begin
-
-    def limit(self, evaluations: int) -> None:
-        """Set the number of evaluations after which an instance begins no further step; 0: none."""
-        for memory in self.memory if evaluations else ():
-            memory.max_evaluations = evaluations
-
-    def leave(self, codes: Array | None) -> None:
-        """Set the status number of each instance before the simulation begins.
-
-        codes: status numbers (batch,); None: leave them unchanged. Instances whose number is not 0
-        make no step, since their initial state is already known to fail.
-        """
-        if codes is not None:
-            self.status[:] = codes
 
     @property
     def counts(self) -> dict[str, Array]:
@@ -386,10 +364,10 @@ class _Work:
         The result is a dict from the counter's name to an array (batch,). The names are those of
         the members of the C struct `adaptive_memory`.
         """
-        ffi, memory = self.model._ffi, "adaptive_memory"
+        ffi, memory = self.model.c.ffi, "adaptive_memory"
         kinds = dict.fromkeys(_COUNTERS, "l")
         if self.events:
-            kinds |= {"stopped": "i", "limit": self.model.dtype.char}
+            kinds |= {"stopped": "i", "limit": self.model.info.dtype.char}
         layout: Any = {
             "names": list(kinds), "formats": list(kinds.values()), "itemsize": ffi.sizeof(memory),
             "offsets": [ffi.offsetof(memory, name) for name in kinds],
@@ -417,19 +395,19 @@ class _Work:
         self.rows[:, np.arange(len(self.times)) >= self.kept[:, None]] = np.nan
         return whole
 
-    def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
+    def run_group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
         """Simulate instances at, ..., at + count - 1 to the end, one control period at a time."""
         model, inputs = self.model, self.inputs
-        u, periods, each = model._c[2], 1, 0
+        u, periods, each = model.c.tools[2], 1, 0
         if inputs is not None:
             many, periods, _ = inputs.shape
-            u, each = model._pointer(inputs), periods * model.nu if many > 1 else 0
+            u, each = model.c.pointer(inputs), periods * model.info.nu if many > 1 else 0
             u += at * each
         for k in range(periods):
             end = self.limits[0]
             if k + 1 < periods:
-                end = period_end(k, self.t0, self.period, model.dtype)
-            if self._advance(at, count, end, u + k * model.nu if k else u, each, look):
+                end = period_end(k, self.t0, self.period, model.info.dtype)
+            if self._advance(at, count, end, u + k * model.info.nu if k else u, each, look):
                 return  # interrupted
         self.open[at : at + count] = False
         self.ended += count  # for the progress bar only: not synchronised between threads
@@ -441,15 +419,15 @@ class _Work:
     ) -> bool:  # fmt: skip
         """Simulate these instances to t_end in chunks of steps; return True if interrupted."""
         end = at + count
-        model, pointer = self.model, self.model._pointer
+        model, pointer = self.model, self.model.c.pointer
         n, many = len(self.times), _FIRST_CHUNK_STEPS
         p_each = len(self.table) > 1
-        address, (long, integer) = model._c[0], model._whole
+        address, (long, integer) = model.c.tools[0], model.batch.count_types
         events = self.events.room(count) if self.events else None
         more = True
         while more and not self.stop and not self.full:
             call_start = perf_counter()
-            more = model._lib.adaptive_batch(
+            more = model.c.lib.adaptive_batch(
                 count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
                 t_end, *self.limits[1:], u, u_instance, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),

@@ -5,21 +5,22 @@ A state between two steps is computed by a shorter step from the first of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .arguments import Array, machine_memory
-from .batch_instances import Instances
-from .batch_run import BatchRun, stepper_for
-from .batch_work import BatchStepper, Work
-from .dense import parts
-from .model import LARGE
+from .batch_trajectory import BatchRun, stepper_for
+from .batch_work import BatchStepper, BatchSteps, Instances, Work
+from .integrator import MIN_CHECKED_NUMBERS
+from .interfaces import CompiledBatchModel
+from .requests import Progress
 from .status import STATUS
+from .trajectory_data import parts
 
-_NAMES = ("_times", "_begin")
+_NAMES = ("_times", "initial_state")
 _INTERRUPTED = STATUS.index("interrupted")
 
 
@@ -34,7 +35,7 @@ class TimedBatchRun(BatchRun):
     """
 
     _times: Array = field(kw_only=True)
-    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
+    initial_state: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
 
     @property
     def t(self) -> Array:
@@ -42,109 +43,74 @@ class TimedBatchRun(BatchRun):
         return self._times
 
     def _states(self, times: Array) -> Array:
-        rows = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
-        stepper = stepper_for(self, self._begin.copy(), self._u)
+        rows = np.empty((2, len(self), len(times), self.model.info.nq), self.model.info.dtype)
+        stepper = stepper_for(self, self.initial_state.copy(), self.given_inputs)
         stepper.rows(parts(times, self.t0, self.h), rows)
         return rows
 
-    def _all(self) -> tuple[Any, ...]:
+    def field_values(self) -> tuple[Any, ...]:
+        """Return the values of the fields that the base class `BatchRun` has, in order."""
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
-    def _to_arrays(self) -> dict[str, Any]:
-        return super()._to_arrays() | {name: getattr(self, name) for name in _NAMES}
+    def to_arrays(self) -> dict[str, Any]:
+        """Return the arrays and numbers that a file of the run contains, by name."""
+        return super().to_arrays() | {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
-    def _from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> TimedBatchRun:
-        fields_of_batch = BatchRun._from_arrays(model, arrays)._all()
+    def from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> TimedBatchRun:
+        """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
+        fields_of_batch = BatchRun.from_arrays(model, arrays).field_values()
         own: Any = {name: arrays.get(name) for name in _NAMES}
         return cls(*fields_of_batch, **own)
 
-    def _settings(self) -> tuple[Any, ...]:
-        return (*super()._settings(), self._times.tolist())
+    def settings(self) -> tuple[Any, ...]:
+        """Return the settings of the run that have to agree for two runs to be equal."""
+        return (*super().settings(), self._times.tolist())
 
 
-class FixedStepRequest(NamedTuple):
-    """Checked arguments of a batch with fixed steps.
+class BatchRequest(NamedTuple):
+    """Checked arguments of a batch with fixed steps that are the same for all instances.
 
     Attributes
     ----------
-    step : C function
-        Function that advances a group of instances by steps.
-    h, t0 : float
-        Step size and start time, s.
-    steps : int
-        Number of steps.
-    every : int
-        Number of steps between two rows.
+    plan : BatchSteps
+        Method, step size, start time, numbers of steps.
     times : (n,) array or None
         Requested times of the rows, s. None: a row after each `every` steps.
-    method : str
-        Name of the method.
     threads : int or None
         Number of threads; None: one for each processor.
     progress : callable or None
         Called with the numbers of completed and of all steps, summed over all instances.
-    codes : (batch,) array or None
-        Status number of each instance before the first step: 0, or the number of the failure if its
-        initial state cannot be moved onto the constraints. None if all are 0.
     """
 
-    step: Any  # C function
-    h: float
-    t0: float
-    steps: int
-    every: int
+    plan: BatchSteps
     times: Array | None
-    method: str
     threads: int | None
-    progress: Callable[[int, int], None] | None
-    codes: Array | None
+    progress: Progress
 
 
 def simulate(
-    model: Instances,
-    starts: tuple[Array, Array],
-    inputs: Array | None,
-    table: Array,
-    request: FixedStepRequest,
+    model: CompiledBatchModel, instances: Instances, request: BatchRequest
 ) -> tuple[BatchRun, bool]:
     """Simulate many instances with fixed steps, from checked arguments.
 
-    Parameters
-    ----------
-    starts : pair of (batch, nq) arrays
-        Initial positions and velocities.
-    inputs : (batch or 1, steps or 1, nu) array or None
-        Inputs of each step; None: the scene's signals.
-    table : (batch or 1, np) array
-        Parameters.
-    request : FixedStepRequest
-        All other arguments.
-
-    Returns
-    -------
-    run : BatchRun
-    completed : bool
-        False if Ctrl-C interrupted the run.
+    Return the batch, and False if Ctrl-C interrupted it, else True.
     """
     run = _by_steps if request.times is None else _at_times
-    return run(model, starts, inputs, table, request)
+    return run(model, instances, request)
 
 
 def _by_steps(
-    model: Instances,
-    starts: tuple[Array, Array],
-    inputs: Array | None,
-    table: Array,
-    request: FixedStepRequest,
+    model: CompiledBatchModel, instances: Instances, request: BatchRequest
 ) -> tuple[BatchRun, bool]:
     """Simulate with rows after every `every` steps and at the end."""
-    step, h, t0, steps, every, _, method, threads, progress, codes = request
+    method, h, t0, steps, every = request.plan
+    starts, table, inputs, _ = instances
+    assert starts is not None
     rows = 1 + steps // every + (steps % every > 0)
     (q, qd), (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), rows)
-    work = Work(model, step, q, qd, h, t0, steps, every, inputs, table, q_rows, qd_rows, starts)
-    work.leave(codes)
-    whole = work.run(threads, progress)
+    work = Work(model, request.plan, (q, qd), instances, (q_rows, qd_rows))
+    whole = work.run(request.threads, request.progress)
     if steps % every:
         q_rows[:, -1], qd_rows[:, -1] = q, qd
     if not whole or work.failed:
@@ -158,34 +124,31 @@ def _by_steps(
     step_inputs = inputs if inputs is not None and inputs.shape[1] > 1 and every > 1 else None
     run = BatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
-        row_inputs, method, None if step_inputs is None else step_inputs.copy(),
+        row_inputs, model.info.method_name(method),
+        None if step_inputs is None else step_inputs.copy(),
     )  # fmt: skip
     return run, whole
 
 
 def _at_times(
-    model: Instances,
-    starts: tuple[Array, Array],
-    inputs: Array | None,
-    table: Array,
-    request: FixedStepRequest,
+    model: CompiledBatchModel, instances: Instances, request: BatchRequest
 ) -> tuple[BatchRun, bool]:
     """Simulate with rows at the requested times."""
-    h, t0, method, times = request.h, request.t0, request.method, request.times
-    assert times is not None
-    places = parts(times, t0, h, request.steps)
+    (method, h, t0, steps, _), times = request.plan, request.times
+    starts, table, inputs, _ = instances
+    assert starts is not None and times is not None
+    places = parts(times, t0, h, steps)
     both, (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), len(times))
-    stepper = BatchStepper(model, method, both, t0, h, inputs, table, starts)
-    stepper.work.leave(request.codes)
+    stepper = BatchStepper(model, request.plan._replace(steps=0), both, instances)
     whole = stepper.rows(places, (q_rows, qd_rows), request.threads, request.progress)
     work, last = stepper.work, int(places[0][-1])
     if not whole:
         work.status[(work.status == 0) & (work.done < last)] = _INTERRUPTED
-    row_inputs = None if inputs is None else _at_rows(inputs, places[0], request.steps)
+    row_inputs = None if inputs is None else _at_rows(inputs, places[0], steps)
     run = TimedBatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
-        row_inputs, method, None if inputs is None else inputs.copy(), _times=times,
-        _begin=np.array(starts, model.dtype),
+        row_inputs, model.info.method_name(method), None if inputs is None else inputs.copy(),
+        _times=times, initial_state=np.array(starts, model.info.dtype),
     )  # fmt: skip
     return run, whole
 
@@ -198,12 +161,15 @@ def _at_rows(inputs: Array, step_indices: Array, steps: int) -> Array:
 
 
 def _ends_and_rows(
-    model: Instances, count: int, rows: int
+    model: CompiledBatchModel, count: int, rows: int
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Allocate q and qd at the ends, (batch, nq), and of the rows, (batch, rows, nq)."""
-    nq, dtype = model.nq, model.dtype
+    nq, dtype = model.info.nq, model.info.dtype
     try:
-        if count * rows * nq > LARGE and model._bytes(count * rows) > machine_memory():
+        if (
+            count * rows * nq > MIN_CHECKED_NUMBERS
+            and model.info.row_bytes(count * rows) > machine_memory()
+        ):
             raise MemoryError
         end, whole = (count, nq), (count, rows, nq)
         ends = np.empty(end, dtype), np.empty(end, dtype)

@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from .arguments import Array, as_count
-from .batch_instances import Instances
-from .slices import next_chunk
+from .c_library import next_chunk
+from .stability import State
 
 _GROUP_SIZE = 128  # instances of the smallest group (a tile)
 _MAX_TILES_PER_GROUP = 64  # larger groups save calls
@@ -23,6 +23,57 @@ _POLL_SECONDS = 0.05  # between checks of Ctrl-C and updates of the progress bar
 _FIRST_POLL_SECONDS = 0.02  # before the first check
 
 
+class Instances(NamedTuple):
+    """Checked arguments of a batch that may differ between its instances.
+
+    Attributes
+    ----------
+    starts : pair of (batch, nq) arrays or None
+        Initial states, which may be the caller's arrays: they must not be changed, and may contain
+        numbers that are not finite. None if they are already in the arrays of the current states.
+    parameters : (batch or 1, np) array
+        Parameters; a single row applies to all instances.
+    inputs : (batch or 1, steps or 1, nu) array or None
+        Inputs; None: the scene's signals.
+    codes : (batch,) array or None
+        Status number of each instance before the first step: 0, or the number of the failure if its
+        initial state cannot be moved onto the constraints. None if all are 0.
+    """
+
+    starts: tuple[Array, Array] | None
+    parameters: Array
+    inputs: Array | None
+    codes: Array | None = None
+
+    def first_state(self, t0: float) -> State:
+        """Return the state, inputs and parameters of the first instance at time t0, s."""
+        assert self.starts is not None
+        u = None if self.inputs is None else self.inputs[0, 0]
+        return State(self.starts[0][0], self.starts[1][0], t0, u, self.parameters[0])
+
+
+class BatchSteps(NamedTuple):
+    """Fixed steps of a batch.
+
+    Attributes
+    ----------
+    method : str or None
+        Name of the method; None: the first of the scene.
+    h : float
+        Step size, s.
+    t0 : float or (batch,) array
+        Start time, s, of all instances or of each.
+    steps, every : int
+        Numbers of steps, and of steps between two rows (0: no rows).
+    """
+
+    method: str | None
+    h: float
+    t0: Any
+    steps: int
+    every: int = 0
+
+
 class Work:
     """Simulation of a batch with fixed steps, by threads that process groups of instances.
 
@@ -30,24 +81,14 @@ class Work:
 
     Parameters
     ----------
-    step : C function
-        Function that advances a group of instances by steps.
-    q, qd : (batch, nq) arrays
-        Current states, which are overwritten.
-    h : float
-        Step size, s.
-    t0 : float or (batch,) array
-        Start time, s.
-    steps, every : int
-        Numbers of steps, and of steps between two rows.
-    inputs : (batch or 1, steps or 1, nu) array or None
-        Inputs; None: the scene's signals.
-    table : (batch or 1, np) array
-        Parameters.
-    q_rows, qd_rows : (batch, n, nq) arrays or None
+    plan : BatchSteps
+        Method, step size and number of steps.
+    state : pair of (batch, nq) arrays
+        Current positions and velocities, which are overwritten.
+    instances : Instances
+        Initial states, parameters, inputs and status numbers.
+    rows : pair of (batch, n, nq) arrays, optional
         Memory for the rows.
-    starts : pair of (batch, nq) arrays, optional
-        Initial states, which are copied to q and qd; by default q and qd contain them.
 
     Attributes
     ----------
@@ -56,41 +97,38 @@ class Work:
     """
 
     def __init__(
-        self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: Any,
-        steps: int, every: int, inputs: Array | None, table: Array, q_rows: Array | None,
-        qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
+        self, model: Any, plan: BatchSteps, state: tuple[Array, Array], instances: Instances,
+        rows: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
-        self.model, self.step, self.count = model, step, len(q)
-        self.h, self.t0, self.steps, self.every = h, t0, steps, every
-        self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # start time of all or of each
+        q, qd = state
+        self.model, self.count = model, len(q)
+        self.step = model.integrator.c_function(plan.method, "batch")
+        _, self.h, self.t0, self.steps, self.every = plan
+        # start time of all or of each
+        self.begin = np.atleast_1d(np.asarray(plan.t0, model.info.dtype))
         self.first = 0  # the step that `run` begins with
-        self.inputs, self.table = inputs, table
-        self.starts = starts
+        self.inputs, self.table, self.starts = (
+            instances.inputs, instances.parameters, instances.starts,
+        )  # fmt: skip
+        q_rows, qd_rows = (None, None) if rows is None else rows
         self.rows = 0 if q_rows is None else q_rows.shape[1]
         self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
-        address, (long, integer) = model._c[0], model._whole
+        address, (long, integer) = model.c.tools[0], model.batch.count_types
         self.ends = address(long, self.done), address(integer, self.status)
-        self.at = tuple(model._pointer(x) for x in (q, qd, q_rows, qd_rows))
+        self.at = tuple(model.c.pointer(x) for x in (q, qd, q_rows, qd_rows))
         self.failed = self.stop = False
         self.moved = 0
+        if instances.codes is not None:  # the others make no step
+            self.status[:], self.failed = instances.codes, bool(instances.codes.any())
 
     def _places(self, at: int) -> tuple[Any, ...]:
         """Return the pointers to q, qd and their rows of instance `at`."""
-        first = self.model.nq * at
+        first = self.model.info.nq * at
         q, qd, q_rows, qd_rows = self.at
         if not self.rows:
             return q + first, qd + first, q_rows, qd_rows
         row = first * self.rows
         return q + first, qd + first, q_rows + row, qd_rows + row
-
-    def leave(self, codes: Array | None) -> None:
-        """Exclude instances from the simulation whose initial state is already known to fail.
-
-        codes: status number of each instance (batch,). An instance with a number other than 0 gets
-        it as its status and makes no step. None: no instance is excluded.
-        """
-        if codes is not None:
-            self.status[codes != 0], self.failed = codes[codes != 0], True
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """Simulate all instances through all steps; return False if Ctrl-C interrupted the run.
@@ -111,11 +149,11 @@ class Work:
             ),
         )
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
-        self._begin_all(threads if len(groups) > 1 else 1)
+        self._copy_all_starts(threads if len(groups) > 1 else 1)
         total = count * self.steps
         return run_groups(self, groups, threads, lambda: progress and progress(self.moved, total))
 
-    def _begin_all(self, threads: int) -> None:
+    def _copy_all_starts(self, threads: int) -> None:
         """Copy the initial states to the current states and the first rows.
 
         Raises ValueError before any step if one is not finite.
@@ -125,26 +163,30 @@ class Work:
         share = -(-self.count // threads)
         parts = [(at, min(share, self.count - at)) for at in range(0, self.count, share)]
         if len(parts) == 1:
-            self._begin(*parts[0])
+            self._copy_starts(*parts[0])
         else:
-            for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
+            for future in [_pool(threads).submit(self._copy_starts, *part) for part in parts]:
                 future.result()
         self.starts = None  # copied only once
 
-    def _begin(self, at: int, count: int) -> None:
+    def _copy_starts(self, at: int, count: int) -> None:
         assert self.starts is not None
         q, qd, q_rows, qd_rows = self._places(at)
         names = ("q0", q, q_rows), ("qd0", qd, qd_rows)
         for start, (name, x, rows) in zip(self.starts, names, strict=True):
             (far, across), wide = start.strides, start.dtype.itemsize == 8
             first = start.__array_interface__["data"][0] + at * far
-            if not self.model._lib.batch_start(count, first, wide, far, across, x, rows, self.rows):
-                self.model._array(start, name, self.model.nq)  # raises, and says where
+            if not self.model.c.lib.batch_start(
+                count, first, wide, far, across, x, rows, self.rows
+            ):
+                self.model.arguments.array(
+                    start, name, self.model.info.nq
+                )  # raises, and says where
 
-    def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
+    def run_group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
         """Simulate instances at, ..., at + count - 1 through all steps, in chunks."""
         model = self.model
-        pointer, null = model._pointer, model._c[2]
+        pointer, null = model.c.pointer, model.c.tools[2]
         end = at + count
         q, qd, q_rows, qd_rows = self._places(at)
         done, status = (x + at for x in self.ends)
@@ -163,7 +205,10 @@ class Work:
             1,
             int(
                 _FIRST_POLL_SECONDS
-                / (model._paces.get(kind, _DEFAULT_STEP_SECONDS * model.nq) * count)
+                / (
+                    model.batch.step_seconds.get(kind, _DEFAULT_STEP_SECONDS * model.info.nq)
+                    * count
+                )
             ),
         )
         while first < self.steps and not self.stop:
@@ -179,7 +224,7 @@ class Work:
             first += many
             # for the progress bar only: not synchronised between threads
             self.moved += many * count
-            model._paces[kind] = max(1e-10, duration / (many * count))
+            model.batch.step_seconds[kind] = max(1e-10, duration / (many * count))
             many = next_chunk(many, duration, _POLL_SECONDS)
             look()
 
@@ -187,33 +232,14 @@ class Work:
 class BatchStepper:
     """Compute the states of a batch at any times, by whole steps and one shorter last step.
 
-    Parameters
-    ----------
-    method : str or None
-        Name of the method; None: the first of the scene.
-    both : pair of (batch, nq) arrays
-        Current positions and velocities, which are overwritten.
-    t0, h : float
-        Start time and step size, s.
-    inputs : (batch or 1, steps or 1, nu) array or None
-        Inputs; None: the scene's signals.
-    table : (batch or 1, np) array
-        Parameters.
-    starts : pair of (batch, nq) arrays, optional
-        Initial states, which are copied to `both`; by default `both` contains them.
-    first : int
-        Number of steps from t0 to the current states.
+    plan: method, step size and start time, and the number of steps from there to the current
+    states. state: current positions and velocities, (batch, nq) each, which are overwritten.
+    instances: the other arguments; `starts`, if given, are copied to `state`.
     """
 
-    def __init__(
-        self, model: Instances, method: str | None, both: Any, t0: float, h: float,
-        inputs: Array | None, table: Array, starts: tuple[Array, Array] | None = None,
-        first: int = 0,
-    ) -> None:  # fmt: skip
-        self.model, self.method, self.state = model, method, both
-        step = model._stepper(method, "batch")
-        q, qd = both
-        self.work = Work(model, step, q, qd, h, t0, first, 0, inputs, table, None, None, starts)
+    def __init__(self, model: Any, plan: BatchSteps, state: Any, instances: Instances) -> None:
+        self.model, self.method, self.state = model, plan.method, state
+        self.work = Work(model, plan._replace(every=0), state, instances)
 
     def rows(
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
@@ -251,7 +277,7 @@ class BatchStepper:
             n = work.steps
             u = None if inputs is None else inputs[:, min(n, inputs.shape[1] - 1)]
             t, p, method = work.t0 + n * work.h, work.table, self.method
-            good &= self.model.step_batch(q, qd, rest, t, u, p, method=method) == 0
+            good &= self.model.batch.step_batch(q, qd, rest, t, u, p, method=method) == 0
         q[~good] = qd[~good] = np.nan
         return q, qd
 
@@ -259,12 +285,13 @@ class BatchStepper:
 class Grouped(Protocol):
     """Interface of a computation on many instances that `run_groups` distributes over threads.
 
-    The method `_group` processes one group of instances. It returns early if `stop` is set.
+    The method `run_group` processes one group of instances. It returns early if `stop` is set.
     """
 
     stop: bool
 
-    def _group(self, at: int, count: int, look: Callable[[], object] = ...) -> None: ...
+    def run_group(self, at: int, count: int, look: Callable[[], object] = ...) -> None:
+        """Process the group of `count` instances that begins with instance `at`."""
 
 
 def run_groups(
@@ -272,19 +299,19 @@ def run_groups(
 ) -> bool:
     """Process all groups of instances in threads; return False if Ctrl-C interrupted them.
 
-    work: the computation, whose method `_group` processes a group. groups: (index of the first
+    work: the computation, whose method `run_group` processes a group. groups: (index of the first
     instance, number of instances) of each group. threads: number of threads. look: function
     without arguments that is called at regular intervals, for example to update a progress bar.
     """
     if threads == 1 or len(groups) == 1:
         try:
             for group in groups:
-                work._group(*group, look)
+                work.run_group(*group, look)
         except KeyboardInterrupt:
             return False
         return True
     pool = _pool(threads)
-    waiting: set[Future[None]] = {pool.submit(work._group, *group) for group in groups}
+    waiting: set[Future[None]] = {pool.submit(work.run_group, *group) for group in groups}
     try:
         while waiting:
             finished, waiting = wait(waiting, timeout=_POLL_SECONDS, return_when=FIRST_EXCEPTION)

@@ -17,7 +17,7 @@ import numpy as np
 
 from .arguments import Array, not_one_of
 from .atomic_write import File, atomic_write
-from .functions import Functions
+from .interfaces import CompiledModel
 
 
 class Columns:
@@ -28,9 +28,9 @@ class Columns:
     columns but t have the shape (batch, n).
     """
 
-    _model: Functions
+    model: CompiledModel
     outputs: Any  # by name
-    _params: Array
+    parameter_values: Array
     __len__: Callable[[], int]
     _axes: ClassVar[tuple[str, ...]] = ("t",)
     __iter__ = None  # `for name in run` would ask for run[0]
@@ -41,7 +41,7 @@ class Columns:
             "t": partial(getattr, self, "t"),
             **self._named(),
         }
-        names = ("energy", "jacobi") if self._model.has_jacobi else ("energy",)
+        names = ("energy", "jacobi") if self.model.functions.has_jacobi else ("energy",)
         for name in names:
             # a coordinate may have this name
             columns.setdefault(name, partial(getattr, self, name))
@@ -49,15 +49,15 @@ class Columns:
 
     def _named(self) -> dict[str, Callable[[], Array]]:
         """Return the columns of the scene's coordinates, rates, inputs and outputs."""
-        model = self._model
-        rates = [f"{name}_dot" for name in model.coordinates]
-        halves = (("q", model.coordinates), ("qd", rates), ("u", model.inputs))
+        model = self.model
+        rates = [f"{name}_dot" for name in model.info.coordinates]
+        halves = (("q", model.info.coordinates), ("qd", rates), ("u", model.info.inputs))
         columns: dict[str, Callable[[], Array]] = {
             name: partial(self._column, half, k)
             for half, names in halves
             for k, name in enumerate(names)
         }
-        return columns | {name: partial(self._output, name) for name in model.outputs}
+        return columns | {name: partial(self._output, name) for name in model.info.outputs}
 
     def _output(self, name: str) -> Array:
         values: Array = self.outputs[name]
@@ -77,7 +77,7 @@ class Columns:
 
     def __getattr__(self, name: str) -> Any:
         """Return the column of that name from the scene, unless a member has the same name."""
-        named = {} if name.startswith("_") else self._named()
+        named = {} if name.startswith("_") or "model" not in self.__dict__ else self._named()
         if name not in named:
             known = tuple(named)
             raise AttributeError(not_one_of("run", name, known) if known else name)
@@ -93,7 +93,7 @@ class Columns:
         For a batch, the values are arrays (batch,). The dict has the form of the argument `params`
         of `simulate` and `simulate_batch`.
         """
-        names, table = self._model.parameters, self._params
+        names, table = self.model.info.parameters, self.parameter_values
         if table.ndim == 1:
             return dict(zip(names, table.tolist(), strict=True))
         columns = np.broadcast_to(table, (len(self), len(names))).T.copy()
@@ -169,22 +169,22 @@ class Columns:
         instance. Raises ModuleNotFoundError if xarray is not installed.
         """
         xarray = imported("xarray", "to_xarray")
-        model, columns = self._model, self.to_dict()
-        units = dict(model.units)
-        units |= {f"{c}_dot": f"{units[c]}/s" for c in model.coordinates if units.get(c)}
+        model, columns = self.model, self.to_dict()
+        units = dict(model.info.units)
+        units |= {f"{c}_dot": f"{units[c]}/s" for c in model.info.coordinates if units.get(c)}
         t = ("t", columns.pop("t"), {"units": "s"})
         variables = {
             name: (self._axes, column, {"units": units[name]} if name in units else {})
             for name, column in columns.items()
         }
         attributes = {name: getattr(self, name) for name in ("h", "method")}
-        attributes |= {"scene": model.name, "digest": model.digest}
+        attributes |= {"scene": model.info.name, "digest": model.info.digest}
         coordinates = {"t": t} | self._swept(units, {*variables, *self._axes})
         return xarray.Dataset(variables, coords=coordinates, attrs=attributes)
 
     def _swept(self, units: dict[str, str], taken: set[str]) -> dict[str, Any]:
         """Return the parameters that differ between instances by name (params_NAME if taken)."""
-        if self._params.ndim == 1 or len(self._params) == 1:
+        if self.parameter_values.ndim == 1 or len(self.parameter_values) == 1:
             return {}
         return {
             f"params_{name}" if name in taken else name: (

@@ -1,4 +1,12 @@
-"""Error of a run by fixed steps, from step doubling."""
+"""Error of a run by fixed steps, from step doubling, and growth of small differences.
+
+The growth is the factor by which a motion multiplies a small difference of its start. The size of a
+difference d = [dq; dqd] is |d|^2 = dqd' D dqd + (dq/T)' D (dq/T), where D is the mean mass matrix
+along the motion, and T_i is the time in which a difference of q_i changes: the median of
+|dq_i|/|dqd_i| along the motion, at most its duration. So it depends neither on the origin of a
+coordinate, nor on units, nor on how far anything moves; of a harmonic oscillator, for which
+T = 1/omega, it is constant along the motion.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .growth import growth, mean_mass_matrix, norm_root, other_directions
+from .interfaces import CompiledModel
 from .package import reduced
-from .stepping import Stepping
 from .trajectory_data import Trajectory
 
 Array = NDArray[Any]
@@ -24,6 +31,10 @@ _UNRESOLVED = 0.1  # errors above this fraction of a coordinate's scale count as
 _SATURATION = 0.01  # differences above this fraction of the scale no longer grow linearly
 _MAX_SMOOTH_GROWTH = 1e6  # larger growth may come from a discontinuity of the forces
 _REST_ROUNDINGS = 64.0  # velocities that move a position by fewer ulp count as zero
+_GROWTH_STATES = 16  # number of rows of which the mean mass matrix is formed
+_DEFINITE = 1e-12  # smallest eigenvalue of D, relative to the largest
+_MIN_DISTANCE = 1e-6  # relative tolerance of the rank of the initial differences
+_DIRECTIONS = 4  # initial differences, each of which costs a run
 _ROUNDING_RMS = 0.3  # rms rounding error of a sum, relative to eps/2 times its size
 
 
@@ -107,9 +118,9 @@ def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None
     """
     if not run.steps:
         return _zero_error(run)
-    model, own = run._model, run.x.astype(float)
-    order, repeat = model.orders[run.method], _Repetition(run, progress)
-    eps = float(np.finfo(model.dtype).eps) / 2
+    model, own = run.model, run.x.astype(float)
+    order, repeat = model.info.method_table[run.method].order, _Repetition(run, progress)
+    eps = float(np.finfo(model.info.dtype).eps) / 2
     counts = _counts(run, run.every, len(run))
     scale, grown, amplification = _growth(run, own, eps, repeat)
     rounding = eps * np.maximum(grown, np.abs(own))  # of one step, propagated to each row
@@ -127,7 +138,7 @@ def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None
     error = np.maximum(error, np.where(counts[:, None] > 0, least, 0.0))
     error[~np.isfinite(error)] = np.inf
 
-    names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
+    names = [*model.info.coordinates, *(f"{c}_dot" for c in model.info.coordinates)]
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps)) + 0.0  # no -0
     if (walk[-1] > _UNRESOLVED * scale).any() and _is_discontinuous(run, scale, eps, repeat):
@@ -136,8 +147,8 @@ def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None
         run, names, error / scale, walk / scale, observed, order, amplification, stopped
     )
     return Estimate(
-        q=error[:, : model.nq],
-        qd=error[:, model.nq :],
+        q=error[:, : model.info.nq],
+        qd=error[:, model.info.nq :],
         end=dict(zip(names, map(float, error[-1]), strict=True)),
         digits=dict(zip(names, map(float, digits), strict=True)),
         order=order,
@@ -156,7 +167,7 @@ class _Repetition:
     def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Trajectory:
         """Repeat the run in steps of h/parts with rows after `every` steps; nudge: of x(t0)."""
         progress = None if self.progress is None else self._report
-        refined: Trajectory = self.run._repeat(parts, every, nudge, progress)
+        refined: Trajectory = self.run.repeat(parts, every, nudge, progress)
         self.spent += parts * self.run.steps
         if refined.status == "interrupted":
             raise KeyboardInterrupt
@@ -175,12 +186,12 @@ def _growth(
 
     The differences are those at each row after a perturbation of the start by one scale.
     """
-    model, every, base, times = run._model, run.every, own, run.t
+    model, every, base, times = run.model, run.every, own, run.t
     if len(run) < _MIN_ROWS:
         every = max(1, run.steps // _MIN_ROWS)
         refined = repeat(1, every)
         base, times = refined.x.astype(float), refined.t
-    scale = scales(base, float(np.ptp(run.t)), eps, len(model.discrete_coordinates))
+    scale = scales(base, float(np.ptp(run.t)), eps, len(model.info.discrete_coordinates))
     moves = moving_mask(model)
     signs = moves * np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
@@ -203,8 +214,8 @@ def _growth(
         finer = _local_maximum(np.abs(differences[1])) / less
         both = min(len(grown), len(finer))
         grown = np.where(full[:both, None], np.maximum(grown[:both], finer[:both]), grown[:both])
-    D = mean_mass_matrix(model, base[:, : model.nq], times, run._params)
-    place = base[0], float(run.t[0]), run._params
+    D = mean_mass_matrix(model, base[:, : model.info.nq], times, run.parameter_values)
+    place = base[0], float(run.t[0]), run.parameter_values
     amplification = growth_of(model, D, differences, float(np.ptp(run.t)), moves, place, moved)
     counts, steps = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
     rows = np.stack([np.interp(counts, steps, column) for column in grown.T], axis=1)
@@ -212,13 +223,13 @@ def _growth(
 
 
 def growth_of(
-    model: Stepping, D: Array, differences: list[Array], duration: float, moves: Array,
+    model: CompiledModel, D: Array, differences: list[Array], duration: float, moves: Array,
     place: tuple[Array, float, Array], moved: Callable[[Array], Array],
 ) -> float:  # fmt: skip
     """Return the factor by which a motion multiplies small differences of its initial state.
 
-    It is the largest factor over the given differences and further directions, in the norm of the
-    module `growth`.
+    It is the largest factor over the given differences and further directions, in the norm of this
+    module.
 
     Parameters
     ----------
@@ -236,16 +247,18 @@ def growth_of(
         Function that repeats the run from a perturbed start. It takes the perturbation (2 nq,) of
         the initial state and returns the resulting differences of the states, (rows, 2 nq).
     """
-    n, (start, t0, p) = model.nq - len(model.discrete_coordinates), place
-    free = [*range(n), *range(model.nq, model.nq + n)]
+    n, (start, t0, p) = model.info.nq - len(model.info.discrete_coordinates), place
+    free = [*range(n), *range(model.info.nq, model.info.nq + n)]
 
     def allowed(nudge: Array) -> Array:
         """Project a perturbation onto the constraints."""
-        if not model.constraint_names:
+        if not model.info.constraints.names:
             return nudge
         try:
             x = start + nudge
-            solutions = model.project(x[: model.nq], x[model.nq :], t=t0, params=p)
+            solutions = model.constraints.project(
+                x[: model.info.nq], x[model.info.nq :], t=t0, params=p
+            )
         except (ArithmeticError, ValueError):
             return nudge
         return np.asarray(np.concatenate(solutions) - start, float)
@@ -259,12 +272,12 @@ def growth_of(
         ]
         rank = int(np.sum(moves[free]))
         for d in other_directions(root, first[0], moves[free], rank):
-            nudge = np.zeros(2 * model.nq)
+            nudge = np.zeros(2 * model.info.nq)
             nudge[free] = d
             nudge = allowed(nudge)
             solutions = moved(nudge)[:, free]
             own.append(solutions)
-            first.append(solutions[0] if not model.constraint_names else nudge[free])
+            first.append(solutions[0] if not model.info.constraints.names else nudge[free])
         chosen = [0, *range(len(differences), len(first))]
         common = min(len(own[k]) for k in chosen) - 1
         ends = [first[k] for k in chosen], [own[k][common] for k in chosen]
@@ -280,7 +293,7 @@ def _is_discontinuous(run: Trajectory, scale: Array, eps: float, repeat: _Repeti
     """
     every = run.every if len(run) >= _MIN_ROWS else max(1, run.steps // _MIN_ROWS)
     size = max(20 * eps * math.sqrt(run.steps), 1e4 * eps)
-    nudges = (part * size * scale * moving_mask(run._model) for part in (0.0, 1.0, 0.01))
+    nudges = (part * size * scale * moving_mask(run.model) for part in (0.0, 1.0, 0.01))
     base, *moved = (repeat(1, every, nudge).x.astype(float) for nudge in nudges)
     rows = min(len(base), *map(len, moved))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -296,7 +309,7 @@ def _finer(
 
     one: rounding error of one step relative to the scales.
     """
-    solutions, order = [own], run._model.orders[run.method]
+    solutions, order = [own], run.model.info.method_table[run.method].order
     stopped: Trajectory | None = None
     parts, last = 1, math.inf
     while True:
@@ -323,10 +336,10 @@ def _finer(
 
 def _zero_error(run: Trajectory) -> Estimate:
     """Return the estimate of a run without steps: its only row, the start, has no error."""
-    names = [*run._model.coordinates, *(f"{c}_dot" for c in run._model.coordinates)]
+    names = [*run.model.info.coordinates, *(f"{c}_dot" for c in run.model.info.coordinates)]
     none = np.zeros_like(run.q, dtype=float)
-    full = -math.log10(float(np.finfo(run._model.dtype).eps) / 2)
-    order = run._model.orders[run.method]
+    full = -math.log10(float(np.finfo(run.model.info.dtype).eps) / 2)
+    order = run.model.info.method_table[run.method].order
     zero, digits = dict.fromkeys(names, 0.0), dict.fromkeys(names, full)
     return Estimate(none, none.copy(), zero, digits, order, math.nan, 1.0, "")
 
@@ -336,14 +349,14 @@ def _counts(run: Trajectory, every: int, rows: int) -> Array:
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
-def moving_mask(model: Stepping) -> Array:
+def moving_mask(model: CompiledModel) -> Array:
     """Return a mask (2 nq,) of the states [q; qd]: 1 for those that may be perturbed, else 0.
 
     States that only jumps change may not be perturbed.
     """
-    return np.tile(np.arange(model.nq) < model.nq - len(model.discrete_coordinates), 2).astype(
-        float
-    )
+    return np.tile(
+        np.arange(model.info.nq) < model.info.nq - len(model.info.discrete_coordinates), 2
+    ).astype(float)
 
 
 def scales(x: Array, duration: float, eps: float, discrete: int = 0) -> Array:
@@ -390,25 +403,27 @@ def _rms(x: Array) -> float:
 
 def _padded(run: Trajectory, rows: int, every: int) -> Array:
     """Return the states of a finer run at the rows of the original; nan after it stopped."""
-    out = np.full((rows, 2 * run._model.nq), np.nan)
+    out = np.full((rows, 2 * run.model.info.nq), np.nan)
     count = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
     out[:count] = run.x[:count]
     return out
 
 
-def rounding_words(model: Stepping, amplification: float, t_limit: float) -> str:
+def rounding_words(model: CompiledModel, amplification: float, t_limit: float) -> str:
     """Return a sentence that says from which time on rounding errors exceed a tenth of the motion.
 
     It is part of `Estimate.verdict`. model: the scene, whose number type is named. amplification:
     as in `Estimate`; for a large one the sentence calls the motion chaotic. t_limit: the time, s.
     """
-    if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
+    if amplification * math.sqrt(float(np.finfo(model.info.dtype).eps)) > 1:
         return (
             f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
-            f"rounding with it; no run in {model.dtype} means anything from t = {t_limit:.4g} s on"
+            f"rounding with it; no run in {model.info.dtype} means anything from t = "
+            f"{t_limit:.4g} s on"
         )
     return (
-        f"rounding of {model.dtype} is a tenth of the motion from t = {t_limit:.4g} s on, which is "
+        f"rounding of {model.info.dtype} is a tenth of the motion from t = {t_limit:.4g} s on, "
+        "which is "
         "small beside its coordinates: measure these from a nearer origin"
     )
 
@@ -428,7 +443,7 @@ def _verdict(
         )
     if (walk[-1] > _UNRESOLVED).any():
         t_limit = run.t[int(np.argmax((walk > _UNRESOLVED).any(axis=1)))]
-        words.append(rounding_words(run._model, amplification, float(t_limit)))
+        words.append(rounding_words(run.model, amplification, float(t_limit)))
     wrong = relative > _UNRESOLVED
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))
@@ -443,3 +458,73 @@ def _verdict(
             f"2^{order}: h is too long yet, forces jump, or rounding decides"
         )
     return words
+
+
+def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Array:
+    """Return the mean (n, n) of the mass matrices D at some of the states q (rows, n).
+
+    t: their times (rows,), s. params: parameters of the model; None: those of the scene.
+    """
+    rows = np.unique(np.linspace(0, len(q) - 1, _GROWTH_STATES).astype(int))
+    return np.asarray(
+        np.mean([model.functions.D(q[k], t=float(t[k]), params=params) for k in rows], axis=0),
+        float,
+    )
+
+
+def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
+    """Return the matrix W (2n, 2n) that defines the norm |W d| of a difference d = [dq; dqd].
+
+    |W d|^2 = dqd' D dqd + (dq/T)' D (dq/T). D: mean mass matrix (n, n). differences: arrays
+    (rows, 2n) of differences along the motion. The time T of each coordinate is the median of
+    |dq|/|dqd| in these, at most `duration`, s.
+    """
+    values, vectors = np.linalg.eigh((D + D.T) / 2)
+    values = np.maximum(values, _DEFINITE * max(float(values[-1]), np.finfo(float).tiny))
+    root = np.sqrt(values)[:, None] * vectors.T
+    n, rows = len(D), np.concatenate([*differences])
+    times = np.full(n, duration or 1.0)
+    for k in range(n):
+        dq, dqd = np.abs(rows[:, k]), np.abs(rows[:, n + k])
+        good = (dq > 0) & (dqd > 0) & (dq < np.inf) & (dqd < np.inf)
+        if good.any():
+            times[k] = min(times[k], float(np.exp(np.median(np.log(dq[good]) - np.log(dqd[good])))))
+    whole = np.zeros((2 * n, 2 * n))
+    whole[:n, :n], whole[n:, n:] = root / times, root
+    return whole
+
+
+def growth(root: Array, first: Array, last: Array) -> float:
+    """Return the largest factor by which differences of states grow between two times.
+
+    first, last: k differences at the first and at the last time, (2n, k), a column for each. The
+    maximum is over all linear combinations of the columns; inf if a value is not finite. root:
+    matrix W (2n, 2n) of `norm_root`, which defines the norm.
+    """
+    if not (np.isfinite(first).all() and np.isfinite(last).all()):
+        return float("inf")
+    most = float(np.max(np.abs(last), initial=0.0)) or 1.0  # its square may overflow
+    inverse = np.linalg.pinv(root @ first, rcond=_MIN_DISTANCE)
+    return most * float(np.linalg.norm(root @ (last / most) @ inverse, 2))
+
+
+def other_directions(root: Array, first: Array, moves: Array, rank: int) -> list[Array]:
+    """Return further initial differences, (2n,) each, that are orthogonal to `first` (2n,).
+
+    They are also orthogonal to each other, and as large as `first`, in the norm of `root`, the
+    matrix W (2n, 2n) of `norm_root`. moves (2n,): 1 for states that may differ, else 0. rank:
+    dimension of the space of differences; there are fewer than `rank` results.
+    """
+    random, directions = np.random.default_rng(2), [first]
+    size = float(np.linalg.norm(root @ first))
+    widths = np.linalg.norm(root, axis=0)
+    for _ in range(min(rank, _DIRECTIONS) - 1):
+        d = moves * random.standard_normal(len(first)) / widths
+        for other in directions:
+            w = root @ other
+            d = d - other * float(w @ (root @ d)) / max(float(w @ w), np.finfo(float).tiny)
+        length = float(np.linalg.norm(root @ d))
+        if not 0 < length < np.inf:
+            break
+        directions.append(moves * d * (size / length))
+    return directions[1:]

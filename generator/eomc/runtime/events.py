@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .metadata import ModelInfo
+from .interfaces import CompiledModel
 from .package import reduced
 
 # capacity of the buffers, in addition to one event of each kind: of a run, of each of a batch
@@ -92,7 +92,7 @@ class BatchEventBuffer:
     copies them. most: largest number of events that fit in memory.
     """
 
-    def __init__(self, model: ModelInfo, most: float) -> None:
+    def __init__(self, model: CompiledModel, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
@@ -121,7 +121,7 @@ class BatchEventBuffer:
         A row is [t, q, qd]. The occurrences are sorted by instance. An event index is the position
         of the event's name in `events` of the model.
         """
-        none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.nq))
+        none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.info.nq))
         parts = zip(*self.pieces, strict=True) if self.pieces else [[x] for x in none]
         instances, which, rows = (np.concatenate(list(x)) for x in parts)
         order = np.argsort(instances, kind="stable")
@@ -143,15 +143,15 @@ class GroupEventBuffer:
         The arguments of the C function: the capacity, and pointers to these three arrays.
     """
 
-    def __init__(self, model: ModelInfo, count: int) -> None:
+    def __init__(self, model: CompiledModel, count: int) -> None:
         self.counts = np.zeros(count, "l")
-        each = _EVENTS_EACH + len(model.events)
+        each = _EVENTS_EACH + len(model.info.events)
         self.which = np.empty((count, each), np.intc)
-        self.rows = np.empty((count, each, 1 + 2 * model.nq), model.dtype)
-        new = model._ffi.from_buffer
+        self.rows = np.empty((count, each, 1 + 2 * model.info.nq), model.info.dtype)
+        new = model.c.ffi.from_buffer
         self.given = (
             each, new("long[]", self.counts), new("int[]", self.which),
-            model._pointer(self.rows),
+            model.c.pointer(self.rows),
         )  # fmt: skip
 
 
@@ -161,18 +161,18 @@ class EventBuffer:
     One call of C writes into a buffer, from which `keep` copies the events.
     """
 
-    def __init__(self, model: ModelInfo) -> None:
+    def __init__(self, model: CompiledModel) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
-        self.which = np.empty(_EVENTS + len(model.events), np.intc)
-        self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
+        self.which = np.empty(_EVENTS + len(model.info.events), np.intc)
+        self.rows = np.empty((len(self.which), 1 + 2 * model.info.nq), model.info.dtype)
 
     def room(self) -> tuple[Any, ...]:
         """Return the arguments with which a C function writes events into the buffer.
 
         They are the capacity, a pointer to the event indices and a pointer to the rows [t, q, qd].
         """
-        address, real, _ = self.model._c
-        which = self.model._ffi.from_buffer("int[]", self.which)
+        address, real, _ = self.model.c.tools
+        which = self.model.c.ffi.from_buffer("int[]", self.which)
         return len(self.which), which, address(real, self.rows)
 
     def keep(self, work: Any) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, not_one_of
 from .functions import Functions
-from .package import option, reduced
+from .package import Component, option, reduced
 
 
 class Pose(NamedTuple):
@@ -63,7 +63,7 @@ class Momentum(NamedTuple):
         return reduced("frames.Momentum", *self)
 
 
-class Frames(Functions):
+class Frames(Component):
     """Functions of bodies and points (frames): poses, Jacobians, inverse dynamics, momentum.
 
     A module has them if the scene's [run] enables them. A *twist* is the velocity of a frame's
@@ -73,10 +73,10 @@ class Frames(Functions):
     frames have an axis nf after it.
     """
 
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Names of the bodies and points that have poses and Jacobians, in the order of results."""
-        return self._frames[0]
+    path = "frames"
+
+    def __init__(self, functions: Functions) -> None:
+        self.functions, self.arguments, self.info = functions, functions.arguments, functions.info
 
     def pose(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
@@ -103,7 +103,7 @@ class Frames(Functions):
             If `frame` is not among the scene's `frames`.
         """
         poses = self._evaluate_frame("frame_poses", 1, frame, q, None, t, params)
-        if self._plane:
+        if self.info.plane:
             return Pose(poses[..., :2], poses[..., 2])
         return Pose(poses[..., :3], poses[..., 3:].reshape(*poses.shape[:-1], 3, 3))
 
@@ -151,8 +151,8 @@ class Frames(Functions):
         (6,) array, in plane scenes (3,)
             m/s^2 and rad/s^2; with a leading axis n for n states.
         """
-        each = np.zeros(np.shape(q), self.dtype) if qdd is None else qdd
-        full = self._like(each, "qdd", (self.nq,), q)
+        each = np.zeros(np.shape(q), self.info.dtype) if qdd is None else qdd
+        full = self.arguments.for_each_state(each, "qdd", (self.info.nq,), q)
         return self._evaluate_frame("frame_accelerations", 1, frame, q, qd, t, params, full)
 
     def jacobian(
@@ -198,7 +198,7 @@ class Frames(Functions):
         (nq,) or (n, nq) array
             Generalized forces, N or N m.
         """
-        forces: Array = self._evaluate(
+        forces: Array = self.functions.evaluate(
             "frame_forces", q, None, t, None, params, None, self._wrenches(wrenches, q)
         )
         return forces
@@ -234,10 +234,10 @@ class Frames(Functions):
         ValueError
             If `f_ext` is given and the module has no frames.
         """
-        if f_ext is not None and not self.frames:
+        if f_ext is not None and not self.info.frames:
             raise ValueError(f"f_ext acts at frames: build it with {option('frames')}")
-        accelerations = self._like(qdd, "qdd", (self.nq,), q)
-        forces: Array = self._evaluate(
+        accelerations = self.arguments.for_each_state(qdd, "qdd", (self.info.nq,), q)
+        forces: Array = self.functions.evaluate(
             "inverse_dynamics", q, qd, t, None, params, None, accelerations
         )
         return forces if f_ext is None else forces - self.frame_forces(q, f_ext, t=t, params=params)
@@ -259,53 +259,34 @@ class Frames(Functions):
         Momentum
             Named tuple (mass, center, linear, angular); with a leading axis n for n states.
         """
-        d = 2 if self._plane else 3
-        x = self._evaluate("momentum", q, qd, t, None, params)
-        angular = x[..., -1] if self._plane else x[..., 7:]
+        d = 2 if self.info.plane else 3
+        x = self.functions.evaluate("momentum", q, qd, t, None, params)
+        angular = x[..., -1] if self.info.plane else x[..., 7:]
         return Momentum(x[..., 0], x[..., 1 : 1 + d], x[..., 1 + d : 1 + 2 * d], angular)
-
-    # --- calls of C ------------------------------------------------------------------------------
-
-    @property
-    def _plane(self) -> bool:
-        return self._frames[1]
-
-    @property
-    def _width(self) -> int:
-        return 3 if self._plane else 6
 
     def _evaluate_frame(
         self, name: str, axes: int, frame: str | None, q: ArrayLike, qd: ArrayLike | None, t: float,
         params: Parameters, extra: Array | None = None,
     ) -> Array:  # fmt: skip
         """Evaluate a function of all frames; return the part of one, which has `axes` axes."""
-        if not (frame is None or frame in self.frames):
-            raise ValueError(not_one_of("frame", frame, self.frames))
-        values: Array = self._evaluate(name, q, qd, t, None, params, None, extra)
+        if not (frame is None or frame in self.info.frames):
+            raise ValueError(not_one_of("frame", frame, self.info.frames))
+        values: Array = self.functions.evaluate(name, q, qd, t, None, params, None, extra)
         if frame is None:
             return values
-        one: Array = values.take(self.frames.index(frame), axis=values.ndim - 1 - axes)
+        one: Array = values.take(self.info.frames.index(frame), axis=values.ndim - 1 - axes)
         return one
 
-    def _like(self, x: ArrayLike, name: str, shape: tuple[int, ...], q: ArrayLike) -> Array:
-        """Return x as an array with a row for each state; one row is repeated for all."""
-        array, rows = self._numbers(x, name), np.shape(q)[:-1]
-        expected = rows + shape
-        if array.shape not in (expected, shape):
-            raise ValueError(f"{name}: shape {array.shape}, expected {expected}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name}: not all numbers are finite")
-        full = np.broadcast_to(array, expected).reshape(*rows, -1)
-        return np.ascontiguousarray(full)
-
     def _wrenches(self, wrenches: Mapping[str, ArrayLike] | ArrayLike, q: ArrayLike) -> Array:
-        shape = (len(self.frames), self._width)
+        shape = (len(self.info.frames), self.info.frame_size)
         if not isinstance(wrenches, Mapping):
-            return self._like(wrenches, "wrenches", shape, q)
-        each = np.zeros((*np.shape(q)[:-1], *shape), self.dtype)
+            return self.arguments.for_each_state(wrenches, "wrenches", shape, q)
+        each = np.zeros((*np.shape(q)[:-1], *shape), self.info.dtype)
         for name, wrench in wrenches.items():
-            if name not in self.frames:
-                raise ValueError(not_one_of("wrenches", name, self.frames))
-            place = self.frames.index(name)
-            each[..., place, :] = self._like(wrench, f"wrenches: {name}", shape[1:], q)
+            if name not in self.info.frames:
+                raise ValueError(not_one_of("wrenches", name, self.info.frames))
+            place = self.info.frames.index(name)
+            each[..., place, :] = self.arguments.for_each_state(
+                wrench, f"wrenches: {name}", shape[1:], q
+            )
         return each.reshape(*each.shape[:-2], -1)

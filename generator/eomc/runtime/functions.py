@@ -15,8 +15,9 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from .arguments import Arguments, Array, Parameters, StateArguments, as_flag, as_number
-from .package import named_outputs, option
-from .slices import slices
+from .c_library import slices
+from .info import SceneInfo
+from .package import Component, named_outputs, option
 from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 
 _ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at most
@@ -28,12 +29,12 @@ class StateFunction(NamedTuple):
     Attributes
     ----------
     shape : callable
-        Function that takes the model and returns the shape of the result at one state.
+        Function that takes the `SceneInfo` and returns the shape of the result at one state.
     of_velocity : bool
         Whether the generated C function takes the velocities qd as well as q.
     """
 
-    shape: Callable[[Any], tuple[int, ...]]
+    shape: Callable[[SceneInfo], tuple[int, ...]]
     of_velocity: bool = True
 
 
@@ -56,26 +57,30 @@ FUNCTIONS: Mapping[str, StateFunction] = {
     "sensitivity": StateFunction(lambda m: (m.nq, len(m.parameters))),
     "output_sensitivity": StateFunction(lambda m: (len(m.outputs), len(m.parameters))),
     "frame_poses": StateFunction(
-        lambda m: (len(m.frames), 3 if m._plane else 12), of_velocity=False
+        lambda m: (len(m.frames), 3 if m.plane else 12), of_velocity=False
     ),
-    "frame_velocities": StateFunction(lambda m: (len(m.frames), m._width)),
-    "frame_accelerations": StateFunction(lambda m: (len(m.frames), m._width)),
-    "frame_jacobians": StateFunction(lambda m: (len(m.frames), m._width, m.nq), of_velocity=False),
+    "frame_velocities": StateFunction(lambda m: (len(m.frames), m.frame_size)),
+    "frame_accelerations": StateFunction(lambda m: (len(m.frames), m.frame_size)),
+    "frame_jacobians": StateFunction(
+        lambda m: (len(m.frames), m.frame_size, m.nq), of_velocity=False
+    ),
     "frame_forces": StateFunction(lambda m: (m.nq,), of_velocity=False),
     "inverse_dynamics": StateFunction(lambda m: (m.nq,)),
-    "momentum": StateFunction(lambda m: (6 if m._plane else 10,)),
-    "constraints": StateFunction(lambda m: (len(m._rows.names),)),
-    "constraint_rates": StateFunction(lambda m: (len(m._rows.names),)),
-    "constraint_jacobian": StateFunction(lambda m: (len(m._rows.names), m.nq), of_velocity=False),
-    "constraint_slopes": StateFunction(lambda m: (len(m._rows.names), m.nq)),
-    "multipliers": StateFunction(lambda m: (len(m._rows.names),)),
-    "reactions": StateFunction(lambda m: (len(m._rows.loops), m._width)),
+    "momentum": StateFunction(lambda m: (6 if m.plane else 10,)),
+    "constraints": StateFunction(lambda m: (len(m.constraints.names),)),
+    "constraint_rates": StateFunction(lambda m: (len(m.constraints.names),)),
+    "constraint_jacobian": StateFunction(
+        lambda m: (len(m.constraints.names), m.nq), of_velocity=False
+    ),
+    "constraint_slopes": StateFunction(lambda m: (len(m.constraints.names), m.nq)),
+    "multipliers": StateFunction(lambda m: (len(m.constraints.names),)),
+    "reactions": StateFunction(lambda m: (len(m.constraints.loops), m.frame_size)),
     "events": StateFunction(lambda m: (len(m.events),)),
     "jumps": StateFunction(lambda m: (len(m.events), 2 * m.nq)),
 }
 
 
-class Functions(Arguments):
+class Functions(Component):
     """Functions of the state of a compiled scene: D, C, g, energies, accelerations, derivatives.
 
     All methods take one state, q and qd (nq,), or n states, (n, nq). For n states the results have
@@ -87,7 +92,14 @@ class Functions(Arguments):
     arguments raise ValueError.
     """
 
-    def _evaluate(
+    path = "functions"
+
+    def __init__(self, arguments: Arguments) -> None:
+        self.arguments, self.info, self.c = arguments, arguments.info, arguments.c
+        self.nq, self.dtype = self.info.nq, self.info.dtype
+        self._bound: dict[str, Any] = {}  # by name: C function, shape, whether it reads qd
+
+    def evaluate(
         self, name: str, q: ArrayLike, qd: ArrayLike | None, t: Any = 0.0, u: Any = None,
         params: Any = None, out: Any = None, extra: Array | None = None,
     ) -> Any:  # fmt: skip
@@ -95,24 +107,24 @@ class Functions(Arguments):
 
         extra: the argument in place of u of some functions, one for all states or one each.
         """
-        address, real, null = self._c
-        if (bound := self._functions.get(name)) is None:
+        address, real, null = self.c.tools
+        if (bound := self._bound.get(name)) is None:
             of = FUNCTIONS[name]
-            bound = getattr(self._lib, name, None), of.shape(self), of.of_velocity
-            self._functions[name] = bound
+            bound = getattr(self.c.lib, name, None), of.shape(self.info), of.of_velocity
+            self._bound[name] = bound
         function, shape, of_velocity = bound
         at: Any
         if of_velocity:
-            from_q, from_qd, at, _ = self._read(q, qd)
+            from_q, from_qd, at, _ = self.arguments.read_state(q, qd)
         else:
-            at, from_q, from_qd = q, self._listed(q, self._shape), null
+            at, from_q, from_qd = q, self.arguments.as_list(q, self.arguments.small_shape), null
             if from_q is None:
-                at = self._array(q, "q", self.nq)
+                at = self.arguments.array(q, "q", self.nq)
                 from_q = address(real, at)
         rows = at.shape[:-1]
-        result = self._out(out, rows + shape)
+        result = self.arguments.output_array(out, rows + shape)
         if rows or extra is not None:
-            acts = StateArguments(self, rows, t, u, params, extra)
+            acts = StateArguments(self.arguments, rows, t, u, params, extra)
             to, size = address(real, result), result[:1].size if rows else 0
             for k, many in slices(rows[0] if rows else 1, _ROWS // self.nq**2 + 1):
                 if function is None:
@@ -123,7 +135,7 @@ class Functions(Arguments):
                     many, to + size * k, from_q + here if k else from_q, moving, *acts.pointers(k)
                 )
         else:
-            time, (inputs, p) = as_number(t, "t"), self._input_pointers(u, params)
+            time, (inputs, p) = as_number(t, "t"), self.arguments.input_pointers(u, params)
             if function is not None:
                 function(1, address(real, result), from_q, from_qd, time, inputs, p, null)
         if function is None:  # no forces, no power
@@ -155,7 +167,7 @@ class Functions(Arguments):
         (nq, nq) or (n, nq, nq) array
             Kinetic energy is qd^T D qd / 2 for models whose K is quadratic in qd.
         """
-        return self._evaluate("D", q, None, t, None, params, out)
+        return self.evaluate("D", q, None, t, None, params, out)
 
     def C(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -174,7 +186,7 @@ class Functions(Arguments):
         -------
         (nq, nq) or (n, nq, nq) array
         """
-        return self._evaluate("C", q, qd, t, None, params, out)
+        return self.evaluate("C", q, qd, t, None, params, out)
 
     def g(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
         """Return g(q) = dP/dq, the gradient of the potential energy P.
@@ -191,7 +203,7 @@ class Functions(Arguments):
         (nq,) or (n, nq) array
             Generalized forces, N or N m, on the left-hand side of D qdd + C qd + g = tau.
         """
-        return self._evaluate("g", q, None, t, None, params, out)
+        return self.evaluate("g", q, None, t, None, params, out)
 
     def bias(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -211,7 +223,7 @@ class Functions(Arguments):
         (nq,) or (n, nq) array
             Generalized forces, N or N m.
         """
-        return self._evaluate("bias", q, qd, t, None, params, out)
+        return self.evaluate("bias", q, qd, t, None, params, out)
 
     def tau(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
@@ -236,7 +248,7 @@ class Functions(Arguments):
         (nq,) or (n, nq) array
             Generalized forces, N or N m.
         """
-        return self._evaluate("tau", q, qd, t, u, params, out)
+        return self.evaluate("tau", q, qd, t, u, params, out)
 
     def kinetic_energy(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -246,7 +258,7 @@ class Functions(Arguments):
 
         t: time, s; params: parameters that differ from the scene's; out: array for the result.
         """
-        return self._evaluate("kinetic_energy", q, qd, t, None, params, out)
+        return self.evaluate("kinetic_energy", q, qd, t, None, params, out)
 
     def potential_energy(
         self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None
@@ -255,7 +267,7 @@ class Functions(Arguments):
 
         t: time, s; params: parameters that differ from the scene's; out: array for the result.
         """
-        return self._evaluate("potential_energy", q, None, t, None, params, out)
+        return self.evaluate("potential_energy", q, None, t, None, params, out)
 
     def energy(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -265,7 +277,7 @@ class Functions(Arguments):
 
         t: time, s; params: parameters that differ from the scene's; out: array for the result.
         """
-        return self._evaluate("energy", q, qd, t, None, params, out)
+        return self.evaluate("energy", q, qd, t, None, params, out)
 
     def jacobi(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -278,7 +290,7 @@ class Functions(Arguments):
         from the scene's; out: array that receives the result.
         """
         name = "jacobi" if self.has_jacobi else "energy"
-        return self._evaluate(name, q, qd, t, None, params, out)
+        return self.evaluate(name, q, qd, t, None, params, out)
 
     @property
     def has_jacobi(self) -> bool:
@@ -286,7 +298,7 @@ class Functions(Arguments):
 
         They differ if the kinetic energy K is not purely quadratic in qd.
         """
-        return hasattr(self._lib, "jacobi")
+        return hasattr(self.c.lib, "jacobi")
 
     @property
     def has_power(self) -> bool:
@@ -294,7 +306,7 @@ class Functions(Arguments):
 
         If False, `power` is always zero.
         """
-        return hasattr(self._lib, "power")
+        return hasattr(self.c.lib, "power")
 
     def power(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
@@ -319,7 +331,7 @@ class Functions(Arguments):
         -------
         float or (n,) array
         """
-        return self._evaluate("power", q, qd, t, u, params, out)
+        return self.evaluate("power", q, qd, t, u, params, out)
 
     def signal(self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None) -> Any:
         """Return the values of the scene's input signals at a state and time, before saturation.
@@ -336,12 +348,12 @@ class Functions(Arguments):
         (nu,) or (n, nu) array
             A value for each input, in the order of `inputs`.
         """
-        return self._evaluate("signal", q, qd, t, None, params)
+        return self.evaluate("signal", q, qd, t, None, params)
 
     @property
     def has_limits(self) -> bool:
         """True if at least one input of the scene has limits (saturates)."""
-        return hasattr(self._lib, "applied")
+        return hasattr(self.c.lib, "applied")
 
     def limits(self, params: Parameters = None) -> dict[str, tuple[float, float]]:
         """Return the limits of each input.
@@ -356,10 +368,13 @@ class Functions(Arguments):
         dict
             (smallest, largest) value by the input's name; -inf and inf for an input without limits.
         """
-        far, params = float(np.finfo(self.dtype).max), self._parameters(params)
-        both = [self._within(np.full(self.nu, x, self.dtype), params).tolist() for x in (-far, far)]
+        far, params = float(np.finfo(self.dtype).max), self.arguments.parameters(params)
+        both = [
+            self.saturate(np.full(self.info.nu, x, self.dtype), params).tolist()
+            for x in (-far, far)
+        ]
         ends = [[x if abs(x) < far else copysign(inf, x) for x in some] for some in both]
-        return dict(zip(self.inputs, zip(*ends, strict=True), strict=True))
+        return dict(zip(self.info.inputs, zip(*ends, strict=True), strict=True))
 
     def applied(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -380,29 +395,29 @@ class Functions(Arguments):
         (nu,) or (n, nu) array
         """
         if self.has_limits:
-            return np.asarray(self._evaluate("applied", q, qd, t, u, params))
-        at, moving = self._state(q, qd)
+            return np.asarray(self.evaluate("applied", q, qd, t, u, params))
+        at, moving = self.arguments.state(q, qd)
         rows = at.shape[:-1]
-        u_rows = StateArguments(self, rows, t, u, params).u_rows
+        u_rows = StateArguments(self.arguments, rows, t, u, params).u_rows
         inputs = self.signal(at, moving, t, params) if u_rows is None else u_rows
-        return np.asarray(np.broadcast_to(inputs, (*rows, self.nu)))
+        return np.asarray(np.broadcast_to(inputs, (*rows, self.info.nu)))
 
-    def _within(self, u: Array, params: Any) -> Array:
+    def saturate(self, u: Array, params: Any) -> Array:
         """Inputs (..., nu) within their limits: what becomes of the largest and least numbers.
 
         params: those of all inputs, or a row each for the first axis of u.
         """
         if not self.has_limits:
             return u
-        far = np.full(self.nu, np.finfo(self.dtype).max, self.dtype)
-        q, qd = self._start
-        if len(table := self._parameter_rows(params)) > 1:
+        far = np.full(self.info.nu, np.finfo(self.dtype).max, self.dtype)
+        q, qd = self.info.initial_state
+        if len(table := self.arguments.parameter_rows(params)) > 1:
             q, qd = (np.tile(x, (len(table), 1)) for x in (q, qd))
         else:
             table = table[0]
-        ends = [self._evaluate("applied", q, qd, 0.0, x, table) for x in (-far, far)]
+        ends = [self.evaluate("applied", q, qd, 0.0, x, table) for x in (-far, far)]
         if q.ndim > 1:
-            ends = [x.reshape(len(x), *(1,) * (u.ndim - 2), self.nu) for x in ends]
+            ends = [x.reshape(len(x), *(1,) * (u.ndim - 2), self.info.nu) for x in ends]
         return np.asarray(np.clip(u, *ends))
 
     def output(
@@ -431,9 +446,9 @@ class Functions(Arguments):
         ValueError
             If the scene has no outputs.
         """
-        if not self.outputs:
-            raise ValueError(f"output: {self.name} has none: {named_outputs()}")
-        values: Array = self._evaluate("outputs", q, qd, t, u, params, out)
+        if not self.info.outputs:
+            raise ValueError(f"output: {self.info.name} has none: {named_outputs()}")
+        values: Array = self.evaluate("outputs", q, qd, t, u, params, out)
         return values
 
     def acceleration(
@@ -461,17 +476,17 @@ class Functions(Arguments):
         MotionError
             If D is singular or a result is not finite; `out` is then unchanged.
         """
-        from_q, from_qd, at, moving = self._read(q, qd)
+        from_q, from_qd, at, moving = self.arguments.read_state(q, qd)
         values = result = empty(at.shape, self.dtype)
         if out is not None:
-            result = self._out(out, at.shape)
-        to, function, done = self._pointer(values), self._lib.acceleration, 0
+            result = self.arguments.output_array(out, at.shape)
+        to, function, done = self.c.pointer(values), self.c.lib.acceleration, 0
         if at.ndim == 1:
-            time, (inputs, p) = as_number(t, "t"), self._input_pointers(u, params)
-            code = function(1, to, from_q, from_qd, time, inputs, p, self._c[2])
+            time, (inputs, p) = as_number(t, "t"), self.arguments.input_pointers(u, params)
+            code = function(1, to, from_q, from_qd, time, inputs, p, self.c.null)
             status = STATUS[code & 7]
         else:
-            n, acts = self.nq, StateArguments(self, at.shape[:1], t, u, params)
+            n, acts = self.nq, StateArguments(self.arguments, at.shape[:1], t, u, params)
             done, status = self._all_rows(
                 lambda k, many: function(
                     many, to + n * k, from_q + n * k, from_qd + n * k, *acts.pointers(k)
@@ -493,7 +508,7 @@ class Functions(Arguments):
     @property
     def has_slopes(self) -> bool:
         """True if the module was built with derivatives of its accelerations (`linearize`)."""
-        return hasattr(self._lib, "linearization")
+        return hasattr(self.c.lib, "linearization")
 
     def linearize(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Any = None, *,
@@ -540,39 +555,41 @@ class Functions(Arguments):
         """
         if not self.has_slopes:
             raise ValueError(
-                f"linearize: {self.name} was built without it: build it with {option('linearize')}"
+                f"linearize: {self.info.name} was built without it: build it with "
+                f"{option('linearize')}"
             )
         outputs, closed = as_flag(outputs, "outputs"), as_flag(closed, "closed")
-        if outputs and not self.outputs:
-            raise ValueError(f"linearize: {self.name} has no outputs: {named_outputs()}")
-        if outputs and not hasattr(self._lib, "output_slopes"):
+        if outputs and not self.info.outputs:
+            raise ValueError(f"linearize: {self.info.name} has no outputs: {named_outputs()}")
+        if outputs and not hasattr(self.c.lib, "output_slopes"):
             raise ValueError(
-                f"linearize: {self.name} was built without derivatives of its outputs: build it "
+                f"linearize: {self.info.name} was built without derivatives of its outputs: "
+                "build it "
                 f"with {option('linearize')}"
             )
-        at, moving = self._state(q, qd)
-        A, B = self._slopes(at, moving, u, t, params)
+        at, moving = self.arguments.state(q, qd)
+        A, B = self.slopes(at, moving, u, t, params)
         both = [(A, B)]
         if outputs:
-            n, m = self.nq, self.nu
-            slopes = self._evaluate("output_slopes", at, moving, t, u, params)
+            n, m = self.nq, self.info.nu
+            slopes = self.evaluate("output_slopes", at, moving, t, u, params)
             by_state, by_u, by_qdd = np.split(slopes, [2 * n, 2 * n + m], axis=-1)
             both.append((by_state + by_qdd @ A[..., n:, :], by_u + by_qdd @ B[..., n:, :]))
         if closed:
-            K = self._feedback(at, moving, u, t, params)
+            K = self.feedback(at, moving, u, t, params)
             both = [(by_state + by_u @ K, by_u) for by_state, by_u in both]
         return tuple(x for pair in both for x in pair)
 
-    def _slopes(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> tuple[Array, Array]:
+    def slopes(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> tuple[Array, Array]:
         """A and B of states (nq,) or (n, nq). Raises MotionError."""
-        n, m, rows = self.nq, self.nu, q.shape[:-1]
+        n, m, rows = self.nq, self.info.nu, q.shape[:-1]
         A, B = np.zeros((*rows, 2 * n, 2 * n), self.dtype), np.zeros((*rows, 2 * n, m), self.dtype)
         A_q, A_qd, B_u = (empty((*rows, n, w), self.dtype) for w in (n, n, m))
-        out = [(self._pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
-        from_q, from_qd = self._pointer(q), self._pointer(qd)
-        acts = StateArguments(self, rows, t, u, params)
+        out = [(self.c.pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
+        from_q, from_qd = self.c.pointer(q), self.c.pointer(qd)
+        acts = StateArguments(self.arguments, rows, t, u, params)
         done, status = self._all_rows(
-            lambda k, many: self._lib.linearization(
+            lambda k, many: self.c.lib.linearization(
                 many, *(to + k * size for to, size in out), from_q + n * k, from_qd + n * k,
                 *acts.pointers(k),
             ),
@@ -590,16 +607,17 @@ class Functions(Arguments):
         A[..., n:, :n], A[..., n:, n:], B[..., n:, :] = A_q, A_qd, B_u
         return A, B
 
-    def _feedback(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> Array:
+    def feedback(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> Array:
         """du/dx of the scene's signals, (nu, 2 nq), with a leading n for many states."""
         if u is not None:
             raise ValueError("closed: is for the scene's signals: give no u, which would be held")
-        if not hasattr(self._lib, "signal_slopes"):
+        if not hasattr(self.c.lib, "signal_slopes"):
             raise ValueError(
-                f"closed: {self.name} has no loop to close: no signal is a smooth function of the "
+                f"closed: {self.info.name} has no loop to close: no signal is a smooth function "
+                "of the "
                 "state"
             )
-        K: Array = self._evaluate("signal_slopes", q, qd, t, None, params)
+        K: Array = self.evaluate("signal_slopes", q, qd, t, None, params)
         return K
 
     def sensitivity(
@@ -631,23 +649,23 @@ class Functions(Arguments):
         ValueError
             If the module was built without these derivatives, or has no outputs.
         """
-        if not hasattr(self._lib, "sensitivity"):
+        if not hasattr(self.c.lib, "sensitivity"):
             raise ValueError(
-                f"sensitivity: {self.name} was built without it: build it, with parameters, with "
-                + option("linearize", '"parameters"')
+                f"sensitivity: {self.info.name} was built without it: build it, with "
+                "parameters, with " + option("linearize", '"parameters"')
             )
-        E: Array = self._evaluate("sensitivity", q, qd, t, u, params)
+        E: Array = self.evaluate("sensitivity", q, qd, t, u, params)
         if not np.isfinite(E).all():
             k = np.argwhere(~np.isfinite(E))[0, : E.ndim - 2]
             where = state_text(*(np.asarray(x)[tuple(k)] for x in (q, qd)))
             raise MotionError(f"at {where}: a derivative is not finite there", "not finite")
         if not as_flag(outputs, "outputs"):
             return E
-        if not self.outputs:
-            raise ValueError(f"sensitivity: {self.name} has no outputs: {named_outputs()}")
-        slopes = self._evaluate("output_slopes", q, qd, t, u, params)
-        by_qdd = slopes[..., 2 * self.nq + self.nu :]
-        return E, self._evaluate("output_sensitivity", q, qd, t, u, params) + by_qdd @ E
+        if not self.info.outputs:
+            raise ValueError(f"sensitivity: {self.info.name} has no outputs: {named_outputs()}")
+        slopes = self.evaluate("output_slopes", q, qd, t, u, params)
+        by_qdd = slopes[..., 2 * self.nq + self.info.nu :]
+        return E, self.evaluate("output_sensitivity", q, qd, t, u, params) + by_qdd @ E
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """Return dx/dt = [qd; qdd] for x = [q; qd], as `scipy.integrate.solve_ivp` calls it.
@@ -671,7 +689,7 @@ class Functions(Arguments):
         MotionError
             If D is singular or an acceleration is not finite.
         """
-        n, state = self.nq, self._numbers(x, "x")
+        n, state = self.nq, self.arguments.numbers(x, "x")
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
         out = empty(2 * n, self.dtype)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .labels import plain
-from .plugins import require_eomc
+from .package import require_eomc
 
 SHOWN = 12  # maximum number of coordinates in the table
 
@@ -22,7 +22,7 @@ def html(run: Any) -> str:
     Names and titles from the scene are escaped, and nothing is loaded from URLs. Without matplotlib
     there is no picture.
     """
-    model = run._model
+    model = run.model
     words = [f"{run.steps} steps of {run.method}, {run.description}"]
     words += [f"to t = {run.t[-1]:g} s"] if len(run) else []
     words.append(f"status: {run.status}" if run.status == "ok" else run.message)
@@ -30,14 +30,14 @@ def html(run: Any) -> str:
         error = max(float(np.max(x[-1])) for x in (run.error.q, run.error.qd))
         words.append(run.error.warning or f"error at the end about {error:.1g}")
     rows = ["<tr><td>at the end</td></tr>"] if len(run) else []
-    for k, name in enumerate(model.coordinates[:SHOWN] if len(run) else ()):
-        unit = plain(model.units.get(name, ""))
+    for k, name in enumerate(model.info.coordinates[:SHOWN] if len(run) else ()):
+        unit = plain(model.info.units.get(name, ""))
         q, qd = (f"{x[-1, k] + 0.0:.9g}" for x in (run.q, run.qd))  # no -0
         cells = (name, f"{q} {unit}", f"{name}_dot", f"{qd} {unit and unit + '/s'}")
         rows.append("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in cells) + "</tr>")
-    if (more := len(model.coordinates) - SHOWN) > 0:
+    if (more := len(model.info.coordinates) - SHOWN) > 0:
         rows.append(f"<tr><td>and {more} more</td></tr>")
-    title = plain(model.title or model.name).replace(r"\$", "$")
+    title = plain(model.info.title or model.info.name).replace(r"\$", "$")
     parts = [f"<b>{escape(title)}</b>", *(escape(plain(w)) for w in words)]
     return f"<div>{'<br>'.join(parts)}<table>{''.join(rows)}</table>{_picture(run)}</div>"
 

@@ -12,8 +12,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 # How another process locates this package if its name cannot be imported: (function, place), set
 # by the loader.
@@ -21,7 +22,8 @@ unpickler: tuple[Callable[..., Any], tuple[str, ...]] | None = None
 
 # the built package, such as "cartpole"; "eomc" within the generator, which is no build
 _BUILT = str(__package__).rpartition(".")[0]
-MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all others are of data
+# paths of the code of a build, relative to the package; all other pickled values are data
+MODULE, MODEL, COMPONENT = "_self", "_model.itself", "_model.component"
 
 
 class Identity(NamedTuple):
@@ -58,14 +60,19 @@ def identity() -> tuple[Any, ...]:
     if (model := getattr(package, "_model", None)) is None:
         return ()
     return (
-        package._extension.__name__.rpartition(".")[2], model.digest, model.dtype.name,
-        model.coordinates, model.parameters, model.inputs, model.events,
+        package._extension.__name__.rpartition(".")[2], model.info.digest, model.info.dtype.name,
+        model.info.coordinates, model.info.parameters, model.info.inputs, model.info.events,
     )  # fmt: skip
 
 
 def own_model() -> Any:
     """Return the `Model` of the built package to which this module belongs."""
-    return import_module(_BUILT)._model
+    return model_of(import_module(_BUILT))
+
+
+def model_of(package: ModuleType) -> Any:
+    """Return the `Model` of a built package; None if the module is not a built package."""
+    return vars(package).get("_model")
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
@@ -78,6 +85,18 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
         return unpickled, (identity(), path, arguments)
     function, place = unpickler
     return function, (place, identity(), path, arguments)
+
+
+class Component:
+    """Part of a `Model`. It belongs to a build and is pickled by its name.
+
+    path: attribute of the model that contains the part.
+    """
+
+    path: ClassVar[str]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced(COMPONENT, self.path)
 
 
 def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
@@ -121,7 +140,7 @@ def refusal(pickled: tuple[Any, ...], path: str) -> str:
     if own[:2] == other[:2]:
         return ""
     name = own_model().name
-    if path in (MODULE, MODEL):
+    if path in (MODULE, MODEL, COMPONENT):
         return (
             f"{name}: this was pickled by the build {other.extension}, which is gone; the build "
             f"here is {own.extension}: load the scene again and pickle its module"
@@ -225,10 +244,10 @@ def initial_value_message(model: Any, name: str) -> str:
 
     The remedy says in which argument the value of the coordinate is given.
     """
-    if name in model.discrete_coordinates:
+    if name in model.info.discrete_coordinates:
         return (
             f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
-            f"it in q0, [{', '.join(model.coordinates)}], or eomc run --start {name}=..."
+            f"it in q0, [{', '.join(model.info.coordinates)}], or eomc run --start {name}=..."
         )
     return f"'{name}' is a coordinate: give it in q0"
 
@@ -250,13 +269,13 @@ def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]
     from inspect import signature  # of use here alone
 
     name, known = next(iter(unknown)), [*signature(call).parameters][:-1]  # all but **unknown
-    table = "params" if name in model.parameters else "u" if name in model.inputs else ""
+    table = "params" if name in model.info.parameters else "u" if name in model.info.inputs else ""
     near = (
         f": write {table}={{'{name}': ...}}"
         if table
         else suggestion(_CALLED.get(name, name), known)
     )
-    if name in model.coordinates:
+    if name in model.info.coordinates:
         near = f": {initial_value_message(model, name)}"
     near = near or f": it has {', '.join(known)}"
     return TypeError(f"{call.__name__} has no argument '{name}'{near}")
@@ -282,6 +301,59 @@ def _of_eomc(package: str) -> bool:
     )
 
 
+def require_eomc(module: str, what: str = "runs are drawn") -> Any:
+    """Import and return the module `eomc.<module>` of the installed package eomc.
+
+    A built package needs eomc only for pictures and for events that the scene does not define.
+    what: the purpose, as the beginning of the error message. Raises ImportError, with a remedy, if
+    eomc is not installed.
+    """
+    try:
+        return import_module(f"eomc.{module}")
+    except ModuleNotFoundError as fault:
+        if not str(fault.name).startswith("eomc"):
+            raise
+        raise ImportError(
+            f"{what} by eomc, which is not here: in its clone 'pip install .' "
+            "installs it, elsewhere 'pip install' with the file of its wheel"
+        ) from None
+
+
+def with_events(call: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """Return the model extended by a call's additional events, and the other arguments of the call.
+
+    call: the method that the user called. arguments: all its local variables, including "self" (a
+    `Component`), "events" and "unknown" (arguments that the method does not have). Raises TypeError
+    for unknown arguments.
+
+    A parameter that a jump of an additional event sets is a state of the extended model, not a
+    parameter. Therefore only the parameters that differ from the scene's values are passed on.
+    """
+    part, events, unknown = (arguments.pop(name) for name in ("self", "events", "unknown"))
+    model = part.model
+    if unknown:
+        raise no_argument(model, call, unknown)
+    other = eventful(model, events)
+    if hasattr(params := arguments["params"], "_names"):
+        values = {name: getattr(params, name) for name in params._names}
+        arguments["params"] = {k: x for k, x in values.items() if x != model.info.defaults[k]}
+    return other, arguments
+
+
+def eventful(model: Any, events: Any) -> Any:
+    """Return the model extended by additional events.
+
+    events: mapping of the events by name, each a formula or a table such as [[event]] of a scene.
+    The extended model is compiled at the first call and reused afterwards.
+    """
+    known = model.extensions
+    if (key := repr(events)) not in known:
+        build = require_eomc("pipeline", "events of a run are compiled").with_events
+        known[key] = model_of(build(model, events, Path(__file__).parents[1]))
+        known[key].extension_of = model, events  # for files of its runs
+    return known[key]
+
+
 # functions and other attributes of scenes with constraints only
 CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
 _CONSTRAINED = (*CONSTRAINED, "constraint_names", "loops", "reactions")
@@ -300,9 +372,9 @@ class Package(ModuleType):
             there = "a scene has them by [constraints] or [[loop]]"
             if is_built_from_system():
                 there = "give them by System.make(..., constraints={...})"
-            closed = hasattr(model, name) and model.constraint_names
+            closed = model.info.constraints.names
             what = "[[loop]]" if closed else f"constraints: {there}"
-            raise AttributeError(f"{name}: {model.name} has no {what}")
+            raise AttributeError(f"{name}: {model.info.name} has no {what}")
         own = self.__dict__.get("__getattr__", super().__getattribute__)
         return own(name)
 
@@ -313,8 +385,9 @@ class Package(ModuleType):
 
     def _why_not(self, name: str, value: Any) -> str:
         """Return the reason why a name cannot be assigned, with a remedy; "" if it can."""
-        model, call = self._model, f"{self._model.name}.simulate"
-        if name in model.parameters:
+        info = self.__dict__["_model"].info
+        call = f"{info.name}.simulate"
+        if name in info.parameters:
             return (
                 "a parameter is given to a call, not assigned to the module: "
                 f'{call}(params={{"{name}": {value!r}}}), or eomc run --set {name}={value!r}; '
@@ -322,14 +395,14 @@ class Package(ModuleType):
             )
         if name in ("h", "duration"):
             return f"is given to a call, {call}({name}={value!r}), or eomc run --{name} {value!r}"
-        if name in model.inputs:
+        if name in info.inputs:
             return f'an input is given to a call: {call}(u={{"{name}": {value!r}}})'
-        rates = [f"{c}_dot" for c in model.coordinates]
-        if name in (*model.coordinates, *rates, "start"):
+        rates = [f"{c}_dot" for c in info.coordinates]
+        if name in (*info.coordinates, *rates, "start"):
             return f"a start is given to a call: {call}(q0=..., qd0=...), or eomc run --start"
         if name in self.__all__:
             return "belongs to the module and stays as it is"
-        near = suggestion(name, (*model.parameters, *model.inputs, *model.coordinates, *rates))
+        near = suggestion(name, (*info.parameters, *info.inputs, *info.coordinates, *rates))
         if not near or isinstance(value, ModuleType):  # one of its own files, imported
             return ""
         return f"is no name of the scene{near}; values are given to a call: {call}(params={{...}})"
@@ -343,9 +416,13 @@ class Package(ModuleType):
         model = self.__dict__.get("_model")
         if model is None:  # not imported yet
             return super().__repr__()
-        counts = {"coordinate": model.nq, "input": model.nu, "parameter": len(model.parameters)}
+        counts = {
+            "coordinate": model.info.nq,
+            "input": model.info.nu,
+            "parameter": len(model.info.parameters),
+        }
         summary = ", ".join(f"{n} {what}{'s' * (n != 1)}" for what, n in counts.items())
-        return f"<compiled scene {model.name}: {summary}>"
+        return f"<compiled scene {model.info.name}: {summary}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced(MODULE)

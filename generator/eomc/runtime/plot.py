@@ -127,15 +127,15 @@ class Source:
     """
 
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
-        model, run = run._model, getattr(run, "_drawn", run)
+        model, run = run.model, getattr(run, "curve_run", run)
         self.run, self.t = run, np.asarray(run.t, float)
-        self.is_held = getattr(run, "_u", None) is not None
-        self.coordinates = tuple(model.coordinates)
-        self._units = dict(model.units)
-        self._energy = "J" if any(self._units.get(c) for c in model.coordinates) else ""
-        self._inputs, self._outputs = tuple(model.inputs), tuple(model.outputs)
+        self.is_held = getattr(run, "given_inputs", None) is not None
+        self.coordinates = tuple(model.info.coordinates)
+        self._units = dict(model.info.units)
+        self._energy = "J" if any(self._units.get(c) for c in model.info.coordinates) else ""
+        self._inputs, self._outputs = tuple(model.info.inputs), tuple(model.info.outputs)
         if wrap is True:
-            wrap = [c for c in model.coordinates if self._units.get(c) == "rad"]
+            wrap = [c for c in model.info.coordinates if self._units.get(c) == "rad"]
         self._wrap = {wrap} if isinstance(wrap, str) else set(wrap or ())
         for name in self._wrap:
             run[name]  # KeyError, with the names there are
@@ -176,7 +176,7 @@ def plot(
     The arguments are those of `Run.plot`.
     """
     no_files(names)
-    others = [other] if hasattr(other, "_model") else [*(other or ())]
+    others = [other] if hasattr(other, "model") else [*(other or ())]
     sources = [Source(each, wrap) for each in (run, *others)]
     suffixes = _suffixes(len(sources), labels)
     pairs = _pairs(phase, sources[0])

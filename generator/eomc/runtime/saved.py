@@ -13,14 +13,12 @@ import numpy as np
 
 from .arguments import Array
 from .atomic_write import File, atomic_write
-from .metadata import ModelInfo
-from .package import warn
-from .plugins import eventful
+from .interfaces import CompiledModel
+from .package import eventful, warn
 
 KINDS = (
     "Run",
     "AdaptiveRun",
-    "SteppedRun",
     "TimedRun",
     "BatchRun",
     "TimedBatchRun",
@@ -32,18 +30,19 @@ _KIND = "eomc {} 1"  # name of the class and version of the format
 
 def write(run: Any, path: Path) -> None:
     """Write a run or batch to an .npz file: its columns, and the arguments that reproduce it."""
-    model = run._model
+    model = run.model
+    info = model.info
     arrays: dict[str, Any] = {
-        "kind": _KIND.format(type(run).__name__), "scene": model.name, "digest": model.digest,
-        "coordinates": model.coordinates, "parameters": model.parameters, "inputs": model.inputs,
-        "events": model.events,
+        "kind": _KIND.format(type(run).__name__), "scene": info.name, "digest": info.digest,
+        "coordinates": info.coordinates, "parameters": info.parameters, "inputs": info.inputs,
+        "events": info.events,
         "t": run["t"], "energy": run.energy, "u": run.u,
     }  # fmt: skip
-    if additional := vars(model).get("_asked"):
-        arrays |= {"own": additional[0].digest, "asked": _text(additional[1])}
-    if model.has_jacobi:
+    if additional := model.extension_of:
+        arrays |= {"own": additional[0].info.digest, "asked": _text(additional[1])}
+    if model.functions.has_jacobi:
         arrays["jacobi"] = run.jacobi
-    arrays |= {name: value for name, value in run._to_arrays().items() if value is not None}
+    arrays |= {name: value for name, value in run.to_arrays().items() if value is not None}
     converted: Any = {name: np.asarray(value) for name, value in arrays.items()}
     with atomic_write(path) as new, new.open("wb") as file:
         np.savez(file, **converted)
@@ -57,7 +56,7 @@ def _text(events: Any) -> str:
         return ""
 
 
-def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
+def read(model: CompiledModel, file: File) -> tuple[Any, str, dict[str, Any]]:
     """Read an .npz file that `run.save` has written.
 
     Return the model, the name of the run's class (one of KINDS) and the arrays by name. The
@@ -69,37 +68,41 @@ def read(model: ModelInfo, file: File) -> tuple[Any, str, dict[str, Any]]:
     kind = next((k for k in KINDS if str(arrays.get("kind")) == _KIND.format(k)), "")
     if not kind:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
-    if arrays["scene"] != model.name:
-        raise ValueError(f"{file}: is a run of {arrays['scene']}, not of {model.name}")
-    if str(arrays.get("own", arrays["digest"])) != model.digest:
+    if arrays["scene"] != model.info.name:
+        raise ValueError(f"{file}: is a run of {arrays['scene']}, not of {model.info.name}")
+    if str(arrays.get("own", arrays["digest"])) != model.info.digest:
         warn(
-            f"{model.name}: {file}: was saved from another version of the scene; what is computed "
+            f"{model.info.name}: {file}: was saved from another version of the scene; what is "
+            "computed "
             "from it now is of the present version"
         )
     if "asked" in arrays:
         model = _model_with_events(model, arrays, file)
     for what in ("coordinates", "parameters", "inputs", "events"):
-        own = getattr(model, what)
+        own = getattr(model.info, what)
         saved = tuple(arrays.get(what, np.array(own)).tolist())  # old files have no events
         if saved != own:
             raise ValueError(
-                f"{file}: is a run of another version of {model.name}, whose {what} were "
+                f"{file}: is a run of another version of {model.info.name}, whose {what} were "
                 f"{', '.join(saved) or 'none'}; here they are {', '.join(own) or 'none'}"
             )
-    if arrays["q"].dtype != model.dtype:
-        raise ValueError(f"{file}: has numbers of {arrays['q'].dtype}, {model.name} {model.dtype}")
+    if arrays["q"].dtype != model.info.dtype:
+        raise ValueError(
+            f"{file}: has numbers of {arrays['q'].dtype}, {model.info.name} {model.info.dtype}"
+        )
     return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
 
 
-def _model_with_events(model: ModelInfo, arrays: dict[str, Array], file: File) -> Any:
+def _model_with_events(model: CompiledModel, arrays: dict[str, Array], file: File) -> Any:
     """Return the model with the additional events of a saved run."""
-    known = vars(model).get("_eventful", {}).values()
-    if same := [other for other in known if other.digest == arrays["digest"]]:
+    known = model.extensions.values()
+    if same := [other for other in known if other.info.digest == arrays["digest"]]:
         return same[0]
     if not (text := str(arrays["asked"])):
         raise ValueError(
             f"{file}: its events= had formulas of SymPy, which files don't keep: call "
-            f"{model.name}.simulate(events=...) with the same ones first; numpy.load reads its rows"
+            f"{model.info.name}.simulate(events=...) with the same ones first; numpy.load reads "
+            "its rows"
         )
     try:
         return eventful(model, json.loads(text))

@@ -4,37 +4,50 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .arguments import Array
-from .metadata import ModelInfo
+from .interfaces import CompiledModel
+
+MIN_STEPS = 20  # runs of fewer steps are not checked
 
 
-def beyond_end(h: float, duration: float) -> str | None:
-    """Return a message if the step size h, s, is larger than the duration, s, else None."""
-    if not 0 < duration < h * (1 - 1e-12):
-        return None
-    return (
-        f"h = {h:g} s is longer than the duration, {duration:g} s: the run is one step of {h:g} s"
-    )
+class State(NamedTuple):
+    """State at which the motion is linearised.
+
+    Attributes
+    ----------
+    q, qd : (nq,) arrays
+        Positions and velocities.
+    t : float
+        Time, s.
+    u : (nu,) array or None
+        Inputs; None: the scene's signals.
+    params
+        Parameters.
+    """
+
+    q: Array
+    qd: Array
+    t: float
+    u: Any
+    params: Any
 
 
-def advice(
-    model: ModelInfo, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
-) -> str | None:
+def advice(model: CompiledModel, state: State, h: float, method: str) -> str | None:
     """Return a message if the step size h is too large for a stable run from a state, else None.
 
-    q, qd: state (nq,). h: step size, s. t: time, s. u: inputs (nu,), or None for the scene's
-    signals. method: name of the method.
+    h: step size, s. method: name of the method.
 
     The motion is linearised at the state. The largest |imaginary part| and the fastest decay of its
     eigenvalues are compared with the two stability limits of the method. A mode whose speed depends
     on the width of the finite differences comes from a discontinuity of the forces and is ignored.
     """
-    undamped, decaying = model.stability_limits[method]
-    modes = _fastest_modes(model, q, qd, t, u, params, 1.0)
+    limits = model.info.method_table[method]
+    undamped, decaying = limits.oscillation_limit, limits.decay_limit
+    modes = _fastest_modes(model, state, 1.0)
     if modes is None:
         return None
     turning, decay = modes
@@ -43,7 +56,7 @@ def advice(
     )
     if not 0 < longest < abs(h):
         return None
-    if (again := _fastest_modes(model, q, qd, t, u, params, 100.0)) is None:
+    if (again := _fastest_modes(model, state, 100.0)) is None:
         return None
     if max(again) < max(turning, decay) / 2:
         return None
@@ -57,17 +70,16 @@ def advice(
     )
 
 
-def _fastest_modes(
-    model: ModelInfo, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
-) -> tuple[float, float] | None:
+def _fastest_modes(model: CompiledModel, state: State, wide: float) -> tuple[float, float] | None:
     """Return (largest |Im|, fastest decay) of the eigenvalues at a state, 1/s, or None.
 
     The linearisation is the module's own where available, else a finite difference of the
     acceleration, whose width is `wide` times the usual one. With constraints there are two
     spectra, of all perturbations and of those tangent to the constraints; the slower one counts.
     """
-    n, x = model.nq, np.concatenate([q, qd]).astype(float)
-    near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
+    q, qd, t, u, params = state
+    n, x = model.info.nq, np.concatenate([q, qd]).astype(float)
+    near = wide * math.sqrt(float(np.finfo(model.info.dtype).eps)) * np.maximum(1.0, np.abs(x))
 
     def spectrum(ways: Array) -> tuple[float, float]:
         """Return (largest |Im|, fastest decay) of the linearised motion's eigenvalues, 1/s.
@@ -75,11 +87,17 @@ def _fastest_modes(
         ways: (2 nq, k), orthonormal columns; the motion is linearised in these directions only.
         """
         moved = near[:, None] * ways
-        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
-            rates = model.linearize(q, qd, t=t, u=u, params=params)[0].astype(float) @ moved
+        if model.functions.has_slopes and (
+            u is not None or not model.info.nu
+        ):  # signals may depend on the state
+            rates = (
+                model.functions.linearize(q, qd, t=t, u=u, params=params)[0].astype(float) @ moved
+            )
         else:
-            states = np.vstack([x, x + moved.T]).astype(model.dtype)
-            a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
+            states = np.vstack([x, x + moved.T]).astype(model.info.dtype)
+            a = model.functions.acceleration(states[:, :n], states[:, n:], t, u, params).astype(
+                float
+            )
             rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
         values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
         turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
@@ -88,26 +106,28 @@ def _fastest_modes(
     modes: list[tuple[float, float]] = []  # if empty, the run itself reports the error
     with suppress(ArithmeticError, np.linalg.LinAlgError):
         modes.append(spectrum(np.eye(2 * n)))
-    if model.constraint_names:
+    if model.info.constraints.names:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
             modes.append(spectrum(_tangent_basis(model, x, t, params, near)))
     return min(modes, key=max, default=None)
 
 
-def _tangent_basis(model: ModelInfo, x: Array, t: float, params: Any, near: Array) -> Array:
+def _tangent_basis(model: CompiledModel, x: Array, t: float, params: Any, near: Array) -> Array:
     """Return an orthonormal basis (2 nq, k) of the tangent space of the constraints.
 
     Perturbations of x = [q; qd] are in units of `near`.
     """
-    n, holonomic = model.nq, model._rows.holonomic
-    least = math.sqrt(float(np.finfo(model.dtype).eps))
-    q, qd = (half.astype(model.dtype) for half in (x[:n], x[n:]))
-    A = model.constraint_jacobian(q, t=t, params=params).astype(float)
+    n, holonomic = model.info.nq, model.info.constraints.holonomic
+    least = math.sqrt(float(np.finfo(model.info.dtype).eps))
+    q, qd = (half.astype(model.info.dtype) for half in (x[:n], x[n:]))
+    A = model.constraints.constraint_jacobian(q, t=t, params=params).astype(float)
     sizes = np.maximum(np.linalg.norm(A * near[n:], axis=1), 1e-300)  # rows have units of their own
     back = A * near[n:] / sizes[:, None]
     of_q = _null_space((A * near[:n] / sizes[:, None])[:holonomic], least)
-    places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.dtype)
-    rates = model.constraint_rates(places, np.tile(qd, (len(places), 1)), t, params).astype(float)
+    places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.info.dtype)
+    rates = model.constraints.constraint_rates(
+        places, np.tile(qd, (len(places), 1)), t, params
+    ).astype(float)
     follow = -np.linalg.pinv(back, rcond=least) @ ((rates[1:] - rates[0]) / sizes).T
     of_qd = _null_space(back, least)
     whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])

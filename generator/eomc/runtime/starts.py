@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, as_number, by_name, not_one_of
-from .constrained import Constrained
+from .interfaces import CompiledModel
 
 _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
@@ -33,7 +33,7 @@ def is_by_name(q0: Any, qd0: Any) -> bool:
 
 
 def initial_state_for_parameters(
-    model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
+    model: CompiledModel, q0: Any, qd0: Any, p: Array, many_values: bool = False
 ) -> tuple[Any, Any]:
     """Return the initial state (q0, qd0), completed by the scene's initial values.
 
@@ -64,21 +64,21 @@ def initial_state_for_parameters(
     p = np.broadcast_to(p, (*many, p.shape[-1]))
     result = [
         x if named_values is None else np.tile(own, (*many, 1))
-        for x, own, named_values in zip((q0, qd0), model._start, mappings, strict=True)
+        for x, own, named_values in zip((q0, qd0), model.info.initial_state, mappings, strict=True)
     ]
     for x, named_values in zip(result, mappings, strict=True):
         for name, value in (named_values or {}).items():
-            x[..., model.coordinates.index(name)] = value
-    values = {name: p[..., k].astype(float) for k, name in enumerate(model.parameters)}
-    for name, text in model._follows.items():
-        half, at = divmod(model._states.index(name), model.nq)
+            x[..., model.info.coordinates.index(name)] = value
+    values = {name: p[..., k].astype(float) for k, name in enumerate(model.info.parameters)}
+    for name, text in model.info.start_formulas.items():
+        half, at = divmod(model.info.states.index(name), model.info.nq)
         named_values = mappings[half]
-        if named_values is None or model.coordinates[at] in named_values:
+        if named_values is None or model.info.coordinates[at] in named_values:
             continue
         tree = ast.parse(text, mode="eval").body
         own = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name)]
-        which = [k for k, parameter in enumerate(model.parameters) if parameter in own]
-        changed = (p[..., which] != model._p0[which]).any(axis=-1)
+        which = [k for k, parameter in enumerate(model.info.parameters) if parameter in own]
+        changed = (p[..., which] != model.info.p0[which]).any(axis=-1)
         with np.errstate(all="ignore"):
             value = np.broadcast_to(_value(tree, values | {"pi": np.pi}), many)
         if not np.isfinite(value[changed]).all():
@@ -106,7 +106,7 @@ def _instances(
 
 
 def values_by_name(
-    model: Constrained, x: Any, half: int, many: bool = False
+    model: CompiledModel, x: Any, half: int, many: bool = False
 ) -> dict[str, Array] | None:
     """Check a mapping of initial values by coordinate name and return it as a dict of arrays.
 
@@ -119,8 +119,10 @@ def values_by_name(
     if not hasattr(x, "keys"):
         return None
     what, result = ("q0", "qd0")[half], dict[str, Array]()
-    moving = [name for name in model.coordinates if name not in model.discrete_coordinates]
-    known = moving if half else model.coordinates
+    moving = [
+        name for name in model.info.coordinates if name not in model.info.discrete_coordinates
+    ]
+    known = moving if half else model.info.coordinates
     for key, value in by_name(x).items():
         name = key.removesuffix("_dot") if half and key not in known else key
         if name not in known:
@@ -130,7 +132,7 @@ def values_by_name(
         if name in result:
             raise ValueError(f"{what}: '{name}' is given twice, as '{name}' and as '{name}_dot'")
         if many and np.ndim(value) == 1:
-            result[name] = model._numbers(value, f"{what}: {name}")
+            result[name] = model.arguments.numbers(value, f"{what}: {name}")
             if not np.isfinite(result[name]).all():
                 raise ValueError(f"{what}: {name}: not all numbers are finite")
         else:

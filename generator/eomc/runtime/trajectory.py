@@ -9,21 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array
+from .arguments import Array, ByName
 from .atomic_write import File
 from .balance import Balance, balance
-from .by_name import ByName
-from .dense import states
 from .estimate import Estimate, estimate
-from .initial_checks import infinite_at_start
-from .laws import evaluate_law
+from .inputs import evaluate_law
 from .notebook import html
-from .package import warn
+from .package import require_eomc, warn
 from .plot import plot
-from .plugins import require_eomc
 from .section import as_section, crossings
 from .status import STATUS_MESSAGES, Interrupted, state_text
-from .trajectory_data import Trajectory
+from .trajectory_data import Trajectory, infinite_at_start
 
 NOISE = (
     "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
@@ -69,29 +65,6 @@ class Run(Trajectory):
     """
 
     error: Estimate | None = field(default=None, init=False)
-
-    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return the state at any time within the run.
-
-        A shorter step of the method from the last row before yields the state, with the order of
-        the method.
-
-        Parameters
-        ----------
-        t : array_like, any shape
-            Times, s.
-
-        Returns
-        -------
-        q, qd : arrays of shape t.shape + (nq,)
-
-        Raises
-        ------
-        ValueError
-            If a time is outside of the run, or if u was a function whose values are not stored at
-            each step.
-        """
-        return states(self, t)
 
     stopped = ""  # name of the event that ended the run
 
@@ -206,7 +179,7 @@ class Run(Trajectory):
         return crossings(self.to_dict(), name, value, rising, period)
 
     @property
-    def _drawn(self) -> Run:
+    def curve_run(self) -> Run:
         """The run with rows close enough for curves."""
         return self
 
@@ -301,16 +274,23 @@ class Run(Trajectory):
         except KeyboardInterrupt:
             raise Interrupted(self) from None
         if words := self.error.warning:
-            warn(f"{self._model.name}: {words}")
+            warn(f"{self.model.info.name}: {words}")
         return self.error
 
     def _repeated(self) -> None:
         """Raise ValueError if the run cannot be repeated."""
-        if isinstance(self._u, str):
-            raise ValueError(f"estimate: {self._u}")
-        if callable(self._u) and self._applied is not None and len(self) and self.t[0] == self.t0:
-            u_at_start = evaluate_law(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
-            if not np.array_equal(u_at_start, self._applied[0]):
+        if isinstance(self.given_inputs, str):
+            raise ValueError(f"estimate: {self.given_inputs}")
+        if (
+            callable(self.given_inputs)
+            and self.applied_inputs is not None
+            and len(self)
+            and self.t[0] == self.t0
+        ):
+            u_at_start = evaluate_law(
+                self.given_inputs, self.model.arguments.inputs, self.t0, self.q[0], self.qd[0]
+            )
+            if not np.array_equal(u_at_start, self.applied_inputs[0]):
                 raise ValueError(NOISE)
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
@@ -328,6 +308,6 @@ class Run(Trajectory):
         )
 
     @property
-    def _remark(self) -> str:
+    def remark(self) -> str:
         """Warning for a run with status "ok", or ""."""
         return self._singular

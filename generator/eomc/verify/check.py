@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
+from eomc.runtime.package import model_of
 from eomc.verify import (
     checks_adaptive,
     checks_bodies,
@@ -64,14 +65,14 @@ def check(
         If there is no reference for the system; see `symbolic.reference_for`.
     """
     comparison = Comparison(system, module, np.random.default_rng(seed), states, plain)
-    models = [form._model for form, _ in comparison.forms if hasattr(form, "_model")]
+    models = [model_of(form) for form, _ in comparison.forms if hasattr(form, "_model")]
     for model in models:
-        model._passes_over = True  # as the reference does
+        model.integrator.ignores_events = True  # as the reference does
     try:
         return _report(comparison, module)
     finally:
         for model in models:
-            model._passes_over = False
+            model.integrator.ignores_events = False
 
 
 def _report(comparison: Comparison, module: Any) -> CheckReport:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import GAUSS16
+from eomc.runtime.package import model_of
 from eomc.verify import one_step
 from eomc.verify.checks_refusals import (
     NOT_FINITE,
@@ -210,7 +211,7 @@ class AdaptiveRefusalChecks:
     """
 
     def __init__(self, check: Comparison, refusals: RefusalChecks) -> None:
-        self.check, self.model, self.refusals = check, check.module._model, refusals
+        self.check, self.model, self.refusals = check, model_of(check.module), refusals
         self.state = check.few(2)[-1].state
 
     def drive(
@@ -223,20 +224,23 @@ class AdaptiveRefusalChecks:
         whether to begin with Newton's method. each: number of steps per call of the C function.
         """
         model, many = self.model, 2 * MAX_STEPS
-        x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)
-        rows, times = np.full((2, many, model.nq), np.nan, model.dtype), np.zeros(many, model.dtype)
-        u = None if s.u is None else np.array(s.u, model.dtype)
-        work, null, p = model._ffi.new("adaptive_work *"), model._c[2], parameters(model, s)
+        x, t = np.array([s.q, s.qd], model.info.dtype).ravel(), np.array([s.t], model.info.dtype)
+        rows, times = (
+            np.full((2, many, model.info.nq), np.nan, model.info.dtype),
+            np.zeros(many, model.info.dtype),
+        )
+        u = None if s.u is None else np.array(s.u, model.info.dtype)
+        work, null, p = model.c.ffi.new("adaptive_work *"), model.c.tools[2], parameters(model, s)
         work.stiff = stiff
-        events = (0, model._ffi.NULL, null) if model.events else ()
+        events = (0, model.c.ffi.NULL, null) if model.info.events else ()
         n, status, end = 0, OK, s.t + span
         for _ in range(0, MAX_STEPS, each):
-            if status != OK or t[0] >= end or (model.events and work.stopped):
+            if status != OK or t[0] >= end or (model.info.events and work.stopped):
                 break
-            status = model._lib.adaptive(
-                model._pointer(x), model._pointer(t), end, tol, h_most, model._pointer(u), each,
-                null, many - n, model._pointer(times[n:]), model._pointer(rows[0, n:]),
-                model._pointer(rows[1, n:]), *events, model._pointer(p), work,
+            status = model.c.lib.adaptive(
+                model.c.pointer(x), model.c.pointer(t), end, tol, h_most, model.c.pointer(u), each,
+                null, many - n, model.c.pointer(times[n:]), model.c.pointer(rows[0, n:]),
+                model.c.pointer(rows[1, n:]), *events, model.c.pointer(p), work,
             )  # fmt: skip
             n += work.rows
         return AdaptiveRunResult(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
@@ -265,7 +269,7 @@ class AdaptiveRefusalChecks:
 
         Their initial states are so large that a step may overflow.
         """
-        wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
+        wrong, huge = 0, float(np.finfo(self.model.info.dtype).max) / 2
         for unit in np.eye(len(self.state.q)):
             for size in (1e7, huge):  # the vectorised sines are for angles below 1e7 rad
                 for stiff in (False, True):
@@ -374,14 +378,14 @@ class EventRecorder:
     def __init__(self, model: Any, count: int) -> None:
         self.digests: list[list[int]] = [[0, 0] for _ in range(count)]
         self.room: tuple[Any, ...] = ()
-        if not model.events:
+        if not model.info.events:
             return
-        each = 64 + len(model.events)  # room for the events of an instance in one call
+        each = 64 + len(model.info.events)  # room for the events of an instance in one call
         self.counts, self.which = np.zeros(count, "l"), np.zeros((count, each), "i")
-        self.rows = np.zeros((count, each, 1 + 2 * model.nq), model.dtype)
-        address, (long, integer) = model._c[0], model._whole
+        self.rows = np.zeros((count, each, 1 + 2 * model.info.nq), model.info.dtype)
+        address, (long, integer) = model.c.tools[0], model.batch.count_types
         places = address(long, self.counts), address(integer, self.which)
-        self.room = (each, *places, model._pointer(self.rows))
+        self.room = (each, *places, model.c.pointer(self.rows))
 
     def record(self) -> None:
         """Add the events that the last call of the C function stored to the digests."""
@@ -401,8 +405,8 @@ class AdaptiveBatchChecks:
 
     def __init__(self, check: Comparison, singular: list[State], module: Any = None) -> None:
         self.check, self.module, self.singular = check, module or check.module, singular
-        self.model = self.module._model
-        self.tol = 1e-12 if self.model.dtype == np.float64 else 1e-6
+        self.model = model_of(self.module)
+        self.tol = 1e-12 if self.model.info.dtype == np.float64 else 1e-6
         states = [e.state for e in reversed(check.few(2))]
         self.state = s = next(filter(self.resolves_steps, states), states[0])
         random, sampler = np.random.default_rng(3), check.sampler
@@ -479,24 +483,24 @@ class AdaptiveBatchChecks:
         longest: limit of the step size, s; 0 for none.
         """
         model, n, s = self.model, len(starts), starts[0]
-        new = model._ffi.new
-        q, qd = (np.array([getattr(x, k) for x in starts], model.dtype) for k in ("q", "qd"))
-        t = np.array([x.t for x in starts], model.dtype)
+        new = model.c.ffi.new
+        q, qd = (np.array([getattr(x, k) for x in starts], model.info.dtype) for k in ("q", "qd"))
+        t = np.array([x.t for x in starts], model.info.dtype)
         end = self.state.t + span
-        times = np.array([self.state.t + 0.6 * span, end], model.dtype)
-        rows = np.full((2, n, 2, model.nq), np.nan, model.dtype)
+        times = np.array([self.state.t + 0.6 * span, end], model.info.dtype)
+        rows = np.full((2, n, 2, model.info.nq), np.nan, model.info.dtype)
         row_counts, status, memory = np.zeros(n, "l"), np.zeros(n, "i"), new("adaptive_memory[]", n)
         for one in memory if stiff else ():
             one.stiff = 1
-        u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
-        p = np.array([parameters(model, x) for x in starts], model.dtype)
-        address, (long, integer) = model._c[0], model._whole
+        u = None if s.u is None else np.array([x.u for x in starts], model.info.dtype)
+        p = np.array([parameters(model, x) for x in starts], model.info.dtype)
+        address, (long, integer) = model.c.tools[0], model.batch.count_types
         recorder = EventRecorder(model, n)
         for _ in range(100_000):
-            remaining = model._lib.adaptive_batch(
-                n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
-                model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
-                model._pointer(rows[1]), *recorder.room, model._pointer(p), 1, memory,
+            remaining = model.c.lib.adaptive_batch(
+                n, *map(model.c.pointer, (q, qd, t)), end, self.tol, longest, model.c.pointer(u),
+                model.info.nu, steps, model.c.pointer(times), 2, model.c.pointer(rows[0]),
+                model.c.pointer(rows[1]), *recorder.room, model.c.pointer(p), 1, memory,
                 address(long, row_counts), address(integer, status),
             )  # fmt: skip
             recorder.record()

@@ -40,7 +40,7 @@ class BatchChecks:
         self.singular = singular
         self.instances = self.sample_instances()
         # direction of perturbed states, with different random parts so that no changes cancel
-        shape, random = (2, self.model.nq), np.random.default_rng(10)
+        shape, random = (2, self.model.info.nq), np.random.default_rng(10)
         self.direction = random.uniform(0.5, 1.5, shape) * random.choice([-1, 1], shape)
 
     def report(self) -> None:
@@ -123,10 +123,10 @@ class BatchChecks:
         nu), and inputs that change from step to step (COUNT, STEPS, nu). Without inputs, the list
         is [None].
         """
-        if not self.model.nu:
+        if not self.model.info.nu:
             return [None]
-        shape = (COUNT, STEPS, self.model.nu)
-        rows = self.random.normal(size=shape).astype(self.model.dtype)
+        shape = (COUNT, STEPS, self.model.info.nu)
+        rows = self.random.normal(size=shape).astype(self.model.info.dtype)
         return [None, rows[:, 0], rows]
 
     def compare_with_single_steps(self, method: str) -> float | Measurement:
@@ -189,7 +189,7 @@ class BatchChecks:
                 wrong += not _are_permuted(other, whole, part)
             sparse = self.simulate(method, self.instances, u, every=EVERY)
             stored = np.minimum(EVERY * np.arange(sparse.q.shape[1]), STEPS)
-            good = whole._codes == 0
+            good = whole.status_codes == 0
             wrong += not np.array_equal(sparse.q[good], whole.q[good][:, stored])
             wrong += not np.array_equal(sparse.qd[good], whole.qd[good][:, stored])
             alike = [replace(s, params=self.instances[0].params) for s in self.instances]
@@ -233,8 +233,8 @@ class BatchChecks:
             size = STEPS * self.check.eps * (np.abs(others) + spread) + noise
             alike = (rows == others) | (np.abs(rows - others) <= ALIKE * size)
         alike |= (np.isnan(rows) & np.isnan(others)) | ~np.isfinite(noise)
-        codes = one._codes == other._codes
-        codes |= np.any([x._codes != other._codes for x in rounded], axis=0)
+        codes = one.status_codes == other.status_codes
+        codes |= np.any([x.status_codes != other.status_codes for x in rounded], axis=0)
         return bool(np.all(alike) and np.all(codes))
 
     def long_step_cases(self) -> Iterator[tuple[list[State], float]]:
@@ -285,7 +285,7 @@ class BatchChecks:
         failing ones, or if a failing instance ends otherwise than in a single run.
         """
         states, bad = list(self.instances), [0, *range(5, COUNT, 11)]
-        fast = 1e-3 * float(np.finfo(self.model.dtype).max)
+        fast = 1e-3 * float(np.finfo(self.model.info.dtype).max)
         for n, k in enumerate(bad):
             if n % 2 and self.singular:
                 s = self.singular[n % len(self.singular)]
@@ -319,7 +319,7 @@ class BatchChecks:
         if not states:
             return 0
         batch = self.simulate(method, states, None)
-        return int(np.sum((batch._codes != SINGULAR) | (batch.steps != 0)))
+        return int(np.sum((batch.status_codes != SINGULAR) | (batch.steps != 0)))
 
     def fails_differently(self, method: str, whole: Any, k: int, s: State) -> bool:
         """Return whether a failing instance of a batch run ends otherwise than in a single run.
@@ -328,7 +328,7 @@ class BatchChecks:
         with its inputs.
         """
         alone = run_in_c(self.model, method, s, self.h, STEPS)
-        steps, status = int(whole.steps[k]), int(whole._codes[k])
+        steps, status = int(whole.steps[k]), int(whole.status_codes[k])
         rows = np.stack([whole.q[k], whole.qd[k]])
         stored = rows[:, : steps + 1]
         if not np.all(np.isfinite(stored)) or not np.all(np.isnan(rows[:, steps + 1 :])):

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from eomc.runtime.package import model_of
 from eomc.scene.assembly import LoopJoint
 from eomc.verify import kkt
 from eomc.verify.checks_bodies import MotionLine, widths
@@ -480,14 +481,14 @@ class ProjectionChecks:
 
     def project_in_c(self, s: State, fixed: tuple[int, int]) -> tuple[int, bool, State]:
         """Return the C function's status, whether the state is unchanged, and the new state."""
-        model = self.module._model
-        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+        model = model_of(self.module)
+        q, qd = (np.array(x, model.info.dtype) for x in (s.q, s.qd))
         before = np.array([q, qd])
         flags = [x for x in fixed for _ in s.q] if any(fixed) else None
-        fixed_flags = model._ffi.NULL if flags is None else model._ffi.new("int[]", flags)
-        code = model._lib.project(
-            1, model._pointer(q), model._pointer(qd), s.t, fixed_flags,
-            model._pointer(parameters(model, s)), model._c[2],
+        fixed_flags = model.c.ffi.NULL if flags is None else model.c.ffi.new("int[]", flags)
+        code = model.c.lib.project(
+            1, model.c.pointer(q), model.c.pointer(qd), s.t, fixed_flags,
+            model.c.pointer(parameters(model, s)), model.c.tools[2],
         )  # fmt: skip
         unchanged = np.array_equal(before, np.array([q, qd]), equal_nan=True)
         return int(code & 7), unchanged, replace(s, q=q.astype(float), qd=qd.astype(float))
@@ -526,7 +527,7 @@ class MasslessChecks:
             status, clean = self.refusals.accelerate(s)
             wrong += status != SINGULAR or not clean
             for method in self.check.methods:
-                run = run_in_c(self.check.module._model, method, s, self.check.system.run.h, 3)
+                run = run_in_c(model_of(self.check.module), method, s, self.check.system.run.h, 3)
                 wrong += run.steps != 0 or run.status != SINGULAR
             for q in (s.q + 1e-3 * self.check.sampler.spread, s.q):
                 x = replace(s, q=q, qd=s.qd + 1e-3 * self.check.sampler.speed)

@@ -18,6 +18,7 @@ import numpy as np
 
 from eomc.model.symbols import Output
 from eomc.model.system import System
+from eomc.runtime.package import model_of
 from eomc.verify.checks_inputs_outputs import Formulas, compare_outputs
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
@@ -50,10 +51,10 @@ def report_functions(check: Comparison) -> None:
 
 def _function_error(check: Comparison, module: Any, name: str, system: System) -> float:
     """Return the largest error of event functions or jumps, in units of rounding."""
-    model = module._model
+    model = model_of(module)
 
     def module_values(s: State) -> Vector:
-        values = model._evaluate(name, s.q, s.qd, s.t, s.u, s.params)
+        values = model.functions.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
         return np.asarray(values, float).ravel()[: len(system.outputs)]
 
     return compare_outputs(check, module, Formulas(system), module_values)
@@ -70,12 +71,12 @@ def report_fixed_steps(check: Comparison) -> None:
 
 
 def _largest_error(check: Comparison, module: Any, method: str) -> float | Measurement:
-    model, passed = module._model, module._model._passes_over
-    model._passes_over = False
+    model, passed = model_of(module), model_of(module).integrator.ignores_events
+    model.integrator.ignores_events = False
     try:
         errors = [_run_error(check, module, method, e.state) for e in check.few(4)]
     finally:
-        model._passes_over = passed
+        model.integrator.ignores_events = passed
     return largest(errors, "no step can be made")
 
 
@@ -108,7 +109,7 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 
     The states at the start before a jump, and between jumps at one time, are in no row.
     """
-    _, recorded = run._event_data
+    _, recorded = run.event_data
     first = int(len(recorded) > 0 and recorded[0, 0] <= run.t[0])
     for k in range(first, len(run) - 1):
         if run.t[k + 1] > run.t[k]:
@@ -122,7 +123,7 @@ def _misses_event(check: Comparison, module: Any, run: Any, s: State) -> bool:
     """Return whether an event function changes sign clearly without a detected event."""
     events = check.system.events
     signs_after = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
-    values = module._model._evaluate("events", run.q, run.qd, run.t, s.u, s.params)
+    values = model_of(module).functions.evaluate("events", run.q, run.qd, run.t, s.u, s.params)
     for event, g in zip(events, values.T, strict=True):
         sides = np.where(np.abs(g) > 1e-6 * np.abs(g).max(), np.sign(g), 0)  # 0 if not clear
         recorded = run.events[event.name].t

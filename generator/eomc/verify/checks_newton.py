@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.runtime.package import model_of
 from eomc.verify import one_step
 from eomc.verify.checks_runs import run_in_c
 from eomc.verify.comparison import Comparison
@@ -122,7 +123,7 @@ class NewtonChecks:
                 return None
             counts.append(count)
             rows.append(x)
-        run = run_in_c(self.check.module._model, method, s, h, STEPS)
+        run = run_in_c(model_of(self.check.module), method, s, h, STEPS)
         if run.status:
             return math.inf
         off = np.max(np.abs(run.rows[:, -1] - x) / self.reach(place))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.runtime.package import model_of
 from eomc.verify import kkt
 from eomc.verify.checks_runs import parameters, run_in_c
 from eomc.verify.comparison import Comparison
@@ -50,7 +51,7 @@ class RefusalChecks:
     """
 
     def __init__(self, check: Comparison) -> None:
-        self.check, self.module, self.model = check, check.module, check.module._model
+        self.check, self.module, self.model = check, check.module, model_of(check.module)
         self.random = np.random.default_rng(8)
         self.defaults = check.sampler.defaults
         self.singular: list[State] = []
@@ -218,13 +219,13 @@ class RefusalChecks:
         After an error the outputs must be unchanged; otherwise they must be finite.
         """
         model = self.model
-        a = np.full(model.nq, MARK, model.dtype)
-        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
-        u = None if s.u is None else np.array(s.u, model.dtype)
+        a = np.full(model.info.nq, MARK, model.info.dtype)
+        q, qd = (np.array(x, model.info.dtype) for x in (s.q, s.qd))
+        u = None if s.u is None else np.array(s.u, model.info.dtype)
         p = parameters(model, s)
-        status = model._lib.acceleration(
-            1, model._pointer(a), model._pointer(q), model._pointer(qd), s.t, model._pointer(u),
-            model._pointer(p), model._c[2],
+        status = model.c.lib.acceleration(
+            1, model.c.pointer(a), model.c.pointer(q), model.c.pointer(qd), s.t, model.c.pointer(u),
+            model.c.pointer(p), model.c.tools[2],
         ) & 7  # fmt: skip
         clean = bool(np.all(a == MARK)) if status else bool(np.all(np.isfinite(a)))
         return status, clean
@@ -242,7 +243,10 @@ class RefusalChecks:
                 wrong += not self.raises(partial(self.call, name, s), "singular")
             for method in self.check.methods:
                 wrong += not self.stops_at_start(method, s, "singular")
-            derivatives_present = {"linearize": self.model.has_slopes, "discretize": run.discretize}
+            derivatives_present = {
+                "linearize": self.model.functions.has_slopes,
+                "discretize": run.discretize,
+            }
             for name in (name for name, there in derivatives_present.items() if there):
                 wrong += not self.raises(partial(self.call, name, s), "singular")
         return float(wrong)
@@ -267,7 +271,7 @@ class RefusalChecks:
 
         The step must leave its outputs unchanged, and the run must store the initial state only.
         """
-        out = tuple(np.full(len(s.q), MARK, self.model.dtype) for _ in range(2))
+        out = tuple(np.full(len(s.q), MARK, self.model.info.dtype) for _ in range(2))
         options = {"params": s.params, "u": s.u, "method": method}
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **options)
         if not self.raises(step, status) or not np.all(np.array(out) == MARK):
@@ -385,19 +389,19 @@ class RefusalChecks:
             for method in self.check.methods:
                 run = run_in_c(self.model, method, at, self.check.system.run.h, 3)
                 wrong += run.steps != 0 or run.status not in REFUSED
-            wrong += self.model.has_slopes and not self.has_valid_linearization(at)
+            wrong += self.model.functions.has_slopes and not self.has_valid_linearization(at)
         return float(wrong)
 
     def has_valid_multipliers(self, s: State) -> bool:
         """Return whether the C function `multipliers` gives finite values, or an error and nan."""
         model = self.model
-        multipliers = np.zeros(len(model.constraint_names), model.dtype)
-        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
-        u = None if s.u is None else np.array(s.u, model.dtype)
+        multipliers = np.zeros(len(model.info.constraints.names), model.info.dtype)
+        q, qd = (np.array(x, model.info.dtype) for x in (s.q, s.qd))
+        u = None if s.u is None else np.array(s.u, model.info.dtype)
         p = parameters(model, s)
-        refused = model._lib.multipliers(
-            1, model._pointer(multipliers), model._pointer(q), model._pointer(qd), s.t,
-            model._pointer(u), model._pointer(p), model._c[2],
+        refused = model.c.lib.multipliers(
+            1, model.c.pointer(multipliers), model.c.pointer(q), model.c.pointer(qd), s.t,
+            model.c.pointer(u), model.c.pointer(p), model.c.tools[2],
         )  # fmt: skip
         return bool(np.all(np.isnan(multipliers) if refused else np.isfinite(multipliers)))
 
@@ -430,16 +434,18 @@ class RefusalChecks:
 
         After an error its outputs must be unchanged.
         """
-        model, n = self.model, self.model.nq
-        A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
-        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+        model, n = self.model, self.model.info.nq
+        A_q, A_qd, B = (
+            np.full((n, w), MARK, model.info.dtype) for w in (n, n, max(1, model.info.nu))
+        )
+        q, qd = (np.array(x, model.info.dtype) for x in (s.q, s.qd))
         p = parameters(model, s)
-        status = model._lib.linearization(
-            1, *(model._pointer(x) for x in (A_q, A_qd, B, q, qd)), s.t,
-            model._pointer(None if s.u is None else np.array(s.u, model.dtype)),
-            model._pointer(p), model._c[2],
+        status = model.c.lib.linearization(
+            1, *(model.c.pointer(x) for x in (A_q, A_qd, B, q, qd)), s.t,
+            model.c.pointer(None if s.u is None else np.array(s.u, model.info.dtype)),
+            model.c.pointer(p), model.c.tools[2],
         )  # fmt: skip
-        written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
+        written = np.hstack([A_q, A_qd, *([B] if model.info.nu else [])])
         return bool(np.all(written == MARK) if status & 7 else np.all(np.isfinite(written)))
 
     def overflow_errors(self, method: str) -> float:
@@ -452,7 +458,7 @@ class RefusalChecks:
         ended = []
         for power in (4, 8, 16, 40, 100, 160, 300):
             h = self.check.system.run.h * 10.0**power
-            if h > float(np.finfo(self.model.dtype).max):
+            if h > float(np.finfo(self.model.info.dtype).max):
                 break
             run = run_in_c(self.model, method, s, h, 12)
             stored = run.rows[:, : run.steps + 1]
@@ -461,7 +467,7 @@ class RefusalChecks:
             wrong += run.status == NO_CONVERGENCE and not METHODS[method].implicit
             ended.append(run.status)
         # one coordinate overflows at the end of the step, if forces permit it
-        huge = float(np.finfo(self.model.dtype).max) / 2
+        huge = float(np.finfo(self.model.info.dtype).max) / 2
         for unit in np.eye(len(s.q)):
             run = run_in_c(
                 self.model, method, replace(s, q=huge * unit, qd=1.01 * huge * unit), 1.0, 1

@@ -26,6 +26,7 @@ from eomc.integrators.tableaux import METHODS
 from eomc.model.algebra import compile_function
 from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, dot, t
+from eomc.runtime.package import model_of
 from eomc.verify.checks_derivatives import differentiate
 from eomc.verify.comparison import Comparison
 from eomc.verify.reference import Vector
@@ -72,8 +73,8 @@ class RunResult:
 
 def parameters(model: Any, s: State) -> Vector:
     """Return the values of all parameters at a state, (np,), in the order of the module."""
-    values = [(s.params or model.defaults)[name] for name in model.parameters]
-    return np.array(values, model.dtype)
+    values = [(s.params or model.info.defaults)[name] for name in model.info.parameters]
+    return np.array(values, model.info.dtype)
 
 
 @dataclass(frozen=True)
@@ -119,24 +120,24 @@ def run_in_c(
     division : RunDivision
         Division of the run into calls of the C function; by default, one call.
     """
-    _, run, _, _, work_type, _ = model._loops[method]
-    q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
-    rows = np.full((2, 1 - -steps // every, model.nq), np.nan, model.dtype)
-    u = None if s.u is None else np.array(s.u, model.dtype)
-    stride = 0 if u is None or u.ndim == 1 else model.nu
-    work = model._ffi.new(work_type) if division.cuts else model._c[2]
+    loop = model.integrator.loops[method]
+    q, qd = (np.array(x, model.info.dtype) for x in (s.q, s.qd))
+    rows = np.full((2, 1 - -steps // every, model.info.nq), np.nan, model.info.dtype)
+    u = None if s.u is None else np.array(s.u, model.info.dtype)
+    stride = 0 if u is None or u.ndim == 1 else model.info.nu
+    work = model.c.ffi.new(loop.work_type) if division.cuts else model.c.tools[2]
     steps_done, status, p = 0, 0, parameters(model, s)
     for end in (*(c for c in division.cuts if c < steps), steps):
         if division.moved and steps_done:
             row = rows[0, -(-steps_done // every)]
             row[0] += division.moved * (1 + abs(row[0]))  # also if it is large
         if division.fresh_memory and steps_done:
-            work = model._ffi.new(work_type)
+            work = model.c.ffi.new(loop.work_type)
             work.completed = steps_done
-        code = run(
-            model._pointer(rows[0]), model._pointer(rows[1]), model._pointer(q),
-            model._pointer(qd), s.t, h, end - steps_done, model._pointer(u), stride, every,
-            model._pointer(p), work,
+        code = loop.run(
+            model.c.pointer(rows[0]), model.c.pointer(rows[1]), model.c.pointer(q),
+            model.c.pointer(qd), s.t, h, end - steps_done, model.c.pointer(u), stride, every,
+            model.c.pointer(p), work,
         )  # fmt: skip
         steps_done, status = code >> 3, code & 7
         if status:
@@ -164,7 +165,7 @@ class RunChecks:
     """
 
     def __init__(self, check: Comparison) -> None:
-        self.check, self.model = check, check.module._model
+        self.check, self.model = check, model_of(check.module)
         self.h = check.system.run.h
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
         self.starts = check.few(2)
@@ -196,7 +197,7 @@ class RunChecks:
         if np.any(self.sampler.angles) or _reads_time(self.check.system):
             unit = f"units, of angles of {TURNS:.3g}"
             add("angles far out", self.limit, unit, self.far_angle_error)
-        if self.model.nu and self.check.methods[0] == "rk4":
+        if self.model.info.nu and self.check.methods[0] == "rk4":
             add("inputs row by row", self.limit, rounding, self.input_sequence_error)
         add("every entry written", 0, "values with entries left", self.incomplete_functions)
         for method in self.check.methods:
@@ -210,9 +211,9 @@ class RunChecks:
 
     def incomplete_functions(self) -> float:
         """Return the number of functions of the module that leave some entry of `out` unwritten."""
-        s, n, left = self.states[-1], self.model.nq, 0
+        s, n, left = self.states[-1], self.model.info.nq, 0
         for name in ("D", "C", "g", "bias", "tau"):
-            out = np.full((n, n) if name in "DC" else n, np.nan, self.model.dtype)
+            out = np.full((n, n) if name in "DC" else n, np.nan, self.model.info.dtype)
             place = (s.q,) if name in "Dg" else (s.q, s.qd)
             getattr(self.check.module, name)(*place, t=s.t, params=s.params, out=out)
             left += bool(np.any(np.isnan(out)))
@@ -431,7 +432,7 @@ class RunChecks:
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
             scale = np.where(signals > 0, signals, 1)
-            u = self.random.normal(size=(LONG_STEP_COUNT, self.model.nu)) * scale
+            u = self.random.normal(size=(LONG_STEP_COUNT, self.model.info.nu)) * scale
             at = replace(s, u=u)
             n, x, growth = self.reference_run(s, u, spread)
             run = run_in_c(self.model, self.check.methods[0], at, self.h, LONG_STEP_COUNT)
@@ -440,7 +441,7 @@ class RunChecks:
             errors.append(self.check.units(run.rows[:, n], x, size) if n else None)
             if np.all(np.isfinite(run.rows)):
                 again = self.check.module.simulate(
-                    s.q, s.qd, self.h, steps=LONG_STEP_COUNT, u=u.astype(self.model.dtype),
+                    s.q, s.qd, self.h, steps=LONG_STEP_COUNT, u=u.astype(self.model.info.dtype),
                     params=s.params, t0=s.t,
                 )  # fmt: skip
                 same = np.array_equal([again.q, again.qd], run.rows)
@@ -479,13 +480,13 @@ class RunChecks:
             steps = [self.h, *(self.large_step(s, part) for part in LONG)]
             steps += [self.turning_step(s, part) for part in (SHORT, SHORT / 64)]
             for h in steps:
-                for at in (s, *([self.with_input_sequence(s)] if self.model.nu else [])):
+                for at in (s, *([self.with_input_sequence(s)] if self.model.info.nu else [])):
                     wrong += self.differing_variants(method, at, h)
         return float(wrong)
 
     def with_input_sequence(self, s: State) -> State:
         """Return a copy of the state with random inputs, (STEPS, nu), that change between steps."""
-        u = self.random.normal(size=(STEPS, self.model.nu))
+        u = self.random.normal(size=(STEPS, self.model.info.nu))
         u[::2] = u[1::2]  # inputs that change at every second step only
         return replace(s, u=u)
 

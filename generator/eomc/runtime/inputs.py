@@ -1,4 +1,4 @@
-"""Inputs of adaptive runs: signals, constants, or a zero-order hold over control periods."""
+"""Inputs of runs: constants, tables, signals, and functions of the time and the state."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, as_step_size, cut_table, machine_memory
-from .laws import SampledSignal, evaluate_law
-from .metadata import ModelInfo
+from .interfaces import CompiledModel
+from .package import warn
+from .requests import SimulationArguments
 from .status import PART
 
 NO_PERIOD = (
@@ -19,6 +20,94 @@ NO_PERIOD = (
     "long that is: give control_period=, in s"
 )
 _VALUE = 200  # bytes of the stored inputs of one period
+
+
+def evaluate_law(
+    law: Callable[..., Any], inputs: Callable[[Any], Any], t: float, q: Array, qd: Array
+) -> Array:
+    """Call a user's function law(t, q, qd) and return the inputs (nu,) that it computes.
+
+    inputs: function that checks the returned value and converts it to an array. t: time, s. q, qd:
+    state (nq,). An exception in the law gets a note with the time and the state. An invalid result
+    raises ValueError or TypeError.
+    """
+    try:
+        try:
+            returned = law(t, q.copy(), qd.copy())
+        except TypeError as fault:
+            if fault.__traceback__ and fault.__traceback__.tb_next:  # raised inside the function
+                raise
+            raise TypeError(f"u: is called as u(t, q, qd), and {fault}") from None
+        try:
+            inputs_array = inputs(returned)
+        except ValueError as fault:
+            wrong = str(fault).removeprefix("u: ")
+            raise ValueError(f"u: what the function returned: {wrong}") from None
+    except Exception as fault:
+        fault.add_note(f"u was asked at t = {t:.9g} s, q = {q}, qd = {qd}")
+        raise
+    if inputs_array is None:
+        raise ValueError("u: the function returned None, not the inputs")
+    return np.array(inputs_array)
+
+
+def warn_called_each_step(model: CompiledModel) -> None:
+    """Issue a warning, once for each model, that calling a Python function in each step is slow."""
+    if "u" not in model.integrator.warned:
+        model.integrator.warned.add("u")
+        warn(
+            f"{model.info.name}: u is a Python function, called before each step: some hundred "
+            "times "
+            "slower than a table (steps, nu) or the scene's own signal"
+        )
+
+
+class FeedbackLaw:
+    """A user's function u(t, q, qd) that a run by fixed steps calls once in each control period.
+
+    The inputs that apply at each row of the run are stored. law: the function. inputs: function
+    that converts and checks its result. every: number of steps between two rows. hold: number of
+    steps of a control period.
+    """
+
+    def __init__(
+        self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int, hold: int
+    ) -> None:
+        self.law, self.inputs, self.every, self.hold = law, inputs, every, hold
+        self.calls, self.values = 0, list[Array]()
+        self.last: Any = None
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """Return, and store, the inputs (nu,) of the control period that begins at time t, s."""
+        self.last = evaluate_law(self.law, self.inputs, t, q, qd)
+        self.calls += 1
+        rows = -(-self.calls * self.hold // self.every)  # of the run before the next call
+        self.values += [self.last.copy()] * (rows - len(self.values))
+        return self.last  # type: ignore[no-any-return]
+
+    def rows(self, count: int, width: int) -> Array:
+        """Return the stored inputs that apply from each row of the run on, (count, width).
+
+        count: number of rows. width: number of inputs. Values are nan if the function has not been
+        called.
+        """
+        last = np.full(width, np.nan) if self.last is None else self.last
+        return np.array([*self.values, last][:count], last.dtype)
+
+
+class SampledSignal:
+    """The scene's input signals as a function u(t, q, qd).
+
+    A run with a control period calls it once in each period and holds the result constant.
+    """
+
+    def __init__(self, model: CompiledModel, params: Any) -> None:
+        self.model, self.params = model, params
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """Return the scene's signals (nu,) at time t, s, and state q, qd."""
+        values: Array = self.model.functions.signal(q, qd, t, self.params)
+        return values
 
 
 @dataclass(frozen=True)
@@ -53,23 +142,19 @@ def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array
 
 
 def input_schedule(
-    model: ModelInfo, u: Any, control_period: float | None, span: float, params: Any,
-    duration: float | None = None,
-) -> Array | ZeroOrderHold | None:  # fmt: skip
+    model: CompiledModel, given: SimulationArguments, control_period: float | None, span: float
+) -> Array | ZeroOrderHold | None:
     """Check the inputs of an adaptive run and convert them for `InputSchedule`.
 
     Parameters
     ----------
-    u : None, array_like, mapping or callable
-        Inputs as in `Model.simulate`.
+    given : SimulationArguments
+        Arguments of the run. A table of inputs may cover the given duration instead of `span`, if
+        the run ends earlier.
     control_period : float or None
         Control period, s.
     span : float
         Time from the start of the run to its end, s.
-    params
-        Parameters of the run.
-    duration : float, optional
-        Time, s, that a table of inputs may cover instead of `span`, if the run ends earlier.
 
     Returns
     -------
@@ -83,31 +168,35 @@ def input_schedule(
     MemoryError
         If the inputs of all periods do not fit in memory.
     """
-    period = None
+    u, duration, period = given.u, given.duration, None
     if control_period is not None:
-        period = as_step_size(control_period, model.dtype, "control_period")
+        period = as_step_size(control_period, model.info.dtype, "control_period")
     if u is None:
-        if period is None or not model.nu:
+        if period is None or not model.info.nu:
             return None
         return _check_memory(
-            model, ZeroOrderHold(SampledSignal(model, params), period, count_periods(span, period))
+            model,
+            ZeroOrderHold(SampledSignal(model, given.params), period, count_periods(span, period)),
         )
-    if not model.nu:
+    if not model.info.nu:
         raise ValueError("u: this scene has no inputs")
     if not callable(u):
         if period is not None and duration is not None:
-            u = cut_table(u, model.nu, count_periods(duration, period), count_periods(span, period))
+            u = cut_table(
+                u, model.info.nu, count_periods(duration, period), count_periods(span, period)
+            )
         if isinstance(u, Mapping):
-            u = model._by_name(u)
-        rows = model._numbers(u, "u")
-        if rows.ndim == 1 and model.nu == 1 < rows.size:
+            u = model.arguments.inputs_by_name(u)
+        rows = model.arguments.numbers(u, "u")
+        if rows.ndim == 1 and model.info.nu == 1 < rows.size:
             rows = rows[:, None]
         if rows.ndim < 2:
-            return model._array(rows.reshape(-1), "u", model.nu).copy()
-        rows = model._array(rows, "u", model.nu)
+            return model.arguments.array(rows.reshape(-1), "u", model.info.nu).copy()
+        rows = model.arguments.array(rows, "u", model.info.nu)
         if period is None:
             raise ValueError(
-                f"u: shape {np.shape(u)}, expected ({model.nu},): one value an input; rows, each "
+                f"u: shape {np.shape(u)}, expected ({model.info.nu},): one value an input; "
+                "rows, each "
                 "held over a control period, take control_period=, in s"
             )
         if len(rows) != (count := count_periods(span, period)):
@@ -121,10 +210,10 @@ def input_schedule(
     return _check_memory(model, ZeroOrderHold(u, period, count_periods(span, period)))
 
 
-def _check_memory(model: ModelInfo, hold: ZeroOrderHold) -> ZeroOrderHold:
+def _check_memory(model: CompiledModel, hold: ZeroOrderHold) -> ZeroOrderHold:
     """Return `hold`; raise MemoryError if the inputs of its periods do not fit in memory."""
     count = hold.count
-    if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
+    if count * (model.info.row_bytes(1) + _VALUE) > PART * machine_memory():
         raise MemoryError(
             f"control_period: the rows of {count:.3g} periods of {hold.period:g} s don't fit in "
             "memory: take a longer one, or a shorter duration"
@@ -166,7 +255,7 @@ class InputSchedule:
 
     def __init__(
         self,
-        model: ModelInfo,
+        model: CompiledModel,
         u: Array | ZeroOrderHold | None,
         t0: float,
         t_end: float,
@@ -183,7 +272,7 @@ class InputSchedule:
     @property
     def address(self) -> Any:
         """Pointer to the present inputs, for C; NULL if C evaluates the scene's signals."""
-        return self.model._pointer(self.current)
+        return self.model.c.pointer(self.current)
 
     def advance(self, work: Any) -> bool:
         """Compute the inputs of the next control period if the present one has ended.
@@ -195,7 +284,7 @@ class InputSchedule:
             return True
         if self.stop >= self.t_end:
             return False
-        x = np.frombuffer(self.model._ffi.buffer(work.x), self.model.dtype).copy()
+        x = np.frombuffer(self.model.c.ffi.buffer(work.x), self.model.info.dtype).copy()
         self._next(work.t, *x.reshape(2, -1))
         return True
 
@@ -204,7 +293,7 @@ class InputSchedule:
         assert self.periods
         index, source, model = len(self.values), self.periods.source, self.model
         if callable(source):
-            self.current = evaluate_law(source, model._inputs, t, q, qd)
+            self.current = evaluate_law(source, model.arguments.inputs, t, q, qd)
         else:
             # a run that was interrupted has fewer rows than periods
             self.current = source[min(index, len(source) - 1)]
@@ -212,7 +301,7 @@ class InputSchedule:
         self.stop = self.t_end
         if index + 1 < self.periods.count:
             self.stop = min(
-                period_end(index, self.t0, self.periods.period, model.dtype), self.t_end
+                period_end(index, self.t0, self.periods.period, model.info.dtype), self.t_end
             )
 
     @property

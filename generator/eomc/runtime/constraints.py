@@ -8,56 +8,20 @@ is the number of constraint equations; results are in their order in the scene.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, StateArguments, not_one_of
-from .by_name import ByName
-from .frames import Frames
-from .package import option
+from .arguments import Array, ByName, Parameters, StateArguments, not_one_of
+from .functions import Functions
+from .package import Component, option
 from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
 
 REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
 
-class ConstraintRows(NamedTuple):
-    """Facts about the constraint equations and the discrete coordinates of a scene.
-
-    A discrete coordinate is one that only state jumps change.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the constraint equations.
-    loops : tuple of str
-        Names of the loops (joints that close a kinematic chain) that have reactions.
-    fixed : tuple of bool
-        For each coordinate, then for each velocity: True if its initial value stays unchanged when
-        an initial state is assembled, that is, moved onto the constraints.
-    holonomic : int
-        Number of holonomic constraint equations, which come first.
-    redundant : tuple of int
-        Indices of the constraint equations that follow from the others. Their multipliers are 0.
-    modes : tuple of (int, int)
-        For each Coulomb friction with sticking: the index of the coordinate that contains its mode
-        (sticking, or the sliding direction), and that of the coordinate that slides. The modes are
-        the last coordinates.
-    discrete : int
-        Number of parameters that state jumps set. They are coordinates, before the modes.
-    """
-
-    names: tuple[str, ...] = ()
-    loops: tuple[str, ...] = ()
-    fixed: tuple[bool, ...] = ()
-    holonomic: int = 0
-    redundant: tuple[int, ...] = ()
-    modes: tuple[tuple[int, int], ...] = ()
-    discrete: int = 0
-
-
-class Constrained(Frames):
+class Constraints(Component):
     """Methods of a compiled scene that concern its constraint equations.
 
     The equations come from [constraints] and [[loop]] of the scene. In all methods q and qd are one
@@ -65,17 +29,11 @@ class Constrained(Frames):
     (n,), and values in params may be arrays (n,).
     """
 
-    _rows = ConstraintRows()
+    path = "constraints"
 
-    @property
-    def constraint_names(self) -> tuple[str, ...]:
-        """Return the names of the constraint equations, in the order in which results list them."""
-        return self._rows.names
-
-    @property
-    def loops(self) -> tuple[str, ...]:
-        """Return the names of the loops that have reactions, in the order of the reactions."""
-        return self._rows.loops
+    def __init__(self, functions: Functions) -> None:
+        self.functions, self.arguments = functions, functions.arguments
+        self.info, self.c, self.nq = functions.info, functions.c, functions.nq
 
     def constraints(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
@@ -122,7 +80,7 @@ class Constrained(Frames):
         return self._of_rows("constraint_rates", q, qd, t, params)
 
     def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
-        values: Array = self._evaluate(name, q, qd, t, None, params)
+        values: Array = self.functions.evaluate(name, q, qd, t, None, params)
         return values
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
@@ -143,7 +101,7 @@ class Constrained(Frames):
             dphi/dq of holonomic constraints phi(q, t) = 0, dpsi/dqd of nonholonomic ones,
             psi(q, qd, t) = 0.
         """
-        jacobian: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
+        jacobian: Array = self.functions.evaluate("constraint_jacobian", q, None, t, None, params)
         return jacobian
 
     def tangent(
@@ -176,14 +134,14 @@ class Constrained(Frames):
         MotionError
             If a derivative of a constraint is not finite.
         """
-        if not hasattr(self._lib, "constraint_slopes"):
+        if not hasattr(self.c.lib, "constraint_slopes"):
             raise ValueError(
-                f"tangent: {self.name} was built without derivatives: build it with "
+                f"tangent: {self.info.name} was built without derivatives: build it with "
                 f"{option('linearize')}, or discretize"
             )
         A = self.constraint_jacobian(q, t=t, params=params)
-        slopes = self._evaluate("constraint_slopes", q, qd, t, None, params)
-        of_q = A[..., : self._rows.holonomic, :]
+        slopes = self.functions.evaluate("constraint_slopes", q, qd, t, None, params)
+        of_q = A[..., : self.info.constraints.holonomic, :]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
         if not np.isfinite(whole).all():
             k = tuple(np.argwhere(~np.isfinite(whole))[0, : whole.ndim - 2])
@@ -228,20 +186,20 @@ class Constrained(Frames):
         MotionError
             If D is singular, or a multiplier is not finite.
         """
-        values = self._multipliers(q, qd, t, u, params)
+        values = self.multipliers_or_nan(q, qd, t, u, params)
         if not np.isfinite(values).all():
-            self.acceleration(q, qd, t, u, params)  # raises with place and reason
+            self.functions.acceleration(q, qd, t, u, params)  # raises with place and reason
             at, k = np.argwhere(~np.isfinite(np.atleast_2d(values)))[0]
             where = state_text(*(np.atleast_2d(x)[at] for x in (q, qd)))
-            words = f"the multiplier of {self._rows.names[k]} is not finite there"
+            words = f"the multiplier of {self.info.constraints.names[k]} is not finite there"
             raise MotionError(f"at {where}: {words}", "not finite")
         return values
 
-    def _multipliers(
+    def multipliers_or_nan(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """Return the multipliers, nan if they do not exist."""
-        values: Array = self._evaluate("multipliers", q, qd, t, u, params)
+        values: Array = self.functions.evaluate("multipliers", q, qd, t, u, params)
         return values
 
     def reactions(
@@ -274,22 +232,22 @@ class Constrained(Frames):
         MotionError
             If D is singular, or a multiplier is not finite.
         """
-        if not self._rows.loops:
-            raise ValueError(f"reactions: {self.name} has no [[loop]]")
-        values = self._reactions_by(self.multipliers(q, qd, t, u, params), q, qd, t, params)
-        return ByName("reactions", self._rows.loops, np.moveaxis(values, -2, 0))
+        if not self.info.constraints.loops:
+            raise ValueError(f"reactions: {self.info.name} has no [[loop]]")
+        values = self._reactions_from(self.multipliers(q, qd, t, u, params), q, qd, t, params)
+        return ByName("reactions", self.info.constraints.loops, np.moveaxis(values, -2, 0))
 
-    def _reactions(
+    def reactions_or_nan(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """Return reactions of all loops, (loops, 6), in the plane (loops, 3); nan if undefined."""
-        return self._reactions_by(self._multipliers(q, qd, t, u, params), q, qd, t, params)
+        return self._reactions_from(self.multipliers_or_nan(q, qd, t, u, params), q, qd, t, params)
 
-    def _reactions_by(
+    def _reactions_from(
         self, multipliers: Array, q: ArrayLike, qd: ArrayLike, t: float, params: Any
     ) -> Array:
         each = np.ascontiguousarray(multipliers)
-        values: Array = self._evaluate("reactions", q, qd, t, None, params, None, each)
+        values: Array = self.functions.evaluate("reactions", q, qd, t, None, params, None, each)
         return values
 
     def project(
@@ -326,26 +284,28 @@ class Constrained(Frames):
         if isinstance(fixed, str):
             fixed = (fixed,)
         if not (fixed is None or isinstance(fixed, Iterable)):
-            raise ValueError(f"fixed: {fixed!r} is no list of names: {', '.join(self._states)}")
+            raise ValueError(f"fixed: {fixed!r} is no list of names: {', '.join(self.info.states)}")
         fixed = fixed and tuple(fixed)
         for name in fixed or ():
-            if name not in self._states:
-                raise ValueError(not_one_of("fixed", name, self._states))
-        flags = tuple(name in fixed for name in self._states) if fixed else ()
-        return self._projected(q, qd, t, params, flags)
+            if name not in self.info.states:
+                raise ValueError(not_one_of("fixed", name, self.info.states))
+        flags = tuple(name in fixed for name in self.info.states) if fixed else ()
+        return self.project_fixed(q, qd, t, params, flags)
 
-    def _projected(
+    def project_fixed(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array]:
         """Project a state or many. fixed: whether each of q and qd is fixed, or empty."""
-        at, moving, codes = self._projected_rows(q, qd, t, params, fixed)
+        at, moving, codes = self.project_rows(q, qd, t, params, fixed)
         if codes.any():
             k = int(codes.nonzero()[0][0])
             status = STATUS[codes[k]]
             where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
-            fixed_names = [n for n, h in zip(self._states, fixed, strict=False) if h]
+            fixed_names = [n for n, h in zip(self.info.states, fixed, strict=False) if h]
             fixed_names = [
-                n for n in fixed_names if n.removesuffix("_dot") not in self.discrete_coordinates
+                n
+                for n in fixed_names
+                if n.removesuffix("_dot") not in self.info.discrete_coordinates
             ]
             what = STATUS_MESSAGES[status] if status != "locked" else (
                 "no state near that obeys the constraints"
@@ -355,18 +315,18 @@ class Constrained(Frames):
             raise MotionError(f"from {where}: {what}", status)
         return at, moving
 
-    def _projected_rows(
+    def project_rows(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array, Array]:
         """Return projected (q, qd) and the status of each state; failed ones are unchanged."""
-        at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
-        flags = self._ffi.new("int[]", [int(x) for x in fixed]) if fixed else self._c[2]
-        acts, n = StateArguments(self, at.shape[:-1], t, None, params), self.nq
+        at, moving = (np.array(x, self.info.dtype, order="C") for x in self.arguments.state(q, qd))
+        flags = self.c.ffi.new("int[]", [int(x) for x in fixed]) if fixed else self.c.null
+        acts, n = StateArguments(self.arguments, at.shape[:-1], t, None, params), self.nq
         codes, first = np.zeros(at.size // n, "i"), 0
-        from_q, from_qd = self._pointer(at), self._pointer(moving)
+        from_q, from_qd = self.c.pointer(at), self.c.pointer(moving)
         while first < len(codes):
             now, _, p, own = acts.pointers(first)
-            result = self._lib.project(
+            result = self.c.lib.project(
                 len(codes) - first, from_q + n * first, from_qd + n * first, now, flags, p, own
             )
             first += result >> 3
@@ -375,11 +335,7 @@ class Constrained(Frames):
                 first += 1
         return at, moving, codes
 
-    @property
-    def _states(self) -> tuple[str, ...]:
-        return (*self.coordinates, *(f"{name}_dot" for name in self.coordinates))
-
-    def _assembled_rows(
+    def assemble_rows(
         self, q: Array, qd: Array, table: Array, t0: float
     ) -> tuple[Array, Array, Array | None]:
         """Assemble many starts (n, nq); return them and their status, (n,), or None if all succeed.
@@ -387,81 +343,61 @@ class Constrained(Frames):
         table: parameters, a row for each or one for all. A start that cannot be assembled is
         unchanged.
         """
-        if not self._rows.names:
+        if not self.info.constraints.names:
             return q, qd, None
         q, qd, codes = self._project_starts(q, qd, t0, table if len(table) > 1 else table[0])
         return q, qd, codes if codes.any() else None
 
-    def _record_singular_steps(self, run: Any, method: str, work: Any) -> None:
-        """Store the singular steps of a run, which C counted."""
-        if not self._rows.names:
-            return
-        run.singular_steps = getattr(self._lib, f"{method}_singular")(work)
-        if run.singular_steps:
-            run.first_singular = run.t0 + getattr(self._lib, f"{method}_first")(work)
-
-    def _assembled(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
+    def assemble(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
         """Return an initial state on the constraints; values that the scene fixes are unchanged."""
-        q0, qd0 = self._completed(q0, 0), self._completed(qd0, 1)
+        q0, qd0 = self.info.with_discrete(q0, 0), self.info.with_discrete(qd0, 1)
         for x, name in ((q0, "q0"), (qd0, "qd0")):
             if x is not None:
-                self._checked_half(x, name)
-        if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
+                self.arguments.initial_half(x, name)
+        if not self.info.constraints.names or (
+            q0 is None and qd0 is None and params is None and t0 == 0
+        ):
             return q0, qd0
-        q, qd = self._start
+        q, qd = self.info.initial_state
         return self._project_start(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
 
     def _project_start(
         self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
     ) -> tuple[Array, Array]:
         """Project a start onto the constraints and set friction modes from its velocities."""
-        fixed = self._rows.fixed
-        if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
-            return self._projected(q, qd, t0, params, fixed)
+        fixed = self.info.constraints.fixed
+        if not self.info.constraints.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (
+            self.nq,
+        ):
+            return self.project_fixed(q, qd, t0, params, fixed)
         q = self._sliding(q)
-        return self._projected(
-            *self._in_modes(*self._projected(q, qd, t0, params, fixed)), t0, params, fixed
+        return self.project_fixed(
+            *self._in_modes(*self.project_fixed(q, qd, t0, params, fixed)), t0, params, fixed
         )
 
     def _project_starts(
         self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
         """Project many starts; return their status too. Failed ones are unchanged."""
-        fixed = self._rows.fixed
-        if not self._rows.modes:
-            return self._projected_rows(q, qd, t0, params, fixed)
-        found_q, found_qd, first = self._projected_rows(self._sliding(q), qd, t0, params, fixed)
+        fixed = self.info.constraints.fixed
+        if not self.info.constraints.modes:
+            return self.project_rows(q, qd, t0, params, fixed)
+        found_q, found_qd, first = self.project_rows(self._sliding(q), qd, t0, params, fixed)
         found_q, found_qd = self._in_modes(found_q, found_qd)
-        found_q, found_qd, codes = self._projected_rows(found_q, found_qd, t0, params, fixed)
+        found_q, found_qd, codes = self.project_rows(found_q, found_qd, t0, params, fixed)
         codes = np.where(first, first, codes)
         failed = (codes != 0)[:, None]
         return np.where(failed, q, found_q), np.where(failed, qd, found_qd), codes
 
     def _sliding(self, q: ArrayLike) -> Array:
         """Return q with all friction modes set to sliding."""
-        q = np.array(q, self.dtype)
-        q[..., [at for at, _ in self._rows.modes]] = 1
+        q = np.array(q, self.info.dtype)
+        q[..., [at for at, _ in self.info.constraints.modes]] = 1
         return q
-
-    @property
-    def discrete_coordinates(self) -> tuple[str, ...]:
-        """Return the names of the coordinates that only state jumps change.
-
-        They are the last coordinates and have no velocities.
-        """
-        return self.coordinates[self.nq - len(self._rows.modes) - self._rows.discrete :]
-
-    def _completed(self, x: Any, half: int) -> Any:
-        """Append the scene's values of discrete coordinates to q (half 0) or qd (half 1)."""
-        more = len(self._rows.modes) + self._rows.discrete  # called often
-        if not more or np.shape(x)[-1:] != (self.nq - more,):
-            return x
-        shape = (*np.shape(x)[:-1], more)
-        return np.concatenate([x, np.broadcast_to(self._start[half][-more:], shape)], axis=-1)
 
     def _in_modes(self, q: Array, qd: Array) -> tuple[Array, Array]:
         """Set friction modes to the signs of their velocities; tiny velocities become 0."""
-        at, of = np.array(self._rows.modes).T
+        at, of = np.array(self.info.constraints.modes).T
         fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
         qd[..., of] *= np.abs(qd[..., of]) > np.maximum(REST_TOLERANCE * fastest, MIN_SPEED)
         q[..., at] = np.sign(qd[..., of])
