@@ -322,6 +322,9 @@ class _Bodies:
             )
 
 
+# --- joints ---------------------------------------------------------------------------------------
+
+
 class JointChecker:
     """Checks the joints by which bodies are attached to their parents.
 
@@ -517,6 +520,9 @@ class JointChecker:
         return tuple(formula for formula, _ in checked)
 
 
+# --- springs, dampers and forces ------------------------------------------------------------------
+
+
 def check_spring(values: ValueChecker, path: Path, entry: SpringTable) -> Spring:
     """Check a [[spring]] table and return the spring.
 
@@ -629,6 +635,8 @@ def _attachment(
     one, other = (values.vector((*path, "points"), point) for point in points)
     return {"bodies": (first, second), "points": (one, other)}
 
+
+# --- loops ----------------------------------------------------------------------------------------
 
 _AXES_IN_WORDS = {
     1: "one axis, or one in each body's frame",

@@ -103,6 +103,8 @@ def check_width(
         check.report(path, "there is no 'friction' with it: add it")
 
 
+# --- constraints ----------------------------------------------------------------------------------
+
 _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
@@ -225,6 +227,8 @@ def check_guesses(check: Checker, doc: Document) -> None:
                 )
 
 
+# --- events ---------------------------------------------------------------------------------------
+
 COMPARISON = re.compile(r"\s*([^<>=!]+?)\s*(?:[<>]=?|==)\s*([^<>=!]+?)\s*")
 INPUT_REMEDY = ": write '{name}*on' where it acts, with a parameter on = 1, and set that to 0"
 CONSTANT_REMEDY = ", and does not change in a run: make it a parameter"
@@ -289,6 +293,8 @@ def _jump(
     if first and entry.action != "jump":
         check.report(("event", k, first), f"only a jump sets '{first}': add action = \"jump\"")
 
+
+# --- picture --------------------------------------------------------------------------------------
 
 _SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", "path"))
 
