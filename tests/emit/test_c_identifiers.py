@@ -1,7 +1,8 @@
-"""No name that the reader accepts breaks the C: neither a header's macros nor our own names.
+"""Names that a scene may use are renamed where C could not compile them.
 
-The macros are those of the compiler that runs the tests, for the headers that the generated files,
-cffi's binding and Python.h include, in the dialects that they are compiled as.
+They must collide neither with macros of headers nor with other generated names. The macros are
+those of the compiler that runs the tests, for the headers that the generated files, the binding of
+cffi and Python.h include, in the dialects that they are compiled as.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ wchar wctype termios""".split()
 
 
 def dumped(mode: str, text: str) -> set[str]:
-    """The macros that a text defines, those without arguments."""
+    """Return the macros without arguments that a text defines."""
     command = [needs("cc"), *mode.split(), INCLUDE, "-dM", "-E", "-"]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
     return set(re.findall(r"^#define (\w+)(?!\S)", done.stdout, re.MULTILINE))
@@ -47,7 +48,7 @@ def dumped(mode: str, text: str) -> set[str]:
 
 @cache
 def macros() -> frozenset[str]:
-    """All macros that generated text may meet."""
+    """Return all macros that are visible in generated C."""
     ffi = cffi.FFI()
     ffi.cdef("int nothing(void);")
     ffi.set_source("binding", OUTSIDE, compiler_verbose=0)
@@ -60,7 +61,7 @@ def macros() -> frozenset[str]:
     return frozenset(found | {m for mode in MODES[:1] for m in dumped(mode, binding)})
 
 
-def test_the_compiler_has_told_its_macros() -> None:
+def test_the_compiler_lists_its_macros() -> None:
     assert len(macros()) > 1000
     assert {"NAN", "EOF", "errno", "M_PI", "CHAR_BIT", "Py_None", "stdout", "I", "B0"} <= macros()
 
@@ -79,7 +80,7 @@ def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
 
 
 def test_no_enumerator_is_a_macro() -> None:
-    """Every macro cut at every underscore: a scene and a coordinate of it."""
+    """Each macro is cut at each underscore into the names of a scene and of a coordinate."""
     for macro in sorted(macros()):
         for cut in [m.start() for m in re.finditer("_", macro)]:
             name, coordinate = macro[:cut].lower(), macro[cut + 1 :].lower()
@@ -93,7 +94,7 @@ def made(text: str) -> dict[str, str]:
 
 
 def whole(name: str, real: str = "double") -> str:
-    """A scene with all that gives names to C: batches, slopes, implicit methods, angles."""
+    """Return a scene with everything that adds C names: batches, derivatives, implicit methods."""
     return f"""eomc = 1
 name = "{name}"
 [coordinates]
@@ -124,7 +125,7 @@ def identifiers(text: str) -> set[str]:
 
 
 def single(name: str) -> str:
-    """A scene of one trajectory with every implicit method."""
+    """Return a scene without batches, with every implicit method."""
     return (
         whole(name).replace('["rk4", "dp8"]', '["rk4", "gauss8", "gauss16"]')
         .replace("batch = true\n", "")
@@ -132,7 +133,7 @@ def single(name: str) -> str:
 
 
 def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
-    """What follows a scene's name in files: a scene that it makes a macro of is refused."""
+    """A scene's name with which a generated name would be a macro is refused."""
     behind = set()
     for text in (whole("scene"), whole("scene", "float"), single("scene")):
         for file, content in made(text).items():
@@ -151,7 +152,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
 
 
 def compiled(folder: Path, name: str, *flags: str) -> None:
-    """Both forms compile, the fast one in Python's and C++'s company too."""
+    """Compile both forms; the optimised one also together with Python.h and as C++."""
     folder = folder / "fast"
     plain = [needs("cc"), "-std=c99", *flags, "-fsyntax-only", f"../{name}.c"]
     done = subprocess.run(plain, cwd=folder, capture_output=True, text=True)
@@ -171,7 +172,7 @@ ROLES = ("coordinates", "parameters", "inputs", "definitions")
 
 
 def of_names(role: str, given: list[str], run: str) -> str:
-    """A scene in which the names have one role, each used in an angle and in a product."""
+    """Return a scene whose names all have one role; each is used in an angle and in a product."""
     tables = dict.fromkeys(ROLES, "")
     value = {"parameters": "1.5", "definitions": '"sin(zzz)*zzz"'}.get(role, "{}")
     tables[role] = "".join(f"{n} = {value}\n" for n in given)
@@ -187,7 +188,7 @@ def of_names(role: str, given: list[str], run: str) -> str:
 
 @cache
 def ours() -> frozenset[str]:
-    """Every identifier of generated text that could be a name of a scene."""
+    """Return every identifier of generated text that a scene could use as a name."""
     found: set[str] = set()
     for text in (whole("scene"), whole("scene", "float"), single("scene")):
         for file, content in made(text).items():
@@ -208,7 +209,7 @@ RUNS = {
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("role", ROLES)
 def test_names_of_our_own_do_not_collide(role: str, run: str, tmp_path: Path) -> None:
-    """As coordinates, parameters, inputs and definitions; -Wshadow finds what hides another."""
+    """They are coordinates, parameters, inputs and definitions; -Wshadow finds collisions."""
     every = sorted(ours())
     assert len(every) > 100
     step = 6 if role in ("coordinates", "inputs") else 30
@@ -234,7 +235,7 @@ def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
         assert f"{given[4]} is {given[4]}_" in files["fast/scene.h"]
 
 
-def test_a_moment_of_inertia_stands_beside_complex_numbers(tmp_path: Path) -> None:
+def test_a_parameter_named_I_compiles_with_complex_numbers(tmp_path: Path) -> None:
     """`I` is the imaginary unit of <complex.h>, which <tgmath.h> includes."""
     text = """eomc = 1
 name = "scene"
@@ -256,7 +257,7 @@ kinetic = "I*theta_dot**2/2"
 
 
 def test_accelerations_are_renamed_with_their_coordinates() -> None:
-    """`small` may be a macro: C calls it small_; its acceleration keeps its name."""
+    """`small` may be a macro, so C calls the coordinate small_. Its acceleration keeps its name."""
     text = """eomc = 1
 name = "one"
 [coordinates]
@@ -273,7 +274,7 @@ inverse_dynamics = true
     assert re.search(r"\bsmall_\b", source) and not re.search(r"\bsmall\b", source)
 
 
-def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
+def test_temporaries_get_names_that_are_valid_in_c() -> None:
     made = program.build(lagrange.derive(scene_system("cartpole")))
     for name, function in made.functions.items():
         if not function.body:
@@ -285,7 +286,7 @@ def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
 
 
 def test_coordinates_may_be_called_as_the_arguments_of_constraints_are(tmp_path: Path) -> None:
-    """`A` is their Jacobian."""
+    """`A` is the name of the Jacobian."""
     text = """eomc = 1
 name = "scene"
 [coordinates]
@@ -343,7 +344,7 @@ batch = true
 
 
 def code_of(text: str) -> dict[str, str]:
-    """The C files of a scene without comments, strings, stamps and white space.
+    """Return the C files of a scene without comments, strings, stamps and white space.
 
     Enumerators of events and constraints keep the full names of joints; here they are shortened.
     """
@@ -378,7 +379,7 @@ def test_a_prefix_stays_where_names_without_it_would_not_serve(old: str, new: st
 
 
 def test_no_identifier_has_two_underscores_in_a_row() -> None:
-    """Such names are reserved in C++; those of compilers have two at their start."""
+    """Such names are reserved in C++. Names of compilers, which begin with two, are left out."""
     names_of_macros = "small NAN I".split()
     texts = (MECHANISM.replace("PREFIX_", "robot_"),
              of_names("coordinates", names_of_macros, RUNS["batch"]),

@@ -1,4 +1,4 @@
-"""Names of people and of temporaries: w1 may be anybody's."""
+"""Names of scenes do not collide with those of temporaries, such as w1."""
 
 from __future__ import annotations
 
@@ -57,7 +57,10 @@ IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 def test_names_that_temporaries_have_too(
     text: str, run: str, modules: Modules, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A parameter that a function does not read once had its name taken, and its value too."""
+    """A parameter that a function did not read once shared its name with a temporary.
+
+    The temporary then got the value of the parameter.
+    """
     monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
     made = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
     report = check(made, modules.unoptimised(made), states=4)

@@ -1,4 +1,4 @@
-"""Units of FMI as text: units, dependencies, C, bytes. No importer needed."""
+"""FMUs as text: units of measurement, dependencies, C and determinism. No importer is needed."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_same_scene_same_text(version: int) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_texts_of_people_are_escaped_and_names_are_the_authors(version: int) -> None:
+def test_texts_are_escaped_and_names_are_those_of_the_scene(version: int) -> None:
     unit = made(ODD, version)
     root = described(unit)
     assert root.get("description") == "Quotes \" ' and ]]> & <b> --> here"
@@ -113,7 +113,7 @@ def test_texts_of_people_are_escaped_and_names_are_the_authors(version: int) -> 
     assert "more" not in whole and 'name="kg m^2/s^2"' in whole
 
 
-def test_what_depends_on_what() -> None:
+def test_dependencies_are_those_of_the_equations() -> None:
     root = described(made(BALL, 3))
     name = {v.get("valueReference"): v.get("name") for v in root.find("ModelVariables") or ()}
     structure = root.find("ModelStructure")
@@ -140,7 +140,7 @@ def test_what_depends_on_what() -> None:
     ("version", "text"),
     [(3, BALL), *tiers([(2, BALL), *product((2, 3), (EVERYTHING, FLOAT, ODD))])],
 )
-def test_its_c_is_strict_and_has_nothing_that_changes(
+def test_c_files_are_strict_and_have_no_static_variables(
     version: int, text: str, tmp_path: Path
 ) -> None:
     unit = made(text, version)
@@ -169,7 +169,7 @@ def test_units_that_are_linked_statically_have_a_prefix(version: int, tmp_path: 
     assert f" T ball_fmi{version}DoStep" in listed and f" T fmi{version}DoStep" not in listed
 
 
-def test_the_standard_brings_its_licence() -> None:
+def test_the_licence_of_the_standard_is_included() -> None:
     text = resources.text("csrc", "fmi/LICENSE.txt")
     assert "2-Clause BSD" in text and "Modelica Association" in text
     for version in (2, 3):
@@ -204,7 +204,7 @@ def test_numeric_limits_are_min_and_max_and_starts_of_parameters_depend_on_them(
 
 
 def test_constraints_are_for_co_simulation_alone() -> None:
-    """An importer that integrates would leave them."""
+    """An importer that integrates the model itself would drift off the constraints."""
     text = FLOAT.replace("[run]", '[constraints]\ndrive = "phi - phi**2/4 - t"\n[run]')
     text = text.replace("start = 0.5", "start = 0.5, guess = true")
     for version in (2, 3):
@@ -218,13 +218,13 @@ def test_other_versions_are_refused() -> None:
 
 
 def filled(text: str, version: int) -> Unit:
-    """A unit with a text wherever one can be."""
+    """Return an FMU whose scene has a text wherever a text is allowed."""
     whole = derived()
     return render.unit(replace(whole, system=with_texts(whole.system, text)), version)
 
 
 def without_digests(unit: Unit) -> dict[str, str]:
-    """Its sources but for what tells one from another."""
+    """Return the sources of an FMU without the token of the build."""
     return {
         name.removeprefix("sources/"): re.sub(r"[0-9a-f-]{36}", "", text)
         for name, text in unit.files.items()
@@ -247,7 +247,7 @@ def plain_tokens(version: int, names: tuple[str, ...], folder: Path) -> str:
 def test_free_texts_stay_texts(
     given: str, version: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """Whatever they hold: descriptions read back are they, and a C compiler sees none of them."""
+    """Descriptions are read back unchanged, whatever they contain, and no C file contains them."""
     unit = filled(given, version)
     for name, text in unit.files.items():
         assert not RAW.search(text.replace("\t", "")), name

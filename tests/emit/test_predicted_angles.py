@@ -1,4 +1,4 @@
-"""Sines that are rotated from stage to stage, sums that are compensated, runs that are cut."""
+"""Rotated sines, compensated sums, and runs in several calls."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def odd() -> program.Program:
 
 
 def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """RK4 as a textbook has it, over the module's accelerations."""
+    """Return the state after one textbook step of RK4 with the accelerations of the module."""
     q, v = module.start
     a = module.acceleration
     for _ in range(steps):
@@ -58,7 +58,7 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.3), 0.02))
 def test_steps_short_and_long_are_those_of_the_textbook(h: float, modules: Modules) -> None:
-    """Turns of some 1e-6, 1e-4 and, beyond what is rotated, 1e-1."""
+    """Angles change by about 1e-6, 1e-4 and, above the limit of rotations, 1e-1."""
     links = range(1, 7)
     coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
     energy = " + ".join(f"{k}*a{k}_dot**2/2" for k in links)
@@ -74,7 +74,7 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, modules: Modul
 
 
 def test_steps_leave_their_predictions_and_come_back(cartpole: ModuleType) -> None:
-    """A pole that falls: it turns by h^2 a/8 from the predicted angles, up to 2^-12.5 is close."""
+    """A falling pole turns by h^2 a/8 from the predicted angles; up to 2^-12.5 predictions hold."""
     h, steps = 0.016, 800
     run = cartpole.simulate(h=h, steps=steps)
     turns = h**2 / 8 * np.abs(cartpole.acceleration(run.q, run.qd)[:, 1])
@@ -89,7 +89,7 @@ def test_steps_leave_their_predictions_and_come_back(cartpole: ModuleType) -> No
 def test_signals_and_held_inputs_reach_steps_near_predictions(
     signal: str, modules: Modules
 ) -> None:
-    """Signals of time, of the state and constant ones; and inputs held over a step each."""
+    """Signals of time, of the state and constant ones; and inputs that are constant over a step."""
     scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')
     text = scene.replace('name = "odd"', 'name = "pushed"') + '[forces]\nb = "u"\n'
     module = modules.unoptimised(text)
@@ -117,7 +117,7 @@ def test_signals_and_held_inputs_reach_steps_near_predictions(
 
 
 def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
-    """Two million turns on it is the same motion, but for what rounding leaves of the angle."""
+    """After two million turns the motion is the same, up to the rounding error of the angle."""
     module = modules("simple_pendulum")
     q, qd = module.start
     there = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=200)
@@ -130,9 +130,9 @@ def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     ("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15), ("gauss16", 15)]
 )
 def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
-    """A step of an oscillator is a linear map R(h J): its power in 40 digits is the answer.
+    """The reference is the power of the linear map R(h J) of a step of an oscillator, in 40 digits.
 
-    With plain sums 1e-13 and more, and nearly as much with weights as they are rounded.
+    With plain sums the error is 1e-13 and more, and nearly as large with rounded weights.
     """
     text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
     names = '["rk4", "dp8", "gauss8", "gauss16"]'
@@ -167,10 +167,10 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     ("h", "name"),
     tiers([(0.005, "cartpole"), (0.016, "cartpole"), (0.004, "double_pendulum")], 0.016),
 )
-def test_a_run_cut_in_c_is_the_same_to_the_last_bit(
+def test_a_run_in_several_calls_is_the_same_to_the_last_bit(
     name: str, h: float, tmp_path: Path, modules: Modules
 ) -> None:
-    """With the memory handed on; without it, sums begin anew. Near what was predicted, and not."""
+    """This holds if the workspace is kept. Without it, compensated sums restart."""
     write_files(fast_files(modules(name)), tmp_path)
     main = r"""
         #include "NAME.h"
@@ -227,8 +227,8 @@ static void METHOD_by_hand(void)
 """
 
 
-def test_a_memory_of_another_state_is_not_believed(tmp_path: Path, modules: Modules) -> None:
-    """A state changed by hand between two calls moves on as it would with no memory at all."""
+def test_a_workspace_of_another_state_is_ignored(tmp_path: Path, modules: Modules) -> None:
+    """A state that is changed between two calls continues as without a workspace."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", f"[run]\nmethod = {list(METHODS_OF_MEMORY)}\n")
     made = system.from_scene(scene.parse(text, "cartpole.toml"))

@@ -1,4 +1,4 @@
-"""Sines of rotated and of predicted angles, compiled with and without FMA, against forty digits."""
+"""Sines of rotated and of predicted angles, compiled with and without FMA, against 40 digits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from eomc.toolchain.files import write_files
 
 @cache
 def fast(name: str) -> tuple[Accelerations, dict[str, str]]:
-    """Of the cart-pole or of the odd scene."""
+    """Return the optimised C of the cart-pole or of the odd scene."""
     own = odd_system() if name == "odd" else scene_system(name)
     made = program.build(lagrange.derive(own))
     return Accelerations(Target(made, DOUBLE)), fast_files(Modules().unoptimised(own))
@@ -33,7 +33,10 @@ def fast(name: str) -> tuple[Accelerations, dict[str, str]]:
 def made_with(
     main: str, name: str, rows: Iterable[Sequence[float]], flags: Sequence[str], folder: Path
 ) -> list[list[float]]:
-    """What a main() behind the fast C of a scene tells of rows of numbers."""
+    """Return the numbers that a main() prints for each row of its input.
+
+    It is compiled together with the optimised C of a scene.
+    """
     write_files(fast(name)[1], folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     main = "#include <stdio.h>\n" + main.replace("eomc_", f"{name}_")
@@ -54,7 +57,7 @@ UNIT = 2.0**-53
 
 
 def worst_of(found: Iterable[tuple[float, float, mpmath.mpf]]) -> float:
-    """The largest error of sines and cosines at exact angles, in units of rounding of 1."""
+    """Return the largest error of sines and cosines at exact angles, in units of rounding of 1."""
     with mpmath.workdps(40):
         return max(
             float(max(abs(s - mpmath.sin(x)), abs(c - mpmath.cos(x)))) / UNIT for s, c, x in found
@@ -62,10 +65,10 @@ def worst_of(found: Iterable[tuple[float, float, mpmath.mpf]]) -> float:
 
 
 @pytest.mark.parametrize("build", tiers(BUILDS, "narrow"))
-def test_a_turned_sine_is_a_sine(build: str, tmp_path: Path) -> None:
-    """Of a step without predictions: from its middle back and on, then by the accelerations.
+def test_rotated_sines_are_accurate(build: str, tmp_path: Path) -> None:
+    """Sines are rotated from the middle of a step back and forth, then by the accelerations.
 
-    Up to the bounds 2^-3 and 2^-6 of what is rotated; beyond them the step has failed.
+    Rotations are accurate up to their limits 2^-3 and 2^-6; beyond them the step fails.
     """
     main = r"""
     int main(void)
@@ -127,8 +130,8 @@ def test_a_turned_sine_is_a_sine(build: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("build", BUILDS)
 @pytest.mark.parametrize("name", ["cartpole", "odd"])
-def test_sines_near_predictions_are_sines(name: str, build: str, tmp_path: Path) -> None:
-    """In units of rounding of 1, of one angle and of three in one register, up to their bounds."""
+def test_sines_near_predictions_are_accurate(name: str, build: str, tmp_path: Path) -> None:
+    """Errors are in units of rounding of 1, of one angle and of three in one register."""
     main = r"""
     int main(void)
     {
@@ -197,9 +200,9 @@ def test_sines_near_predictions_are_sines(name: str, build: str, tmp_path: Path)
 
 @pytest.mark.parametrize("build", tiers(BUILDS, "native"))
 def test_steps_end_where_predictions_do(build: str, tmp_path: Path) -> None:
-    """Four distances, whose squares may be 2^-24 together; an angle of 2^20 takes all of that.
+    """The sum of four squared distances may be 2^-24; an angle of 2^20 needs all of that.
 
-    What was not done leaves the state as it was, what was done has the sines of its end.
+    A step that fails leaves the state unchanged; other steps have the sines of their end.
     """
     main = r"""
     int main(void)

@@ -1,4 +1,4 @@
-"""`project` finds the nearest positions, and closes loops by the rotation that is meant."""
+"""`project` finds the nearest positions, and closes loops by the smallest rotation."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ def rolling(modules: Modules) -> ModuleType:
 
 
 @pytest.mark.parametrize("held", [(), ("qx",), ("qw",), ("qy", "x")])
-def test_rows_of_rates_do_not_move_positions(rolling: ModuleType, held: tuple[str, ...]) -> None:
+def test_velocity_constraints_do_not_move_positions(
+    rolling: ModuleType, held: tuple[str, ...]
+) -> None:
     q = np.array([0.3, 0.0, 0.98, 0.1, -0.1, 0.1])
     found = rolling.project(q, np.zeros(6), fixed=list(held))[0]
     free = [k for k in range(2, 6) if rolling.coordinates[k] not in held]
@@ -67,14 +69,14 @@ def test_rows_of_rates_do_not_move_positions(rolling: ModuleType, held: tuple[st
     np.testing.assert_allclose(found[free], nearest, atol=1e-12)
 
 
-def test_rows_of_rates_do_not_move_an_assembled_start() -> None:
+def test_velocity_constraints_do_not_move_an_assembled_start() -> None:
     made = assembled(from_scene(parse(ROLLING)))
     q = np.array([c.start for c in made.coordinates])
     np.testing.assert_array_equal(q[[0, 1, 3, 5]], [0.3, 0, 0.1, 0])
     np.testing.assert_allclose(q[[2, 4]], np.array([1, 0.2]) * np.sqrt(0.99 / 1.04), atol=1e-12)
 
 
-def test_a_coordinate_in_rows_of_rates_alone_and_without_inertia_stays(modules: Modules) -> None:
+def test_a_massless_coordinate_in_velocity_constraints_only_stays(modules: Modules) -> None:
     counted = modules.unoptimised(COUNTED)
     for held in ([], ["y"]):
         q = counted.project([1.1, 0.2, 0.5], np.zeros(3), fixed=held)[0]
@@ -87,7 +89,7 @@ def test_a_coordinate_in_rows_of_rates_alone_and_without_inertia_stays(modules: 
 def test_the_change_is_the_least_in_the_metric_of_the_mass_matrix(
     modules: Modules, held: tuple[str, ...]
 ) -> None:
-    """It was that of Newton's method: 1e-3 of the way, or less, beside the nearest position."""
+    """Newton's method, used before, missed the nearest position by up to 1e-3 of the distance."""
     four_bar = modules("four_bar")
     free = [k for k, name in enumerate(four_bar.coordinates) if name not in held]
     random = np.random.default_rng(3)
@@ -158,8 +160,8 @@ rotation = 2.5
 
 
 @pytest.mark.parametrize("text", [WELDED, pytest.param(LOOSE, marks=pytest.mark.slow)])
-def test_loops_are_closed_as_is_meant_from_any_rotation(modules: Modules, text: str) -> None:
-    """A state that was more than a quarter turn off was closed half a turn off."""
+def test_loops_are_closed_by_the_smallest_rotation(modules: Modules, text: str) -> None:
+    """Loops that were off by more than a quarter turn once were closed half a turn off."""
     loose = modules.unoptimised(text)
     wrong = find_wrong_rotations(from_scene(parse(text)))
     random = np.random.default_rng(7)

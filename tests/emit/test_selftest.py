@@ -22,8 +22,8 @@ from eomc.toolchain.files import write_files
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_what_a_multiple_of_half_pi_loses(real: type) -> None:
-    """Powers of two nothing, others up to half a unit in the last place of n pi/2."""
+def test_rounding_errors_of_multiples_of_half_pi(real: type) -> None:
+    """Powers of two lose nothing, other multiples up to half a unit in the last place of n pi/2."""
     double, half_pi = real is np.float64, real(math.pi / 2)
     for n in (1, 2, 64, 4096):
         assert _rounding_error(n * math.pi / 2 + 0.3, double) == 0
@@ -75,13 +75,13 @@ discretize = true
 
 @cache
 def sources(real: str) -> dict[str, str]:
-    """The C of the ball by file."""
+    """Return the C of the ball by file."""
     text = BALL.replace("REAL", f'real = "{real}"')
     return dict(eomc.sources(system.from_scene(scene.parse(text, "ball.toml"))).files)
 
 
 def outcome(folder: Path, form: str, *flags: str) -> tuple[int, str]:
-    """Status and words of the self-test of the C in a folder."""
+    """Return status and output of the self-test of the C in a folder."""
     at = "." if form == "plain" else "fast"
     files = ["selftest.c", f"{at}/ball.c", "-lm", "-o", "selftest"]
     compiled(needs("cc"), "-std=gnu99", *flags, f"-I{at}", *files, cwd=folder)
@@ -90,7 +90,7 @@ def outcome(folder: Path, form: str, *flags: str) -> tuple[int, str]:
 
 
 def write(folder: Path, real: str = "double") -> None:
-    """The C of the ball in a folder."""
+    """Write the C of the ball to a folder."""
     write_files({n: x for n, x in sources(real).items() if n.endswith((".c", ".h"))}, folder)
 
 
@@ -102,7 +102,7 @@ gauss16_derivative euler_step euler_run euler_derivative""".split()
 
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 def test_every_function_of_the_header_has_cases(real: str) -> None:
-    """Several each; events are run over in both directions."""
+    """There are several for each function; runs cross events in both directions."""
     rows = re.findall(r'^    \{ "(\w+)", test_(\w+),', sources(real)["selftest.c"], re.M)
     counts = {name: sum(row[0] == name for row in rows) for name in EVERY}
     assert {row[0] for row in rows} == {*EVERY} and min(counts.values()) >= 2, counts
@@ -146,7 +146,7 @@ TABLES = {
 
 
 def seeded(name: str, source: str) -> str:
-    """The source with a fault."""
+    """Return the source with a seeded fault."""
     if name in TABLES:
         changed = re.sub(TABLES[name][0], TABLES[name][1], source)
     else:

@@ -1,4 +1,4 @@
-"""The views of the templates, and the calls in them; no C in the Python that makes them."""
+"""Views have exactly the variables of their templates; the modules that fill them contain no C."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ def _views() -> Iterator[Any]:
 VIEWS = sorted(_views(), key=lambda v: str(v.TEMPLATE))
 
 
-def asked(template: str) -> set[str]:
-    """The variables that a template and what it includes ask for."""
+def variables_of(template: str) -> set[str]:
+    """Return the variables that a template and the templates that it includes use."""
     source = resources.text("templates", f"{template}.jinja")
     tree = render.environment().parse(source)
     found = jinja2.meta.find_undeclared_variables(tree)
     for name in jinja2.meta.find_referenced_templates(tree):
         assert name is not None
-        found |= asked(name.removesuffix(".jinja"))
+        found |= variables_of(name.removesuffix(".jinja"))
     return found
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda v: str(v.TEMPLATE))
-def test_a_view_has_what_its_template_asks_for(view: Any) -> None:
-    assert asked(view.TEMPLATE) == {field.name for field in dataclasses.fields(view)}
+def test_a_view_has_the_variables_of_its_template(view: Any) -> None:
+    assert variables_of(view.TEMPLATE) == {field.name for field in dataclasses.fields(view)}
     assert view.__dataclass_params__.frozen
 
 
@@ -75,7 +75,7 @@ def test_every_template_of_code_has_a_view() -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_no_c_syntax_in_python(module: str) -> None:
-    """Semicolons, arrows, braces and const: in two files alone."""
+    """Only two modules contain semicolons, arrows, braces and const in texts."""
     if module in MAY:
         return
     tree = ast.parse((EMIT / module).read_text(encoding="utf-8"))
@@ -98,7 +98,7 @@ def test_no_c_syntax_in_python(module: str) -> None:
     tiers(["cartpole", "cartpole_driven", "chain", "suspension"], "cartpole", "cartpole_driven"),
 )
 def test_public_functions_are_those_of_the_header(name: str) -> None:
-    """Each is declared there once, with these arguments."""
+    """The header declares each of them once, with these arguments."""
     made = program.build(lagrange.derive(eomc.read(SCENES / f"{name}.toml")))
     public, methods = Public(Target(made, DOUBLE)), made.system.run.methods
     expected = [*public.evaluations(), public.acceleration]
