@@ -1,6 +1,6 @@
 /*
- * What FMI 2.0 and 3.0 say alike, for both: FMI(name) is fmi2name or fmi3name, FMI_STATE(a, b) the
- * name of a function of states. Included after Instance and log_message(). Written by hand.
+ * Functions that FMI 2.0 and 3.0 have in common: FMI(name) is fmi2name or fmi3name, FMI_STATE(a, b) the
+ * name of a function for states. Included after Instance and log_message(). Written by hand.
  */
 
 static FMI(Status) outcome(Instance *a, UnitResult result)

@@ -1,7 +1,7 @@
 /* FMI 2.0, model exchange and co-simulation, over unit.h. Written by hand, the same for every scene. */
 #include "fmi2Functions.h"
 
-/* The header beside this file adds no prefix: units that are linked statically want one. */
+/* The FMI header adds no prefix, which units that are linked statically need. */
 #if defined(FMI2_FUNCTION_PREFIX) && !defined(FMI2_OVERRIDE_FUNCTION_PREFIX)
 #undef fmi2FullName
 #define fmi2Paste(a, b) a##b
@@ -15,10 +15,10 @@ typedef struct {
     UnitInstance unit;
     fmi2CallbackFunctions callbacks;
     char *name;
-    int errors, events; /* which messages are wanted */
+    int errors, events; /* whether such messages are logged */
 } Instance;
 
-/* text: without a '%', since loggers take it for a format. */
+/* text: without '%', since loggers may use it as a format. */
 static void log_message(const Instance *a, fmi2Status status, const char *category, const char *text)
 {
     if (a->callbacks.logger && (status == fmi2OK ? a->events : a->errors))
@@ -83,7 +83,7 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     }
     memcpy(a->name, instanceName, length);
     a->callbacks = *functions;
-    a->errors = 1; /* failures are always told, unless fmi2SetDebugLogging says otherwise */
+    a->errors = 1; /* failures are logged unless fmi2SetDebugLogging disables that */
     a->events = loggingOn;
     unitReset(&a->unit.x, fmuType == fmi2ModelExchange);
     return a;
@@ -156,7 +156,7 @@ fmi2Status fmi2SetBoolean(
     return fmi2OK;
 }
 
-/* Types that no variable has: fine where nothing is asked for. */
+/* Types that no variable has: calls without value references succeed. */
 #define NONE(name, values)                                                                    \
     fmi2Status fmi2##name(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, values) \
     {                                                                                         \
@@ -217,7 +217,7 @@ fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReferenc
     return refused(c, "there are no derivatives of outputs by time");
 }
 
-/* Where an event has stopped the motion, or it can't go on: fmi2Discard, and fmi2GetRealStatus says when. */
+/* fmi2Discard if an event has stopped the motion or it cannot continue; fmi2GetRealStatus returns the time. */
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint,
     fmi2Real communicationStepSize, fmi2Boolean noSetFMUStatePriorToCurrentPoint)
 {

@@ -7,7 +7,7 @@ typedef struct {
     UnitInstance unit;
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
-    bool errors, events; /* which messages are wanted */
+    bool errors, events; /* whether such messages are logged */
 } Instance;
 
 static void log_message(const Instance *a, fmi3Status status, const char *category, const char *text)
@@ -56,7 +56,7 @@ static fmi3Instance instantiate(fmi3String token, fmi3Boolean loggingOn,
     }
     a->environment = environment;
     a->log = log;
-    a->errors = true; /* failures are always told, unless fmi3SetDebugLogging says otherwise */
+    a->errors = true; /* failures are logged unless fmi3SetDebugLogging disables that */
     a->events = loggingOn;
     unitReset(&a->unit.x, exchange);
     return a;
@@ -167,7 +167,7 @@ fmi3Status fmi3SetBoolean(fmi3Instance instance, const fmi3ValueReference valueR
     return fmi3OK;
 }
 
-/* Types that no variable has: fine where nothing is asked for. */
+/* Types that no variable has: calls without value references succeed. */
 #define NONE(name, values)                                                                   \
     fmi3Status fmi3##name(fmi3Instance instance, const fmi3ValueReference valueReferences[], \
         size_t nValueReferences, values, size_t nValues)                                     \
@@ -312,7 +312,7 @@ fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance)
     return fmi3OK;
 }
 
-/* Clocks, which there are none of. */
+/* Clocks: there are none. */
 #define NO_CLOCK(name, values)                                                                   \
     fmi3Status fmi3##name(fmi3Instance instance, const fmi3ValueReference valueReferences[],     \
         size_t nValueReferences, values)                                                         \
@@ -396,7 +396,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
     (void)noSetFMUStatePriorToCurrentPoint;
     *eventHandlingNeeded = false;
     *terminateSimulation = a->unit.x.stopped != 0;
-    /* an event has stopped the motion inside the step; at its very end the step is complete */
+    /* an event has stopped the motion within the step; at the end of the step, it is complete */
     *earlyReturn = a->unit.x.stopped &&
         a->unit.x.t < currentCommunicationPoint + communicationStepSize;
     *lastSuccessfulTime = a->unit.x.t;

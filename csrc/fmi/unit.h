@@ -1,10 +1,10 @@
 /*
- * A scene as a unit of FMI, whatever its version: variables, steps, events, derivatives.
+ * A scene as a functional mock-up unit of FMI 2.0 or 3.0: variables, steps, events, derivatives.
  *
- * Variables are numbered one after the other, each a double to the importer: time, q, qd, their
- * derivatives, inputs, outputs, parameters, energies, event indicators. All that changes is in a Unit,
- * which is copied to keep a state; there are no globals. Written by hand: scene.h, beside this file,
- * is generated. No name has an underscore, which all names of a scene have.
+ * Value references number the variables, each a double for the importer: time, q, qd, their
+ * derivatives, inputs, outputs, parameters, energies, event indicators. A Unit contains all variable
+ * data; a copy of it is a state. There are no globals. This file is written by hand; scene.h is
+ * generated. Names here have no underscore, which all names of a scene have.
  */
 #ifndef FMU_UNIT_H
 #define FMU_UNIT_H
@@ -27,7 +27,7 @@ enum {
     unitP = unitY + unitNY,
     unitE = unitP + unitNP,
     unitZ = unitE + 3,
-    unitFollowSignals = unitZ + unitNE, /* Boolean: the scene's signals act in place of inputs */
+    unitFollowSignals = unitZ + unitNE, /* Boolean: the scene's signals replace the inputs */
     unitNX = 2*unitNQ
 };
 
@@ -40,23 +40,23 @@ typedef enum {
     unitEnded
 } UnitMode;
 
-/* What became of a call. */
+/* Result of a call. */
 typedef enum { unitOk, unitImpossible, unitRefused } UnitResult;
 
 typedef struct {
     UnitMode mode;
-    int exchange; /* model exchange, not co-simulation */
-    double t; /* now */
-    double origin; /* steps of fixed size: the next goes from origin + steps*unitStep */
+    int exchange; /* 1: model exchange; 0: co-simulation */
+    double t; /* time, s */
+    double origin; /* the next step of fixed size starts at origin + steps*unitStep */
     long steps;
     unitReal q[unitNQ], qd[unitNQ], u[unitNU + 1];
     unitParameters p;
-    char own[2*unitNQ]; /* of q, then of qd: whether the importer has set the start */
-    int signals; /* whether the scene's signals act */
+    char own[2*unitNQ]; /* whether the importer has set the initial values of q, then of qd */
+    int signals; /* whether the scene's signals replace the inputs */
     double tolerance;
-    int stopped; /* 1 + the event that has ended the motion */
-    int side[unitNE + 1]; /* model exchange: of zero, where each event is; 0: not known */
-    unitReal zero[unitNE + 1]; /* what counts as zero: what was left where a jump happened */
+    int stopped; /* 1 + the event that stopped the motion; 0: none */
+    int side[unitNE + 1]; /* model exchange: sign of each event indicator; 0: unknown */
+    unitReal zero[unitNE + 1]; /* value that counts as zero: the indicator after a jump at its root */
     unitMemory memory;
 } Unit;
 
@@ -65,9 +65,9 @@ typedef struct {
     char message[240]; /* the last message */
 } UnitInstance;
 
-typedef void (*UnitEventCallback)(void *who, const char *text); /* is called with each event */
+typedef void (*UnitEventCallback)(void *who, const char *text); /* called for each event */
 
-/* The state of a unit that has just been made. */
+/* Initialise the state of a new unit. */
 static void unitReset(Unit *x, int exchange)
 {
     const unitReal none[unitNU + 1] = { 0 };
@@ -86,7 +86,7 @@ static UnitResult unitSay(UnitInstance *a, UnitResult result, const char *text)
     return result;
 }
 
-/* The message of a status of the scene's functions. */
+/* Set the message for a status of the scene's functions. */
 static UnitResult unitFailed(UnitInstance *a, int status)
 {
     static const char *const words[] = {
@@ -102,15 +102,22 @@ static UnitResult unitFailed(UnitInstance *a, int status)
     return unitSay(a, unitImpossible, words[status < 1 || status > 5 ? 1 : status - 1]);
 }
 
-/* The inputs as the scene's functions take them: NULL for its signals. */
+/* The argument u of the scene's functions: NULL if its signals replace the inputs. */
 static const unitReal *unitInputs(const Unit *x)
 {
     return x->signals ? NULL : x->u;
 }
 
+/* Thresholds; macros, since none may be an unused object in some scene. */
+#define unitLeftZero 100 /* an indicator of that many times its value after a jump has left its root */
+#define unitRounding 1e-10 /* relative change of an indicator by a jump below which it is rounding */
+#define unitTimeSlack 1e-9 /* relative difference of times that counts as rounding by the importer */
+#define unitMaxCalls 1000 /* of 10,000 steps each, in a communication step */
+#define unitMaxSteps 1e9 /* of fixed size in a communication step: a C long may have 32 bits */
+
 /* --- variables ---------------------------------------------------------------------------------- */
 
-/* What one call has computed already. */
+/* Values that are computed at most once in a call, and whether they have been. */
 typedef struct {
     int accelerations, outputs, energies, indicators, signals;
     unitReal qdd[unitNQ], y[unitNY + 1], e[3], z[unitNE + 1], u[unitNU + 1];
@@ -196,7 +203,7 @@ static UnitResult unitSet(UnitInstance *a, unsigned reference, double value)
     Unit *const x = &a->x;
     const long r = (long)reference;
     const unitReal number = (unitReal)value;
-    /* with an importer that integrates the states are its own, at any time */
+    /* in model exchange the importer integrates, and may set the state at any time */
     const int free = x->exchange || x->mode == unitNew || x->mode == unitStarting;
 
     if (!(number - number == 0)) {
@@ -275,8 +282,8 @@ static int unitSign(unitReal z)
 }
 
 /*
- * Whether an event has happened since the last call, so that its indicator has changed its sign; those
- * that were at zero have left it from now on.
+ * Return whether an event indicator has changed its sign since the last call. The signs of indicators
+ * that were zero are stored.
  */
 static int unitCrossed(Unit *x)
 {
@@ -289,16 +296,16 @@ static int unitCrossed(Unit *x)
             x->side[k] = unitSign(z[k]);
         else
             crossed |= x->side[k]*unitSign(z[k]) < 0;
-        if (fabs((double)z[k]) > 100*fabs((double)x->zero[k])) /* far from where it jumped */
+        if (fabs((double)z[k]) > unitLeftZero*fabs((double)x->zero[k]))
             x->zero[k] = 0;
     }
     return crossed;
 }
 
 /*
- * What happens at an event: those whose indicator has come to zero or beyond, in the scene's order.
- * What a jump changes counts for those after it; where it carries an indicator over zero that is none.
- * jumped: whether the state has changed.
+ * Process the events whose indicators have reached or crossed zero, in the scene's order. A jump
+ * changes the state for the events after it; a change of an indicator's sign by a jump is no event.
+ * *jumped = whether the state has changed.
  */
 static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitEventCallback report, void *who)
 {
@@ -314,7 +321,7 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitEventCallback rep
         if (side == 0 || side*unitSign(z[k]) > 0)
             continue;
         x->side[k] = unitSign(z[k]);
-        if (unitDirection(k)*side > 0) /* the other way */
+        if (unitDirection(k)*side > 0) /* opposite direction */
             continue;
         snprintf(text, sizeof text, "event '%s' at t = %.12g s", unitEventName(k), x->t);
         report(who, text);
@@ -339,10 +346,10 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitEventCallback rep
             const double change = fabs((double)(indicators[i] - z[i]));
             const double size = fabs((double)indicators[i]) + fabs((double)z[i]);
 
-            if (change > 1e-10*size) {
+            if (change > unitRounding*size) {
                 x->side[i] = unitSign(indicators[i] + x->zero[i]);
                 x->zero[i] = 0;
-            } else if (i == k) { /* at its zero, which it leaves */
+            } else if (i == k) { /* at its root, which it leaves */
                 x->side[k] = 0;
                 x->zero[k] += indicators[k];
             }
@@ -356,7 +363,7 @@ static UnitResult unitHappen(UnitInstance *a, int *jumped, UnitEventCallback rep
 
 #if unitAdaptive
 
-/* To t_end, or to where an event stops the motion. */
+/* Advance to t_end, or until an event stops the motion. */
 static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback report, void *who)
 {
     Unit *const x = &a->x;
@@ -379,7 +386,7 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback r
         if (status)
             return unitFailed(a, status);
         x->stopped = unitStopped(&x->memory);
-        if (calls > 1000)
+        if (calls > unitMaxCalls)
             return unitSay(
                 a, unitImpossible, "no end after 10,000,000 steps: take a looser tolerance");
     }
@@ -389,19 +396,19 @@ static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback r
 #else
 
 /*
- * To t_end: by whole steps of the scene's size from origin on, as a run of the scene makes them, and by
- * a shorter one where t_end lies between two of these; the next steps then begin there.
+ * Advance to t_end by steps of the scene's size from origin on, as a run of the scene makes them, and by
+ * a shorter one if t_end lies between two of these; the next steps then start at t_end.
  */
 static UnitResult unitAdvance(UnitInstance *a, double t_end, UnitEventCallback report, void *who)
 {
     Unit *const x = &a->x;
-    const double h = unitStep, slack = 1e-9*h + 4*2.3e-16*(fabs(t_end) + fabs(x->origin));
+    const double h = unitStep, slack = unitTimeSlack*h + 4*2.3e-16*(fabs(t_end) + fabs(x->origin));
     const double whole = floor((t_end - x->origin + slack)/h) - (double)x->steps;
     double rest;
     int status = 0;
 
     (void)report, (void)who;
-    if (whole > 1e9)
+    if (whole > unitMaxSteps)
         return unitSay(
             a, unitRefused, "a communication step has more than 1e9 steps of the scene's size");
     if (whole > 0) {
@@ -439,7 +446,7 @@ static UnitResult unitCommunicate(
         return unitSay(a, unitRefused, "a step is for co-simulation, after initialization");
     if (!(size >= 0 && size - size == 0))
         return unitSay(a, unitRefused, "a communication step has a size of zero or more");
-    if (!(fabs(t - x->t) <= 1e-9*(fabs(t) + size)) && !x->stopped)
+    if (!(fabs(t - x->t) <= unitTimeSlack*(fabs(t) + size)) && !x->stopped)
         return unitSay(a, unitRefused, "a communication step begins where the last one ended");
     return unitAdvance(a, t + size, report, who);
 }
@@ -447,7 +454,7 @@ static UnitResult unitCommunicate(
 /* --- derivatives -------------------------------------------------------------------------------- */
 
 /*
- * sensitivities = d(unknowns)/d(knowns) seeds, where everything else is held constant. Knowns are
+ * sensitivities = d(unknowns)/d(knowns) seeds, where everything else is constant. Knowns are
  * coordinates, velocities, inputs and, where the scene has such derivatives, parameters; unknowns are
  * coordinates, velocities, their derivatives and outputs.
  */
@@ -466,7 +473,7 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
             "there are no derivatives: [run] linearize = true of the scene brings them");
     if (x->signals && unitFeedback)
         return unitSay(a, unitRefused,
-            "there are no derivatives while signals answer the state: inputs are held in them");
+            "there are no derivatives while signals answer the state: inputs are constant in them");
     for (size_t k = 0; k < knownCount; k++) {
         const long r = (long)knowns[k];
 
@@ -489,7 +496,7 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
     if (parameters && x->signals && unitSignalParameters)
         return unitSay(a, unitRefused,
             "there are no derivatives with respect to parameters while signals depend on parameters: "
-            "inputs are held constant in them");
+            "inputs are constant in them");
     status = unitLinearize(Aq, Aqd, B, x->q, x->qd, t, u, &x->p);
     if (!status)
         status = unitOutputSlopes(slopes, x->q, x->qd, t, u, &x->p);
@@ -543,7 +550,7 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
 
 /* --- states ------------------------------------------------------------------------------------- */
 
-enum { unitBytes = 8 + sizeof(Unit) }; /* a state as bytes: of which unit, how long, what */
+enum { unitBytes = 8 + sizeof(Unit) }; /* a serialized state: stamp of the unit, size, state */
 
 static void unitPack(const Unit *x, unsigned char *bytes)
 {

@@ -285,7 +285,7 @@ def test_enumerators_are_none_of_our_own_macros() -> None:
     pattern = r'(?:\{\{ PREFIX \}\}|PREFIX\}|PREFIX ~ "|\bEOMC)_([A-Z][A-Z_]*[A-Z]|H\b)'
     found = {name for text in texts for name in re.findall(pattern, text)} - {"CFLAGS", "PROCESSOR"}
     found -= set(PLACEHOLDERS)
-    lanes = {f"{lane}_COUNT" for lane in ("WIDE", "TWO", "FOUR", "AHEAD")}
+    lanes = {f"{lane}_COUNT" for lane in ("WIDE", "TWO", "FOUR", "PREDICTION")}
     assert found | lanes | {"ROLLED", "UNROLL"} == c_names.OWN_MACROS
 
 

@@ -81,7 +81,7 @@ def test_positions_are_those_of_the_run_to_the_stated_resolution():
 
 def test_points_that_stand_are_written_once():
     d = data(page(scene("kepler_orbit")))["runs"][0]["drawing"]
-    assert d["still"] == [[0, 0]] and d["count"] == 1
+    assert d["fixed"] == [[0, 0]] and d["count"] == 1
 
 
 @pytest.mark.parametrize("made", [chain, humanoid])

@@ -36,9 +36,9 @@ RESERVED_NAMES = frozenset(
 # Macros and enumerators of the templates and csrc, without the scene's prefix. A coordinate or
 # input with such a name is renamed in C.
 OWN_MACROS = frozenset(
-    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NE_ROOM NF "
-    "NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS "
-    "TOO_LONG TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
+    "ACCUMULATED FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NE_ROOM NF "
+    "NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU NY OK PREDICTION_COUNT ROLLED SINGULAR STAMP TILE "
+    "TILE_BLOCKS TOO_LONG TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
 )
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
 

@@ -287,7 +287,7 @@ def _drawing_data(drawing: Drawing) -> dict[str, Any]:
         "follow": drawing.max_extent if drawing.travels else 0,
         "count": int(moves.sum()),
         "moving": _quantize(moving) if moving.size else None,
-        "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
+        "fixed": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
                   for p in points[0, ~moves]],
         "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in drawing.marks],
         "whose": [mark.instance for mark in drawing.marks if mark.instance is not None],

@@ -290,7 +290,7 @@ def _csrc(steppers: Steppers) -> Iterator[str]:
         lanes += [("four", str(4 * size), simd)]
     if RK4 in steppers.methods and steppers.predicts_angles:
         prediction_bytes = size * prediction_width(len(steppers.accelerations.angles))
-        lanes += [("ahead", str(prediction_bytes), False)]
+        lanes += [("prediction", str(prediction_bytes), False)]
     texts = [(f"sincos/sincos{end}.h", "", "")] if target.sincos else []
     if rotates:
         texts += [("lanes/scalar.h", "", ""), (f"lanes/rotate{end}.h", "", "")]
