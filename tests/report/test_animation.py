@@ -209,7 +209,7 @@ def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
     assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
-    fifth = find_system(batch).with_parameters({"l": batch._params[4, 2]})
+    fifth = find_system(batch).with_parameters({"l": batch.parameter_values[4, 2]})
     alone = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
     path = alone.points[:, alone.paths[0].point]

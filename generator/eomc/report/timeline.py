@@ -78,7 +78,7 @@ class Timeline:
         and changes nothing if the run has fixed steps or no duration.
         """
         run = self.run
-        if not (hasattr(run, "_evenly") and len(run) > 1 and run.t[-1] > run.t[0]):
+        if not (hasattr(run, "resample") and len(run) > 1 and run.t[-1] > run.t[0]):
             return False
         self.run = run.resample(count)
         self.t = np.asarray(self.run.t, dtype=float)
@@ -106,7 +106,7 @@ class Timeline:
             for o in system.outputs
         ]
         u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
-        has_stairs = getattr(run, "_u", None) is not None
+        has_stairs = getattr(run, "given_inputs", None) is not None
         lines += [
             (i.unit, TimeSeries(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)
         ]
@@ -241,8 +241,8 @@ def choose_instances(count: int, chosen: int | Sequence[int]) -> list[int]:
 
 def select_instances(batch: Any, numbers: Sequence[int]) -> Any:
     """Return a copy of a batch that contains only the instances with the indices `numbers`."""
-    fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "_codes")}
-    for name in ("_params", "_row_inputs"):  # one row if all instances share it
+    fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "status_codes")}
+    for name in ("parameter_values", "row_inputs"):  # one row if all instances share it
         values = getattr(batch, name)
         if values is not None and len(values) > 1:
             fields[name] = values[numbers]
