@@ -174,7 +174,7 @@ def test_a_saved_run_comes_back(driven: ModuleType, run: Any, tmp_path: Path) ->
     for name, column in run.to_dict().items():
         assert np.array_equal(other[name], column), name
     assert (other.evaluations, other.method, other.every) == (run.evaluations, run.method, 3)
-    if callable(run.given_inputs):
+    if callable(run.input_source):
         with pytest.raises(ValueError, match=r"u was a function.*simulate again"):
             other.estimate()
     else:

@@ -106,7 +106,7 @@ class Timeline:
             for o in system.outputs
         ]
         u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
-        has_stairs = getattr(run, "given_inputs", None) is not None
+        has_stairs = getattr(run, "input_source", None) is not None
         lines += [
             (i.unit, TimeSeries(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)
         ]

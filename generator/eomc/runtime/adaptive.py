@@ -33,7 +33,7 @@ from .interfaces import CompiledModel
 from .package import is_built_from_system, option
 from .requests import AdaptiveRequest, SimulationArguments, as_end, as_times, as_tolerance
 from .section import crossings
-from .stability import MIN_STEPS, State
+from .stability import MIN_STEPS, LinearizationState
 from .status import FULL, PART, STATUS, STATUS_MESSAGES, state_text
 from .trajectory import Run
 from .trajectory_data import LEFT_OUT, infinite_at_start, within
@@ -257,7 +257,7 @@ class AdaptiveRun(Run):
     def rerun(self, times: Array | None, end: float) -> AdaptiveRun:
         """Repeat the run with rows at `times`; None: after each step and on both sides of jumps."""
         q, qd = self.initial_state
-        u, inputs = self.given_inputs, self._period_inputs
+        u, inputs = self.input_source, self._period_inputs
         if inputs is not None:
             u = ZeroOrderHold(inputs, self._period, self._periods)
         request = AdaptiveRequest(
@@ -332,25 +332,25 @@ class AdaptiveRun(Run):
         return error_by_tighter_tolerance(self, run, progress)
 
 
-def simulate(model: CompiledModel, given: SimulationArguments) -> AdaptiveRun:
+def simulate(model: CompiledModel, options: SimulationArguments) -> AdaptiveRun:
     """Check the arguments of `Integrator.simulate`, simulate with adaptive steps; return the run.
 
     Raises ValueError if an argument is invalid.
     """
     info = model.info
-    tol, most = given.adaptive_limits(info)
-    q, qd, p = _initial(model, given)
-    t0, rows, first = as_number(given.t0, "t0"), None, 0
-    if given.times is None:
-        end = as_end(info, t0, given.duration)
+    tol, most = options.adaptive_limits(info)
+    q, qd, p = _initial(model, options)
+    t0, rows, first = as_number(options.t0, "t0"), None, 0
+    if options.times is None:
+        end = as_end(info, t0, options.duration)
     else:
-        rows = as_times(given.times, t0, info.dtype, given.duration)
+        rows = as_times(options.times, t0, info.dtype, options.duration)
         first, end = int(rows[0] == t0), float(rows[-1])
         check_time(info.dtype, t0, end - t0)
-    inputs = input_schedule(model, given, given.control_period, end - t0)
+    inputs = input_schedule(model, options, options.control_period, end - t0)
     later_times = None if rows is None else rows[first:]
     request = AdaptiveRequest(
-        q, qd, t0, end, tol, later_times, inputs, p, most, given.stiff, progress=given.progress
+        q, qd, t0, end, tol, later_times, inputs, p, most, options.stiff, progress=options.progress
     )
     trajectory = run(model, request)
     if first:
@@ -359,50 +359,50 @@ def simulate(model: CompiledModel, given: SimulationArguments) -> AdaptiveRun:
     return trajectory
 
 
-def simulate_fixed_steps(model: CompiledModel, given: SimulationArguments) -> AdaptiveRun:
+def simulate_fixed_steps(model: CompiledModel, options: SimulationArguments) -> AdaptiveRun:
     """Check the arguments of `Integrator.simulate`, simulate with fixed steps and events.
 
     Raises ValueError if an argument is invalid.
     """
     info = model.info
-    if given.out is not None:
+    if options.out is not None:
         raise ValueError("out: events add rows, and no one knows how many: leave it out")
-    q, qd, p = _initial(model, given)
-    method, t0 = info.method_name(given.method), as_number(given.t0, "t0")
-    h = info.h if given.h is None else as_step_size(given.h, info.dtype)
-    rows, span = given.event_rows(info, t0, h)
+    q, qd, p = _initial(model, options)
+    method, t0 = info.method_name(options.method), as_number(options.t0, "t0")
+    h = info.h if options.h is None else as_step_size(options.h, info.dtype)
+    rows, span = options.event_rows(info, t0, h)
     end = float(info.dtype.type(t0 + span))
-    hold = given.input_period(h)
-    if callable(given.u) and hold == h:
+    hold = options.input_period(h)
+    if callable(options.u) and hold == h:
         warn_called_each_step(model)
-    schedule = input_schedule(model, given, hold, span)
+    schedule = input_schedule(model, options, hold, span)
     if span >= MIN_STEPS * h and (method, h) not in model.integrator.warned:
         constant = schedule if isinstance(schedule, np.ndarray) else None
-        model.integrator.check_step_size(State(q, qd, t0, constant, p), h, method)
+        model.integrator.check_step_size(LinearizationState(q, qd, t0, constant, p), h, method)
     first = 0 if rows is None else int(rows[0] == t0)
     request = AdaptiveRequest(
         q, qd, t0, end, 0.0, None if rows is None else rows[first:], schedule, p, h,
-        method=method, progress=given.progress,
+        method=method, progress=options.progress,
     )  # fmt: skip
     result = run(model, request)
     if rows is None:
         return result
     both = np.concatenate([np.array([[q], [qd]])[:, :first], result.rows], axis=1)
     stamps, (t, x) = rows[: both.shape[1]], result.last_state
-    if given.times is None and t > stamps[-1]:  # an event stopped the run between two rows
+    if options.times is None and t > stamps[-1]:  # an event stopped the run between two rows
         both, stamps = np.append(both, x.reshape(2, 1, -1), axis=1), np.append(stamps, t)
     return result.with_rows(stamps, both)
 
 
-def _initial(model: CompiledModel, given: SimulationArguments) -> tuple[Array, Array, Array]:
+def _initial(model: CompiledModel, options: SimulationArguments) -> tuple[Array, Array, Array]:
     """Return q, qd and the parameters at the start of a run."""
     q, qd = model.info.initial_state
-    if given.q0 is not None or given.qd0 is not None:
+    if options.q0 is not None or options.qd0 is not None:
         q, qd = model.arguments.one_state(
-            q if given.q0 is None else given.q0, qd if given.qd0 is None else given.qd0
+            q if options.q0 is None else options.q0, qd if options.qd0 is None else options.qd0
         )
     p = model.info.p0
-    return q, qd, p if given.params is None else model.arguments.parameters(given.params).copy()
+    return q, qd, p if options.params is None else model.arguments.parameters(options.params).copy()
 
 
 def simulate_short_run(

@@ -143,9 +143,9 @@ class _Rerun:
     ) -> None:
         self.own, self.run, self.progress = own, run, progress
         self.u: Any = (
-            ZeroOrderHold(own.given_inputs, own._period, own._periods)
+            ZeroOrderHold(own.input_source, own._period, own._periods)
             if own._period
-            else own.given_inputs
+            else own.input_source
         )
         self.x = own.x.astype(float)
         # a row at a jump may be on either side of the jump in another run

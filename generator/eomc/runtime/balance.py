@@ -156,7 +156,7 @@ def _velocity_reversal(model: CompiledModel) -> Callable[[Array, Array], tuple[A
 
 def _rows(run: Trajectory) -> _PowerSamples | None:
     """Return samples whose power is smooth between jumps of the state or the inputs."""
-    model, u = run.model, run.given_inputs
+    model, u = run.model, run.input_source
     if u is None or np.ndim(u) == 1:
         # all rows: a few of them may look smooth although the power is not
         states = _in_steps(run) or _between_jumps(run)
@@ -203,8 +203,8 @@ def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
     elif (values := getattr(run, "law_values", None)) is not None:
         starts = run.t0 + run.h * run.hold * np.arange(len(values))
     else:
-        values = run.given_inputs if np.ndim(run.given_inputs) == 2 else run.applied_inputs
-        if values is None or (np.ndim(run.given_inputs) != 2 and run.every > 1):
+        values = run.input_source if np.ndim(run.input_source) == 2 else run.applied_inputs
+        if values is None or (np.ndim(run.input_source) != 2 and run.every > 1):
             return unknown
         first = np.arange(0, min(run.steps, len(values)), run.hold)
         starts, values = run.t0 + run.h * first, values[first]

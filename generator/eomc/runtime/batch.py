@@ -145,32 +145,32 @@ class Batch(Component):
         if events is not None or unknown:
             other, arguments = with_events(self.simulate_batch, dict(locals()))
             return cast(BatchRun, other.batch.simulate_batch(**arguments))
-        given = SimulationArguments(
+        options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, None,
             as_progress(progress), tol, times, h_most, stiff, threads, max_evaluations,
         )  # fmt: skip
-        if given.uses_adaptive_steps(self.info):
-            return self._finish(*batch_adaptive.simulate(self.model, given))
+        if options.uses_adaptive_steps(self.info):
+            return self._finish(*batch_adaptive.simulate(self.model, options))
         if max_evaluations is not None:
             raise ValueError("max_evaluations: belongs to adaptive steps: give tol=, and no h=")
         if self.info.events and not self.model.integrator.ignores_events:
-            return self._finish(*batch_adaptive.simulate_fixed_steps(self.model, given))
-        return self._finish(*self._fixed_steps(given))
+            return self._finish(*batch_adaptive.simulate_fixed_steps(self.model, options))
+        return self._finish(*self._fixed_steps(options))
 
-    def _fixed_steps(self, given: SimulationArguments) -> tuple[BatchRun, bool]:
+    def _fixed_steps(self, options: SimulationArguments) -> tuple[BatchRun, bool]:
         """Check the arguments of a batch with fixed steps and simulate.
 
         Return the batch, and False if Ctrl-C interrupted it.
         """
-        method = self.info.method_name(given.method)
-        h = self.info.h if given.h is None else as_step_size(given.h, self.info.dtype)
-        t0 = as_number(given.t0, "t0")
-        times, steps = given.output_times(t0, h)
-        steps = step_count(self.info, h, given.duration if times is None else None, steps)
-        every = min(as_count(given.every, "every", 1), MAX_EVERY)
-        u, hold = given.inputs_and_hold(self.info, t0, h, steps, 1)
-        batch_adaptive.no_signals(self.model, u, given.control_period)
-        instances = self.instances(given._replace(u=u), -(-steps // hold), t0)
+        method = self.info.method_name(options.method)
+        h = self.info.h if options.h is None else as_step_size(options.h, self.info.dtype)
+        t0 = as_number(options.t0, "t0")
+        times, steps = options.output_times(t0, h)
+        steps = step_count(self.info, h, options.duration if times is None else None, steps)
+        every = min(as_count(options.every, "every", 1), MAX_EVERY)
+        u, hold = options.inputs_and_hold(self.info, t0, h, steps, 1)
+        batch_adaptive.no_signals(self.model, u, options.control_period)
+        instances = self.instances(options._replace(u=u), -(-steps // hold), t0)
         inputs = instances.inputs
         if inputs is not None and hold > 1 and inputs.shape[1] > 1:
             inputs = np.ascontiguousarray(np.repeat(inputs, hold, axis=1)[:, :steps])
@@ -179,7 +179,7 @@ class Batch(Component):
             state = instances.first_state(t0)
             self.model.integrator.check_step_size(state, h, method, "the first instance: ")
         plan = BatchSteps(method, h, t0, steps, every)
-        request = batch_fixed.BatchRequest(plan, times, given.threads, given.progress)
+        request = batch_fixed.BatchRequest(plan, times, options.threads, options.progress)
         return batch_fixed.simulate(self.model, instances, request)
 
     def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
@@ -285,13 +285,13 @@ class Batch(Component):
         )  # fmt: skip
         return status
 
-    def instances(self, given: SimulationArguments, steps: int | None, t0: float) -> Instances:
+    def instances(self, options: SimulationArguments, steps: int | None, t0: float) -> Instances:
         """Check the initial states, parameters and inputs of a batch.
 
         steps: number of rows of a table of inputs. t0: time, s, at which the initial states are
         assembled on the constraints.
         """
-        q0, qd0, params, u = given.q0, given.qd0, given.params, given.u
+        q0, qd0, params, u = options.q0, options.qd0, options.params, options.u
         start, table = self.info.initial_state, self.arguments.parameter_rows(params)
         if (params is not None and self.info.start_formulas) or is_by_name(q0, qd0):
             q0, qd0 = initial_state_for_parameters(self.model, q0, qd0, table, many_values=True)

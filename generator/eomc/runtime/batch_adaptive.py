@@ -109,7 +109,7 @@ class AdaptiveBatchRun(BatchRun):
         return ByName("events", self.model.info.events, logs)
 
     def _states(self, times: Array) -> Array:
-        inputs = self.row_inputs if self.given_inputs is None else self.given_inputs
+        inputs = self.row_inputs if self.input_source is None else self.input_source
         limit = self._max_evaluations
         if limit:  # without those of states between steps
             each = _EVALUATIONS_PER_STATE + 2 * self.model.info.nq + 1
@@ -222,7 +222,7 @@ class _Plan(NamedTuple):
 
 
 def simulate(
-    model: CompiledBatchModel, given: SimulationArguments
+    model: CompiledBatchModel, options: SimulationArguments
 ) -> tuple[AdaptiveBatchRun, bool]:
     """Check the arguments of `Batch.simulate_batch` and simulate with adaptive steps.
 
@@ -230,24 +230,24 @@ def simulate(
     argument is invalid.
     """
     info = model.info
-    tol, most = given.adaptive_limits(info)
+    tol, most = options.adaptive_limits(info)
     limit = 0
-    if given.max_evaluations is not None:
-        limit = min(as_count(given.max_evaluations, "max_evaluations", 1), MAX_EVALUATIONS)
-    t0, times, duration = as_number(given.t0, "t0"), given.times, given.duration
+    if options.max_evaluations is not None:
+        limit = min(as_count(options.max_evaluations, "max_evaluations", 1), MAX_EVALUATIONS)
+    t0, times, duration = as_number(options.t0, "t0"), options.times, options.duration
     if times is None:
         end = as_end(info, t0, duration)
         times, duration = [t0, end] if end > t0 else [t0], None
     rows = as_times(times, t0, info.dtype, duration)
     period = 0.0
-    if given.control_period is not None:
-        period = as_step_size(given.control_period, info.dtype, "control_period")
+    if options.control_period is not None:
+        period = as_step_size(options.control_period, info.dtype, "control_period")
     check_time(info.dtype, t0, float(rows[-1]) - t0)
-    return _run(model, given, _Plan(t0, tol, rows, most, given.stiff, period, "", limit))
+    return _run(model, options, _Plan(t0, tol, rows, most, options.stiff, period, "", limit))
 
 
 def simulate_fixed_steps(
-    model: CompiledBatchModel, given: SimulationArguments
+    model: CompiledBatchModel, options: SimulationArguments
 ) -> tuple[AdaptiveBatchRun, bool]:
     """Check the arguments of `Batch.simulate_batch`; simulate with fixed steps and events.
 
@@ -255,24 +255,24 @@ def simulate_fixed_steps(
     argument is invalid.
     """
     info = model.info
-    h = info.h if given.h is None else as_step_size(given.h, info.dtype)
-    method, t0 = info.method_name(given.method), as_number(given.t0, "t0")
-    rows, _ = given.event_rows(info, t0, h, listed=True)
+    h = info.h if options.h is None else as_step_size(options.h, info.dtype)
+    method, t0 = info.method_name(options.method), as_number(options.t0, "t0")
+    rows, _ = options.event_rows(info, t0, h, listed=True)
     assert rows is not None
-    period = given.input_period(h) or 0.0
-    return _run(model, given, _Plan(t0, 0.0, rows, h, False, period, method))
+    period = options.input_period(h) or 0.0
+    return _run(model, options, _Plan(t0, 0.0, rows, h, False, period, method))
 
 
 def _run(
-    model: CompiledBatchModel, given: SimulationArguments, plan: _Plan
+    model: CompiledBatchModel, options: SimulationArguments, plan: _Plan
 ) -> tuple[AdaptiveBatchRun, bool]:
     """Simulate from checked arguments."""
-    u, span, method, h = given.u, plan.duration, plan.method, plan.h_most
+    u, span, method, h = options.u, plan.duration, plan.method, plan.h_most
     count = count_periods(span, plan.period) if plan.period else None
-    if count is not None and given.duration is not None:
-        u = cut_table(u, model.info.nu, count_periods(given.duration, plan.period), count, 1)
+    if count is not None and options.duration is not None:
+        u = cut_table(u, model.info.nu, count_periods(options.duration, plan.period), count, 1)
     no_signals(model, u, plan.period or None)
-    instances = model.batch.instances(given._replace(u=u), count, plan.t0)
+    instances = model.batch.instances(options._replace(u=u), count, plan.t0)
     _, table, inputs, _ = instances
     q, qd = (
         model.arguments.array(x, name, model.info.nq)
@@ -284,7 +284,7 @@ def _run(
         state = instances.first_state(plan.t0)
         model.integrator.check_step_size(state, h, method, "the first instance: ")
     work = _Work(model, begin.copy(), plan, instances)
-    whole = work.run(given.threads, given.progress)
+    whole = work.run(options.threads, options.progress)
     counts = work.counts
     cut = len(STATUS) if work.full else STATUS.index("interrupted")
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
@@ -431,7 +431,7 @@ class _Work:
                 count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
                 t_end, *self.limits[1:], u, u_instance, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),
-                *(events.given if events else ()),
+                *(events.c_arguments if events else ()),
                 pointer(self.table[at:end] if p_each else self.table), int(p_each),
                 self.memory + at, address(long, self.kept[at:end]),
                 address(integer, self.status[at:end]),

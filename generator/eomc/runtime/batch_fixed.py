@@ -44,7 +44,7 @@ class TimedBatchRun(BatchRun):
 
     def _states(self, times: Array) -> Array:
         rows = np.empty((2, len(self), len(times), self.model.info.nq), self.model.info.dtype)
-        stepper = stepper_for(self, self.initial_state.copy(), self.given_inputs)
+        stepper = stepper_for(self, self.initial_state.copy(), self.input_source)
         stepper.rows(parts(times, self.t0, self.h), rows)
         return rows
 

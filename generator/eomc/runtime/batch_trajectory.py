@@ -76,7 +76,7 @@ class BatchRun(Columns):
     parameter_values: Array  # (batch or 1, np)
     row_inputs: Array | None  # at the rows, (batch or 1, n or 1, nu)
     method: str
-    given_inputs: Array | None = (
+    input_source: Array | None = (
         None  # (batch or 1, steps or 1, nu), if _row_inputs has only a part of it
     )
 
@@ -254,7 +254,7 @@ class BatchRun(Columns):
     def _states(self, times: Array) -> Array:
         """Return states (2, batch, n, nq) at ascending times, from the row before each."""
         inputs, every = (
-            self.row_inputs if self.given_inputs is None else self.given_inputs,
+            self.row_inputs if self.input_source is None else self.input_source,
             self.every,
         )
         whole, rest = parts(times, self.t0, self.h, self._requested_steps)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .arguments import Array, as_count
 from .c_library import next_chunk
-from .stability import State
+from .stability import LinearizationState
 
 _GROUP_SIZE = 128  # instances of the smallest group (a tile)
 _MAX_TILES_PER_GROUP = 64  # larger groups save calls
@@ -45,11 +45,11 @@ class Instances(NamedTuple):
     inputs: Array | None
     codes: Array | None = None
 
-    def first_state(self, t0: float) -> State:
+    def first_state(self, t0: float) -> LinearizationState:
         """Return the state, inputs and parameters of the first instance at time t0, s."""
         assert self.starts is not None
         u = None if self.inputs is None else self.inputs[0, 0]
-        return State(self.starts[0][0], self.starts[1][0], t0, u, self.parameters[0])
+        return LinearizationState(self.starts[0][0], self.starts[1][0], t0, u, self.parameters[0])
 
 
 class BatchSteps(NamedTuple):

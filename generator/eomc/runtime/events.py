@@ -139,7 +139,7 @@ class GroupEventBuffer:
         Index of each event in `events` of the model.
     rows : (count, capacity, 1 + 2 nq) array
         Time and state [t, q, qd] of each event.
-    given : tuple
+    c_arguments : tuple
         The arguments of the C function: the capacity, and pointers to these three arrays.
     """
 
@@ -149,7 +149,7 @@ class GroupEventBuffer:
         self.which = np.empty((count, each), np.intc)
         self.rows = np.empty((count, each, 1 + 2 * model.info.nq), model.info.dtype)
         new = model.c.ffi.from_buffer
-        self.given = (
+        self.c_arguments = (
             each, new("long[]", self.counts), new("int[]", self.which),
             model.c.pointer(self.rows),
         )  # fmt: skip

@@ -142,13 +142,13 @@ def sample_zero_order_hold(times: Array, t0: float, period: float, values: Array
 
 
 def input_schedule(
-    model: CompiledModel, given: SimulationArguments, control_period: float | None, span: float
+    model: CompiledModel, options: SimulationArguments, control_period: float | None, span: float
 ) -> Array | ZeroOrderHold | None:
     """Check the inputs of an adaptive run and convert them for `InputSchedule`.
 
     Parameters
     ----------
-    given : SimulationArguments
+    options : SimulationArguments
         Arguments of the run. A table of inputs may cover the given duration instead of `span`, if
         the run ends earlier.
     control_period : float or None
@@ -168,7 +168,7 @@ def input_schedule(
     MemoryError
         If the inputs of all periods do not fit in memory.
     """
-    u, duration, period = given.u, given.duration, None
+    u, duration, period = options.u, options.duration, None
     if control_period is not None:
         period = as_step_size(control_period, model.info.dtype, "control_period")
     if u is None:
@@ -176,7 +176,9 @@ def input_schedule(
             return None
         return _check_memory(
             model,
-            ZeroOrderHold(SampledSignal(model, given.params), period, count_periods(span, period)),
+            ZeroOrderHold(
+                SampledSignal(model, options.params), period, count_periods(span, period)
+            ),
         )
     if not model.info.nu:
         raise ValueError("u: this scene has no inputs")

@@ -29,7 +29,7 @@ from .inputs import FeedbackLaw, SampledSignal, warn_called_each_step
 from .interfaces import CompiledModel
 from .package import Component, option, warn, with_events
 from .requests import FixedStepRequest, Inputs, SimulationArguments, as_progress, step_count
-from .stability import MIN_STEPS, State, advice
+from .stability import MIN_STEPS, LinearizationState, advice
 from .starts import initial_state_for_parameters, is_by_name
 from .status import STATUS, STATUS_MESSAGES, Interrupted, MotionError, state_text
 from .trajectory import Run
@@ -337,31 +337,32 @@ class Integrator(Component):
             return short
         estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self.model.constraints.assemble(q0, qd0, t0, params)
-        given = SimulationArguments(
+        options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, out,
             progress, tol, times, h_most, stiff,
         )  # fmt: skip
-        if given.uses_adaptive_steps(self.info):
-            return self._finish(adaptive.simulate(self.model, given), estimate)
+        if options.uses_adaptive_steps(self.info):
+            return self._finish(adaptive.simulate(self.model, options), estimate)
         if self.info.events and not self.ignores_events:
-            return self._finish(adaptive.simulate_fixed_steps(self.model, given), estimate)
+            return self._finish(adaptive.simulate_fixed_steps(self.model, options), estimate)
         if is_simple and u is duration is None and type(steps) is type(every) is int:
-            run = self._short_run(given)
+            run = self._short_run(options)
             if run is not None:
                 return run
-        return self._finish(self._fixed_steps(given), estimate)
+        return self._finish(self._fixed_steps(options), estimate)
 
-    def _short_run(self, given: SimulationArguments) -> Run | None:
+    def _short_run(self, options: SimulationArguments) -> Run | None:
         """Simulate a short run by fixed steps in a single call of C.
 
         Return None, and let the caller take the general path, if the run has many steps, does not
         reach its end, or begins so late that its times need a check.
         """
         q0, qd0, h, steps, every, params = (
-            given.q0, given.qd0, given.h, cast(int, given.steps), given.every, given.params,
+            options.q0, options.qd0, options.h, cast(int, options.steps), options.every,
+            options.params,
         )  # fmt: skip
-        info, t0 = self.info, given.t0
-        method = given.method or info.methods[0]
+        info, t0 = self.info, options.t0
+        method = options.method or info.methods[0]
         if (loop := self.loops.get(method)) is None or not 0 < every <= loop.short >= steps >= 0:
             return None
         h = info.h if h is None else as_step_size(h, info.dtype)
@@ -382,42 +383,44 @@ class Integrator(Component):
         )
         if code != 8 * steps:
             return None
-        done = loop.stages * steps
-        return Run(self.model, t0, rows, h, steps, "ok", p, every, None, method, done)
+        evaluations = loop.stages * steps
+        return Run(self.model, t0, rows, h, steps, "ok", p, every, None, method, evaluations)
 
     def _initial(
-        self, given: SimulationArguments
+        self, options: SimulationArguments
     ) -> tuple[Array, Array, Array, tuple[Any, Any, Any]]:
         """Return q, qd and p at the start of a run, and all three in the form that C reads."""
         (q, qd), p = self.info.initial_state, self.info.p0
         from_q, from_qd, at_p = self.arguments.default_pointers
-        if given.q0 is not None:
-            q, from_q = self.arguments.initial_half(given.q0, "q0")
-        if given.qd0 is not None:
-            qd, from_qd = self.arguments.initial_half(given.qd0, "qd0")
-        if given.params is not None:
-            p = self.arguments.parameters(given.params).copy()
+        if options.q0 is not None:
+            q, from_q = self.arguments.initial_half(options.q0, "q0")
+        if options.qd0 is not None:
+            qd, from_qd = self.arguments.initial_half(options.qd0, "qd0")
+        if options.params is not None:
+            p = self.arguments.parameters(options.params).copy()
             at_p = self.c.pointer(p)
         return q, qd, p, (from_q, from_qd, at_p)
 
-    def _fixed_steps(self, given: SimulationArguments) -> Run:
+    def _fixed_steps(self, options: SimulationArguments) -> Run:
         """Check the arguments of a run by fixed steps and simulate."""
-        method = self.info.method_name(given.method)
-        q, qd, p, c_arguments = self._initial(given)
-        h = self.info.h if given.h is None else as_step_size(given.h, self.info.dtype)
-        t0 = as_number(given.t0, "t0")
-        times, steps = given.output_times(t0, h)
-        steps = step_count(self.info, h, given.duration if times is None else None, steps)
-        every = min(as_count(given.every, "every", 1), MAX_EVERY)
-        u, hold = given.inputs_and_hold(self.info, t0, h, steps)
-        if u is None and given.control_period is not None and self.info.nu:
-            u = SampledSignal(self.model, given.params)
+        method = self.info.method_name(options.method)
+        q, qd, p, c_arguments = self._initial(options)
+        h = self.info.h if options.h is None else as_step_size(options.h, self.info.dtype)
+        t0 = as_number(options.t0, "t0")
+        times, steps = options.output_times(t0, h)
+        steps = step_count(self.info, h, options.duration if times is None else None, steps)
+        every = min(as_count(options.every, "every", 1), MAX_EVERY)
+        u, hold = options.inputs_and_hold(self.info, t0, h, steps)
+        if u is None and options.control_period is not None and self.info.nu:
+            u = SampledSignal(self.model, options.params)
         if steps >= MIN_STEPS and (method, h) not in self.warned:
-            self.check_step_size(State(q, qd, t0, self._first(u, steps, hold), p), h, method)
+            self.check_step_size(
+                LinearizationState(q, qd, t0, self._first(u, steps, hold), p), h, method
+            )
         return self.run(
             FixedStepRequest(
-                q, qd, t0, h, steps, every, u, p, method, hold, times, given.out, given.progress,
-                c_arguments,
+                q, qd, t0, h, steps, every, u, p, method, hold, times, options.out,
+                options.progress, c_arguments,
             )
         )  # fmt: skip
 
@@ -434,7 +437,9 @@ class Integrator(Component):
                 warn(f"{self.info.name}: {fault}")
         return run
 
-    def check_step_size(self, state: State, h: float, method: str, whose: str = "") -> None:
+    def check_step_size(
+        self, state: LinearizationState, h: float, method: str, whose: str = ""
+    ) -> None:
         """Warn, once a method and step size, if h, s, is beyond the stability limit.
 
         state: initial state. whose: beginning of the message.
@@ -475,7 +480,7 @@ class Integrator(Component):
         p, method = self.arguments.parameters(params), self.info.method_name(method)
         q, qd = self.arguments.state(*initial_state_for_parameters(self.model, q0, qd0, p))
         h = self.info.h if h is None else as_step_size(h, self.info.dtype)
-        return advice(self.model, State(q, qd, as_number(t0, "t0"), u, p), h, method)
+        return advice(self.model, LinearizationState(q, qd, as_number(t0, "t0"), u, p), h, method)
 
     def run(self, request: FixedStepRequest) -> Run:
         """Simulate by fixed steps from checked arguments; return the run, whatever its status."""

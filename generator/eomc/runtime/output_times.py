@@ -75,12 +75,12 @@ class TimedRun(Run):
         """The inputs at each row before saturation, (n, nu)."""
         if (
             self.applied_inputs is None
-            and self.given_inputs is not None
-            and self.given_inputs.ndim == 2
-            and len(self.given_inputs)
+            and self.input_source is not None
+            and self.input_source.ndim == 2
+            and len(self.input_source)
         ):
             index = parts(self._times, self.t0, self.h)[0]
-            rows: Array = self.given_inputs[np.minimum(index, len(self.given_inputs) - 1)]
+            rows: Array = self.input_source[np.minimum(index, len(self.input_source) - 1)]
             return rows
         return super().requested_inputs
 
@@ -90,7 +90,7 @@ class TimedRun(Run):
         whole = self.status == "ok" or at is not None
         times = self._times if at is None else at
         steps = count_steps(times, self.t0, self.h) if whole else self.steps
-        u = self.given_inputs if at is None or self.law_values is None else self.law_values
+        u = self.input_source if at is None or self.law_values is None else self.law_values
         if isinstance(u, np.ndarray) and u.ndim == 2:
             u = u[: -(-steps // self.hold)]
         request = FixedStepRequest(

@@ -129,7 +129,7 @@ class Source:
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
         model, run = run.model, getattr(run, "curve_run", run)
         self.run, self.t = run, np.asarray(run.t, float)
-        self.is_held = getattr(run, "given_inputs", None) is not None
+        self.is_held = getattr(run, "input_source", None) is not None
         self.coordinates = tuple(model.info.coordinates)
         self._units = dict(model.info.units)
         self._energy = "J" if any(self._units.get(c) for c in model.info.coordinates) else ""

@@ -14,7 +14,7 @@ from .interfaces import CompiledModel
 MIN_STEPS = 20  # runs of fewer steps are not checked
 
 
-class State(NamedTuple):
+class LinearizationState(NamedTuple):
     """State at which the motion is linearised.
 
     Attributes
@@ -36,7 +36,7 @@ class State(NamedTuple):
     params: Any
 
 
-def advice(model: CompiledModel, state: State, h: float, method: str) -> str | None:
+def advice(model: CompiledModel, state: LinearizationState, h: float, method: str) -> str | None:
     """Return a message if the step size h is too large for a stable run from a state, else None.
 
     h: step size, s. method: name of the method.
@@ -70,7 +70,9 @@ def advice(model: CompiledModel, state: State, h: float, method: str) -> str | N
     )
 
 
-def _fastest_modes(model: CompiledModel, state: State, wide: float) -> tuple[float, float] | None:
+def _fastest_modes(
+    model: CompiledModel, state: LinearizationState, wide: float
+) -> tuple[float, float] | None:
     """Return (largest |Im|, fastest decay) of the eigenvalues at a state, 1/s, or None.
 
     The linearisation is the module's own where available, else a finite difference of the

@@ -279,16 +279,16 @@ class Run(Trajectory):
 
     def _repeated(self) -> None:
         """Raise ValueError if the run cannot be repeated."""
-        if isinstance(self.given_inputs, str):
-            raise ValueError(f"estimate: {self.given_inputs}")
+        if isinstance(self.input_source, str):
+            raise ValueError(f"estimate: {self.input_source}")
         if (
-            callable(self.given_inputs)
+            callable(self.input_source)
             and self.applied_inputs is not None
             and len(self)
             and self.t[0] == self.t0
         ):
             u_at_start = evaluate_law(
-                self.given_inputs, self.model.arguments.inputs, self.t0, self.q[0], self.qd[0]
+                self.input_source, self.model.arguments.inputs, self.t0, self.q[0], self.qd[0]
             )
             if not np.array_equal(u_at_start, self.applied_inputs[0]):
                 raise ValueError(NOISE)

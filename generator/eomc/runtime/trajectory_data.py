@@ -77,7 +77,7 @@ class Trajectory(Columns):
     status: str
     parameter_values: Array
     every: int
-    given_inputs: Any
+    input_source: Any
     method: str
     evaluations: int
     _energy: Array | None = field(default=None, init=False)
@@ -140,14 +140,14 @@ class Trajectory(Columns):
         if self.applied_inputs is not None:
             return self.applied_inputs
         shape = (len(self), self.model.info.nu)
-        if self.given_inputs is None:
+        if self.input_source is None:
             signal: Any = self.model.functions.signal
             return np.asarray(signal(self.q, self.qd, self.t, self.parameter_values))
-        if self.given_inputs.ndim == 1:
-            return np.broadcast_to(self.given_inputs, shape).copy()
-        if not len(self.given_inputs):  # no step, and so no inputs
-            return np.full(shape, np.nan, self.given_inputs.dtype)
-        rows: Array = self.given_inputs[
+        if self.input_source.ndim == 1:
+            return np.broadcast_to(self.input_source, shape).copy()
+        if not len(self.input_source):  # no step, and so no inputs
+            return np.full(shape, np.nan, self.input_source.dtype)
+        rows: Array = self.input_source[
             np.minimum(np.arange(len(self)) * self.every, self.steps - 1)
         ]
         return rows
@@ -263,10 +263,10 @@ class Trajectory(Columns):
 
     def _evaluate_with_inputs(self, function: Callable[..., Any]) -> Array:
         """Evaluate a function of the state and the inputs at each row."""
-        constant = self.given_inputs is None or (
-            self.applied_inputs is None and self.given_inputs.ndim == 1
+        constant = self.input_source is None or (
+            self.applied_inputs is None and self.input_source.ndim == 1
         )
-        return self.evaluate(function, u=self.given_inputs if constant else self.u)
+        return self.evaluate(function, u=self.input_source if constant else self.u)
 
     def evaluate(self, function: Callable[..., Any], **arguments: Any) -> Array:
         """Evaluate a function of the state at each row, (n, ...)."""
@@ -286,7 +286,7 @@ class Trajectory(Columns):
         model, x = self.model, self.x[0]
         if nudge is not None:
             x = (x + nudge).astype(model.info.dtype)
-        u = self.given_inputs
+        u = self.input_source
         if u is not None and not callable(u) and np.ndim(u) == 2:
             u = u[: self.steps]  # each row held over `parts` steps
         nq = model.info.nq
@@ -301,8 +301,8 @@ class Trajectory(Columns):
         """Return the arrays of a saved run in addition to its columns; None is not saved."""
         u = (
             None
-            if callable(self.given_inputs) or isinstance(self.given_inputs, str)
-            else self.given_inputs
+            if callable(self.input_source) or isinstance(self.input_source, str)
+            else self.input_source
         )
         return {
             "q": self.q, "qd": self.qd, "t0": self.t0, "h": self.h, "steps": self.steps,
@@ -346,8 +346,8 @@ class Trajectory(Columns):
     def __reduce__(self) -> tuple[Any, ...]:
         state = self._state()
         del state["model"]  # the build that reads the pickle has its own
-        if callable(self.given_inputs):
-            state["given_inputs"] = LEFT_OUT
+        if callable(self.input_source):
+            state["input_source"] = LEFT_OUT
         kind = type(self)
         return reduced(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_state", state)
 
@@ -460,7 +460,7 @@ def _state_after(run: Trajectory, n: int, rest: float) -> Any:
 
 def _time_and_inputs(run: Trajectory, n: int) -> tuple[float, Any]:
     """Return the time of step n and its inputs."""
-    t, u = run.t0 + n * run.h, run.given_inputs
+    t, u = run.t0 + n * run.h, run.input_source
     if u is None or (not callable(u) and not isinstance(u, str) and u.ndim == 1):
         return t, u
     if not callable(u) and not isinstance(u, str):
@@ -478,7 +478,7 @@ def infinite_at_start(run: Trajectory) -> str:
     """
     if run.status != "not finite" or run.steps or not len(run):
         return ""
-    model, q, qd, inputs = run.model, run.q[0], run.qd[0], run.given_inputs
+    model, q, qd, inputs = run.model, run.q[0], run.qd[0], run.input_source
     at: dict[str, Any] = {"t": run.t0, "params": run.parameter_values}
     try:
         model.functions.acceleration(
