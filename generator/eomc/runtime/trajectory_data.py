@@ -237,7 +237,7 @@ class Trajectory(Columns):
         q, qd, t, p = self.q[-1], self.qd[-1], float(self.t[-1]), self.parameter_values
         sizes = np.abs(model.constraints.constraint_jacobian(q, t=t, params=p)).astype(float)
         for what, x in (("constraints", q), ("constraint_rates", qd)):
-            off = np.abs(getattr(model, what)(q, qd, t, p)).astype(float)
+            off = np.abs(getattr(model.constraints, what)(q, qd, t, p)).astype(float)
             share = off / np.maximum(sizes @ (np.abs(x) + np.max(np.abs(x))), _MIN_SCALE)
             worst = int(np.argmax(share))
             if share[worst] > _MAX_ROUNDINGS * float(np.finfo(model.info.dtype).eps):
