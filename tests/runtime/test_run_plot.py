@@ -7,6 +7,7 @@ import io
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -316,8 +317,8 @@ def test_a_notebook_shows_curves_alone_of_what_says_nothing_of_its_shape(modules
 def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> None:
     run = modules("mass_spring").simulate(steps=5)
     model = run.model
-    monkeypatch.setattr(model, "title", "<script>$x$\x1b")
-    monkeypatch.setitem(model.info.units, "x", '"><b>')
+    info = replace(model.info, title="<script>$x$\x1b", units={"x": '"><b>'})
+    monkeypatch.setattr(model, "info", info)
     page = html(run)
     assert "&lt;script&gt;$x$\\x1b" in page and "<script>" not in page and "<b>&" not in page[20:]
     assert "&quot;&gt;&lt;b&gt;" in page

@@ -139,7 +139,7 @@ def refusal(pickled: tuple[Any, ...], path: str) -> str:
     own, other = Identity(*identity()), Identity(*pickled)
     if own[:2] == other[:2]:
         return ""
-    name = own_model().name
+    name = own_model().info.name
     if path in (MODULE, MODEL, COMPONENT):
         return (
             f"{name}: this was pickled by the build {other.extension}, which is gone; the build "
