@@ -1,4 +1,4 @@
-"""Whose multiply-add the sines use, and how exact they are where none is in double."""
+"""Which multiply-add the sines use, and their error where double precision has no hardware FMA."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from eomc.model import from_scene as system
 from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 
-# both headers in one file, and which way each goes
+# Includes both headers and prints which variant each one selects.
 PROBE = f"""
 #include "{ROOT / "csrc" / "sincos" / "sincos.h"}"
 #undef EOMC_INLINE
 #include "{ROOT / "csrc" / "sincos" / "sincosf.h"}"
 int in_double = EOMC_FAST_FMA, in_float = EOMC_FAST_FMAF;
 """
-# what a compiler defines for a processor, and where there is a multiply-add: in double, in float
+# Macros that a compiler defines for a processor, and whether FMA exists: in double, in float.
 MACROS = {
     "Cortex-M4F, M33": ("-D__ARM_FEATURE_FMA=1 -D__ARM_FP=4 -D__FP_FAST_FMAF=1", (0, 1)),
     "Cortex-M4F, clang": ("-D__ARM_FEATURE_FMA=1 -D__ARM_FP=6", (0, 1)),
@@ -34,7 +34,7 @@ MACROS = {
     "none": ("", (0, 0)),
 }
 ONE_WAY = "__FMA__ __FP_FAST_FMA __FP_FAST_FMAF __ARM_FEATURE_FMA __ARM_FP".split()
-# flags of arm-none-eabi-gcc, and where the processor has a multiply-add
+# Flags of arm-none-eabi-gcc, and whether the processor has FMA: in double, in float.
 BOARDS = {
     "M3": ("-mcpu=cortex-m3", (0, 0)),
     "M4F": ("-mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -mfloat-abi=hard", (0, 1)),
@@ -42,7 +42,7 @@ BOARDS = {
     "M7, single": ("-mcpu=cortex-m7 -mfpu=fpv5-sp-d16 -mfloat-abi=hard", (0, 1)),
     "M7": ("-mcpu=cortex-m7 -mfpu=fpv5-d16 -mfloat-abi=hard", (1, 1)),
 }
-# A bare-metal program as a process of Linux, for user-mode qemu: what newlib asks of a system.
+# Runs a bare-metal program as a Linux process in user-mode qemu: the system calls of newlib.
 PROCESS = """
 static long call(long number, long a, long b, long c)
 {
@@ -60,7 +60,7 @@ void *_sbrk(int n) { char *old = end; end += n; return old; }
 void _fini(void) {}
 void _start(void) { exit(main()); }
 """
-# the largest error of both, in ulp of libm's, whose own is below one
+# Prints the largest error of both functions, in ulp relative to libm, whose error is below one.
 ERRORS = """
 #include "sincos.h"
 #include <stdio.h>
@@ -89,7 +89,7 @@ int main(void)
     return 0;
 }
 """
-# a multiply-add of two roundings, as newlib's is where the hardware has none
+# A multiply-add with two roundings, like newlib's where the hardware has none.
 TWO_ROUNDINGS = """
 double fma(double, double, double);
 float fmaf(float, float, float);
@@ -110,33 +110,33 @@ potential = "-g*cos(theta)"
 """
 
 
-def ways(*command: str, cwd: Path) -> tuple[int, int]:
-    """Whether the sines use a multiply-add in double and in float."""
+def uses_fma(*command: str, cwd: Path) -> tuple[int, int]:
+    """Return whether the sines use a multiply-add in double and in float."""
     (cwd / "probe.c").write_text(PROBE)
-    done = subprocess.run(
+    process = subprocess.run(
         [*command, "-E", "-P", "probe.c"], cwd=cwd, capture_output=True, text=True, check=True
     )
-    found = re.search(r"in_double = (\d), in_float = (\d)", done.stdout)
-    assert found
-    return int(found[1]), int(found[2])
+    match = re.search(r"in_double = (\d), in_float = (\d)", process.stdout)
+    assert match
+    return int(match[1]), int(match[2])
 
 
 @pytest.mark.parametrize("processor", MACROS)
-def test_multiply_add_is_used_where_it_is_one_instruction(processor: str, tmp_path: Path) -> None:
-    macros, wanted = MACROS[processor]
+def test_fma_is_used_where_it_is_one_instruction(processor: str, tmp_path: Path) -> None:
+    macros, expected = MACROS[processor]
     undefined = [f"-U{name}" for name in ONE_WAY if f"-D{name}=" not in macros]
-    assert ways("cc", *undefined, *macros.split(), cwd=tmp_path) == wanted
+    assert uses_fma("cc", *undefined, *macros.split(), cwd=tmp_path) == expected
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_cross_compiler_agrees(board: str, tmp_path: Path) -> None:
-    flags, wanted = BOARDS[board]
-    assert ways(needs("arm-none-eabi-gcc"), *flags.split(), cwd=tmp_path) == wanted
+def test_fma_choice_of_cross_compiler(board: str, tmp_path: Path) -> None:
+    flags, expected = BOARDS[board]
+    assert uses_fma(needs("arm-none-eabi-gcc"), *flags.split(), cwd=tmp_path) == expected
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
-    """To 2^20 rad, beside newlib's own."""
+def test_error_of_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
+    """Check angles up to 2^20 rad against newlib's sines."""
     (tmp_path / "process.c").write_text(PROCESS)
     (tmp_path / "errors.c").write_text(ERRORS)
     command = [
@@ -146,35 +146,33 @@ def test_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
     ]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     run = [needs("qemu-arm"), "-cpu", "max", "./errors"]
-    done = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert float(done.stdout) <= 2.6
+    process = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert float(process.stdout) <= 2.6
 
 
 def outcome(text: str, folder: Path, *flags: str) -> tuple[int, str]:
-    """Status and words of the self-test of a scene."""
+    """Return the exit status and the output of the self-test of a scene."""
     s = system.from_scene(scene.parse(text))
     write_files(fast_kit(eomc.sources(s)), folder)
     (folder / "fma.c").write_text(TWO_ROUNDINGS)
     command = ["cc", "-std=c99", "-O0", "-I.", *flags, "selftest.c", f"{s.name}.c", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
-    done = subprocess.run(["./a.out"], cwd=folder, capture_output=True, text=True)
-    return done.returncode, done.stdout
+    process = subprocess.run(["./a.out"], cwd=folder, capture_output=True, text=True)
+    return process.returncode, process.stdout
 
 
 def texts() -> dict[str, str]:
-    """Scenes with angles: a pendulum, and those of the folder whose names say so."""
-    found = {"pendulum": PENDULUM}
+    """Return scene texts with angles: a pendulum, and some files of scenes/."""
+    scenes = {"pendulum": PENDULUM}
     for name in ("cartpole", "double_pendulum", "chain", "furuta_pendulum", "bead_on_hoop"):
-        found[name] = (ROOT / "scenes" / f"{name}.toml").read_text(encoding="utf-8")
-    return found
+        scenes[name] = (ROOT / "scenes" / f"{name}.toml").read_text(encoding="utf-8")
+    return scenes
 
 
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 @pytest.mark.parametrize("name", tiers(texts(), "pendulum"))
-def test_self_test_finds_a_multiply_add_of_two_roundings(
-    name: str, real: str, tmp_path: Path
-) -> None:
-    """The sines are then wrong at large angles alone, by 6e-11 (6e-5 in float) at most."""
+def test_self_test_detects_fma_with_two_roundings(name: str, real: str, tmp_path: Path) -> None:
+    """The error appears at large angles only and is at most 6e-11 (6e-5 in float)."""
     text = texts()[name].replace("[run]\n", f'[run]\nreal = "{real}"\n')
     assert f'real = "{real}"' in text
     status, words = outcome(text, tmp_path)
@@ -186,6 +184,6 @@ def test_self_test_finds_a_multiply_add_of_two_roundings(
 
 
 def system_name(text: str) -> str:
-    found = re.search(r'^name\s*=\s*"(\w+)"', text, re.MULTILINE)
-    assert found
-    return found[1]
+    match = re.search(r'^name\s*=\s*"(\w+)"', text, re.MULTILINE)
+    assert match
+    return match[1]

@@ -1,4 +1,4 @@
-"""csrc/lanes/: in one number and in vectors of 16, 32 and 64 bytes, of double and of float."""
+"""csrc/lanes/: scalars and vectors of 16, 32 and 64 bytes, of double and of float."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="
 
 
 @pytest.fixture(scope="module", params=tiers(["double", "float"], "double"))
-def of(request: pytest.FixtureRequest) -> Any:
-    """The precision, as the benchmark describes it."""
+def precision(request: pytest.FixtureRequest) -> Any:
+    """Precision, as the benchmark describes it."""
     return {"double": bench.DOUBLE, "float": bench.SINGLE}[request.param]
 
 
@@ -32,29 +32,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def judge(of: Any, folder: Path) -> ctypes.CDLL:
-    """What knows better."""
-    return bench.reference(folder, of)
+def reference(precision: Any, folder: Path) -> ctypes.CDLL:
+    """Library with sines in higher precision."""
+    return bench.reference(folder, precision)
 
 
 @pytest.fixture(scope="module", params=tiers(BUILDS, "native"))
-def library(request: pytest.FixtureRequest, of: Any, folder: Path) -> ctypes.CDLL:
-    found = built(folder, of, request.param)
-    if found is None:
+def library(request: pytest.FixtureRequest, precision: Any, folder: Path) -> ctypes.CDLL:
+    candidate = built(folder, precision, request.param)
+    if candidate is None:
         pytest.skip(f"{bench.compiler()} does not build: {request.param}")
-    return found
+    return candidate
 
 
 @pytest.fixture
-def made(of: Any, folder: Path) -> list[ctypes.CDLL]:
+def libraries(precision: Any, folder: Path) -> list[ctypes.CDLL]:
     """All libraries of this precision."""
-    return [library for name in BUILDS if (library := built(folder, of, name)) is not None]
+    return [library for name in BUILDS if (library := built(folder, precision, name)) is not None]
 
 
-def told(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> list[bool]:
-    """What a check finds of each number, in whichever place of a register it stands."""
+def evaluate_check(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> list[bool]:
+    """Return the result of a check for each number; it must not depend on the position in a
+    register.
+    """
     count = len(arrays[0])
-    found = []
+    results = []
     for shift in range(MOST):
         room = -(-(count + shift) // MOST) * MOST
         shifted = [
@@ -63,43 +65,53 @@ def told(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> list[bool]
         ]
         out = np.full(room, 7, np.intc)
         call(library, function, *(a.astype(arrays[0].dtype) for a in shifted), out)
-        found.append(out[shift : shift + count].tolist())
-    assert all(row == found[0] for row in found)
-    assert set(found[0]) <= {0, 1}
-    return [bool(x) for x in found[0]]
+        results.append(out[shift : shift + count].tolist())
+    assert all(row == results[0] for row in results)
+    assert set(results[0]) <= {0, 1}
+    return [bool(x) for x in results[0]]
 
 
-def points(of: Any) -> np.ndarray:
-    """Angles of all sizes up to the limit, next to multiples of pi/2 and between quadrants."""
+def points(precision: Any) -> np.ndarray:
+    """Return angles of all sizes up to the limit, near multiples of pi/2 and between quadrants."""
     random = np.random.default_rng(5)
-    some = random.integers(1, of.last_multiple, 2000).tolist()
-    hardest = [*nearest_multiples(40, of), *range(1, 300), of.last_multiple - 1, of.last_multiple]
-    odd = (np.arange(1, 2000, 2) * (np.pi / 4)).astype(of.dtype)
+    some = random.integers(1, precision.last_multiple, 2000).tolist()
+    hardest = [
+        *nearest_multiples(40, precision),
+        *range(1, 300),
+        precision.last_multiple - 1,
+        precision.last_multiple,
+    ]
+    odd = (np.arange(1, 2000, 2) * (np.pi / 4)).astype(precision.dtype)
     x = [
-        *bench.random_points(6_000, random, of).values(),
-        bench.neighbours_of_multiples([*hardest, *some], of),
-        *(odd, np.nextafter(odd, of.dtype(0)), np.nextafter(odd, of.dtype(np.inf))),
-        np.array([of.limit, np.nextafter(of.dtype(of.limit), of.dtype(0))], of.dtype),
+        *bench.random_points(6_000, random, precision).values(),
+        bench.neighbours_of_multiples([*hardest, *some], precision),
+        *(odd, np.nextafter(odd, precision.dtype(0)), np.nextafter(odd, precision.dtype(np.inf))),
+        np.array(
+            [precision.limit, np.nextafter(precision.dtype(precision.limit), precision.dtype(0))],
+            precision.dtype,
+        ),
     ]
     x = np.concatenate([*x, *(-part for part in x)])
-    assert x.dtype == of.dtype and np.abs(x).max() == of.limit
-    return np.concatenate([x, np.zeros(-len(x) % MOST, of.dtype)])
+    assert x.dtype == precision.dtype and np.abs(x).max() == precision.limit
+    return np.concatenate([x, np.zeros(-len(x) % MOST, precision.dtype)])
 
 
-def test_sines_of_a_lane_are_sines(library: ctypes.CDLL, of: Any, judge: ctypes.CDLL) -> None:
-    """As good as those of one number, in every width."""
-    x = points(of)
-    found = [bench.sincos(library, f"small{lane}", x) for lane in VECTORS]
-    s, c = (np.concatenate(part) for part in zip(*found, strict=True))
-    worst = np.zeros((len(found), 2))
+def test_sines_of_vectors_are_accurate(
+    library: ctypes.CDLL, precision: Any, reference: ctypes.CDLL
+) -> None:
+    """The error is that of scalar code, at every width."""
+    x = points(precision)
+    results = [bench.sincos(library, f"small{lane}", x) for lane in VECTORS]
+    s, c = (np.concatenate(part) for part in zip(*results, strict=True))
+    worst = np.zeros((len(results), 2))
     arrays = (bench.pointer(a) for a in (s, c, worst))
-    judge.errors(ctypes.c_long(x.size), bench.pointer(x), ctypes.c_long(len(found)), *arrays)
+    reference.errors(ctypes.c_long(x.size), bench.pointer(x), ctypes.c_long(len(results)), *arrays)
     assert (worst > 1.3).all() and (worst <= LARGEST_ERROR).all(), worst
 
 
-def test_sines_of_a_lane_are_those_of_one_number(library: ctypes.CDLL, of: Any) -> None:
-    """Bit for bit; with FMA, where one number is reduced by other parts of pi/2, to one unit."""
-    x = points(of)
+def test_sines_of_vectors_equal_scalar_sines(library: ctypes.CDLL, precision: Any) -> None:
+    """Equal bits; with FMA, where scalar code uses other parts of pi/2, within one unit."""
+    x = points(precision)
     one = bench.sincos(library, "small", x)
     lanes = [bench.sincos(library, f"small{lane}", x) for lane in VECTORS]
     for a, b in zip(one, lanes[0], strict=True):
@@ -111,197 +123,211 @@ def test_sines_of_a_lane_are_those_of_one_number(library: ctypes.CDLL, of: Any) 
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_tiny_angles_and_signed_zero(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    info = np.finfo(of.dtype)
+def test_tiny_angles_and_signed_zero(library: ctypes.CDLL, precision: Any, lane: str) -> None:
+    info = np.finfo(precision.dtype)
     tiny = [0.0, info.smallest_subnormal, 1000 * info.smallest_subnormal, info.tiny, 1e-20]
-    tiny = np.array([*tiny, 2.0 ** (of.smallest // 2), bench.TINY, 0.0], of.dtype)
+    tiny = np.array([*tiny, 2.0 ** (precision.smallest // 2), bench.TINY, 0.0], precision.dtype)
     x = np.concatenate([tiny, -tiny])
     s, c = bench.sincos(library, f"small{lane}", x)
-    assert s.tobytes() == x.tobytes()  # the sign of -0.0 as well
+    assert s.tobytes() == x.tobytes()  # includes the sign of -0.0
     assert (c == 1.0).all()
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_angles_beyond_the_limit_fail_alone(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    """And not a number gives none; what stands beside them is as ever, what failed has failed."""
-    beyond = np.nextafter(of.dtype(of.limit), of.dtype(np.inf))
-    largest = np.finfo(of.dtype).max
-    far = np.array([beyond, -beyond, 3e9, -largest, np.inf, -np.inf, np.nan, -np.nan], of.dtype)
-    good = np.linspace(-of.limit, of.limit, len(far) * 63).astype(of.dtype)
+def test_angles_beyond_the_limit_do_not_affect_other_lanes(
+    library: ctypes.CDLL, precision: Any, lane: str
+) -> None:
+    """NaN gives NaN; other elements are unchanged, and an earlier failure stays recorded."""
+    beyond = np.nextafter(precision.dtype(precision.limit), precision.dtype(np.inf))
+    largest = np.finfo(precision.dtype).max
+    far = np.array(
+        [beyond, -beyond, 3e9, -largest, np.inf, -np.inf, np.nan, -np.nan], precision.dtype
+    )
+    good = np.linspace(-precision.limit, precision.limit, len(far) * 63).astype(precision.dtype)
     x = np.concatenate([far[:, None], good.reshape(-1, 63)], axis=1)
     x = np.stack([np.roll(row, 5 * k) for k, row in enumerate(x)]).ravel()
     s, c, failed = np.empty_like(x), np.empty_like(x), np.zeros(x.shape, np.intc)
     call(library, f"sincos{lane}", x, s, c, failed)
-    inside = np.abs(x) <= of.limit
+    inside = np.abs(x) <= precision.limit
     assert inside.sum() == len(good) and set(good) == set(x[inside])
     assert not failed[inside].any()
     assert (failed.astype(bool) | np.isnan(s) & np.isnan(c))[~inside].all()
-    assert failed[np.abs(x) > of.limit].all()  # infinite ones too
-    expected = bench.sincos(library, f"small{lane}", np.where(inside, x, of.dtype(0)))
-    for found, sure in zip((s, c), expected, strict=True):
-        assert found[inside].tobytes() == sure[inside].tobytes()
+    assert failed[np.abs(x) > precision.limit].all()  # includes infinite angles
+    expected = bench.sincos(library, f"small{lane}", np.where(inside, x, precision.dtype(0)))
+    for computed, reference_part in zip((s, c), expected, strict=True):
+        assert computed[inside].tobytes() == reference_part[inside].tobytes()
     before = (np.arange(x.size) % 3 == 0).astype(np.intc)
     call(library, f"sincos{lane}", x, s, c, both := before.copy())
     assert both.tolist() == (before | failed).tolist()
 
 
-def errors(found: tuple[np.ndarray, ...], *wanted: np.ndarray) -> float:
-    return max(float(np.max(np.abs(a - b))) for a, b in zip(found, wanted, strict=True))
+def errors(computed: tuple[np.ndarray, ...], *expected: np.ndarray) -> float:
+    return max(float(np.max(np.abs(a - b))) for a, b in zip(computed, expected, strict=True))
 
 
-def turns(of: Any, widest: int) -> tuple[np.ndarray, ...]:
-    """d up to 2^-widest, s, c of the precision; sin d, cos d, s, c as precise as there is."""
-    exact = np.float64 if of.suffix else np.longdouble
+def turns(precision: Any, widest: int) -> tuple[np.ndarray, ...]:
+    """Return d up to 2^-widest, s, c in this precision; sin d, cos d, s, c in the highest
+    precision.
+    """
+    exact = np.float64 if precision.suffix else np.longdouble
     random = np.random.default_rng(6)
     x = random.uniform(-4, 4, 48_000).astype(exact)
     sizes = 2.0 ** -random.uniform(widest, 40, len(x))
     sizes[::4] = random.uniform(0.5, 1, len(x) // 4) * 2.0**-widest
-    d = (random.choice([-1, 1], len(x)) * sizes).astype(of.dtype)
+    d = (random.choice([-1, 1], len(x)) * sizes).astype(precision.dtype)
     d[:3] = 2.0**-widest, -(2.0**-widest), 0.0
-    s, c = np.sin(x).astype(of.dtype), np.cos(x).astype(of.dtype)
+    s, c = np.sin(x).astype(precision.dtype), np.cos(x).astype(precision.dtype)
     wide = d.astype(exact)
     return d, s, c, np.sin(wide), np.cos(wide), s.astype(exact), c.astype(exact)
 
 
 @pytest.mark.parametrize("lane", LANES)
-def test_rotating_costs_one_unit_of_rounding(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    """Against sums of angles in long double; for float, against double.
+def test_rotation_error_is_about_one_unit(library: ctypes.CDLL, precision: Any, lane: str) -> None:
+    """Compare with sums of angles in long double; for float, in double.
 
-    Two roundings of numbers up to 1 each, and the series' 2^-56 (float: 2^-27).
+    The bound covers two roundings of numbers up to 1 each, and 2^-56 of the series (float: 2^-27).
     """
-    unit = np.finfo(of.dtype).eps / 2
-    d, s, c, sin_d, cos_d, s0, c0 = turns(of, 4 if of.suffix else 6)
+    unit = np.finfo(precision.dtype).eps / 2
+    d, s, c, sin_d, cos_d, s0, c0 = turns(precision, 4 if precision.suffix else 6)
     call(library, f"rotate{lane}", d, s, c)
     error = errors((s, c), s0 * cos_d + c0 * sin_d, c0 * cos_d - s0 * sin_d)
     assert 0.4 * unit < error <= 1.3 * unit
-    assert (s[2], c[2]) == (s0[2], c0[2])  # by no angle
+    assert (s[2], c[2]) == (s0[2], c0[2])  # rotation by zero
 
-    d, s, c, sin_d, cos_d, s0, c0 = turns(of, 2 if of.suffix else 3)
-    back, on = [np.empty((2, len(d)), of.dtype) for _ in range(2)]
+    d, s, c, sin_d, cos_d, s0, c0 = turns(precision, 2 if precision.suffix else 3)
+    back, on = [np.empty((2, len(d)), precision.dtype) for _ in range(2)]
     call(library, f"rotate_both{lane}", d, s, c, *back, *on)
-    for found, sine in ((back, -sin_d), (on, sin_d)):
-        error = errors(tuple(found), s0 * cos_d + c0 * sine, c0 * cos_d - s0 * sine)
+    for rotated, sine in ((back, -sin_d), (on, sin_d)):
+        error = errors(tuple(rotated), s0 * cos_d + c0 * sine, c0 * cos_d - s0 * sine)
         assert 0.4 * unit < error <= 1.3 * unit
-        assert tuple(found[:, 2]) == (s0[2], c0[2])
+        assert tuple(rotated[:, 2]) == (s0[2], c0[2])
 
 
 @pytest.mark.parametrize("both", [False, True], ids=["in place", "both"])
-def test_series_of_small_angles(of: Any, both: bool) -> None:
-    """As far off as the comments say, without a rounding but that of the coefficients."""
-    text = (ROOT / "csrc" / "lanes" / f"rotate{of.suffix}.h").read_text(encoding="utf-8")
+def test_error_of_small_angle_series_is_as_documented(precision: Any, both: bool) -> None:
+    """Evaluate exactly, so that only the rounding of the coefficients counts."""
+    text = (ROOT / "csrc" / "lanes" / f"rotate{precision.suffix}.h").read_text(encoding="utf-8")
     name = "eomc_rotate_both_LANE" if both else "eomc_rotate_LANE"
     body = text[text.index(name) :].partition("}")[0]
     sums = re.findall(r"\b(z|a23|b12|a|b|sin_d|less) = ([^,;]+)[,;]", body)
-    widest = 2.0 ** -((2 if of.suffix else 3) if both else (4 if of.suffix else 6))
+    widest = 2.0 ** -((2 if precision.suffix else 3) if both else (4 if precision.suffix else 6))
     most = 0.0
     with mpmath.workdps(40):
         for k in range(1, 401):
             d = mpmath.mpf(widest * k / 400)
-            known = {"d": d, "number": lambda x: mpmath.mpf(float(of.dtype(x)))}
+            known = {"d": d, "number": lambda x: mpmath.mpf(float(precision.dtype(x)))}
             for value, formula in sums:
                 exact = re.sub(r"(?<![\w.])(\d\.\d+(?:e-\d+)?)f?", r"number('\1')", formula)
                 known[value] = eval(exact, {}, known)
             most = max(most, abs(known["sin_d"] - mpmath.sin(d)))
             most = max(most, abs(known["less"] - (mpmath.cos(d) - 1)))
-        assert most <= mpmath.mpf(2) ** (-27 if of.suffix else -56.7)
+        assert most <= mpmath.mpf(2) ** (-27 if precision.suffix else -56.7)
 
 
-def test_rotating_is_the_same_in_every_lane(library: ctypes.CDLL, of: Any) -> None:
-    """Bit for bit."""
-    found = set()
+def test_rotation_gives_equal_bits_in_every_lane(library: ctypes.CDLL, precision: Any) -> None:
+    """Compare the bytes of all lanes."""
+    results = set()
     for lane in LANES:
-        d, s, c, *_ = turns(of, 4 if of.suffix else 6)
-        both = np.empty((4, len(d)), of.dtype)
+        d, s, c, *_ = turns(precision, 4 if precision.suffix else 6)
+        both = np.empty((4, len(d)), precision.dtype)
         call(library, f"rotate_both{lane}", d, s, c, *both)
         call(library, f"rotate{lane}", d, s, c)
-        found.add(both.tobytes() + s.tobytes() + c.tobytes())
-    assert len(found) == 1
+        results.add(both.tobytes() + s.tobytes() + c.tobytes())
+    assert len(results) == 1
 
 
 @pytest.mark.slow
-def test_builds_without_fma_agree_bit_for_bit(made: list[ctypes.CDLL], of: Any) -> None:
-    x, found = points(of), []
-    for library in made:
-        d, s, c, *_ = turns(of, 4 if of.suffix else 6)
+def test_builds_without_fma_agree_bit_for_bit(libraries: list[ctypes.CDLL], precision: Any) -> None:
+    x, results = points(precision), []
+    for library in libraries:
+        d, s, c, *_ = turns(precision, 4 if precision.suffix else 6)
         call(library, "rotate_32", d, s, c)
         exponentials = [of_lane(library, f"{name}_32", d) for name in EXPONENTIALS]
         arrays = (*bench.sincos(library, "small_32", x), s, c, *exponentials)
         if not library.fast_fma():
-            found.append(b"".join(a.tobytes() for a in arrays))
-    if len(found) < 2:
+            results.append(b"".join(a.tobytes() for a in arrays))
+    if len(results) < 2:
         pytest.skip("the compiler does not take -mno-fma")
-    assert len(set(found)) == 1
+    assert len(set(results)) == 1
 
 
 @pytest.mark.parametrize("lane", LANES)
 @pytest.mark.parametrize("most", [0.125, 0.0, 2.0**20])
-def test_what_exceeds(library: ctypes.CDLL, of: Any, lane: str, most: float) -> None:
-    limit, info = of.dtype(most), np.finfo(of.dtype)
-    beyond = np.nextafter(limit, of.dtype(np.inf))
-    below = np.nextafter(limit, of.dtype(0))
+def test_check_for_values_above_a_limit(
+    library: ctypes.CDLL, precision: Any, lane: str, most: float
+) -> None:
+    limit, info = precision.dtype(most), np.finfo(precision.dtype)
+    beyond = np.nextafter(limit, precision.dtype(np.inf))
+    below = np.nextafter(limit, precision.dtype(0))
     fits = [0.0, -0.0, below, -below, limit, -limit]
     far = [beyond, -beyond, info.max, -info.max, np.inf, -np.inf]
-    x = np.array([*fits, *far], of.dtype)
+    x = np.array([*fits, *far], precision.dtype)
     expected = [False] * len(fits) + [True] * len(far)
-    assert told(library, f"exceeds{lane}", x, np.array([limit])) == expected
-    if not lane:  # vectors leave it to the numbers that become of it
-        odd = np.array([np.nan, -np.nan], of.dtype)
-        assert told(library, "exceeds", odd, np.array([limit])) == [True, True]
+    assert evaluate_check(library, f"exceeds{lane}", x, np.array([limit])) == expected
+    if not lane:  # vectors leave this case to the scalars computed from them
+        odd = np.array([np.nan, -np.nan], precision.dtype)
+        assert evaluate_check(library, "exceeds", odd, np.array([limit])) == [True, True]
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_what_is_not_positive(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    info = np.finfo(of.dtype)
+def test_check_for_values_that_are_not_positive(
+    library: ctypes.CDLL, precision: Any, lane: str
+) -> None:
+    info = np.finfo(precision.dtype)
     sizes = [info.smallest_subnormal, info.tiny, 1e-20, 1.0, info.max, np.inf]
     none = [0.0, -0.0, *(-size for size in sizes)]
-    x = np.array([*sizes, np.nan, -np.nan, *none], of.dtype)
+    x = np.array([*sizes, np.nan, -np.nan, *none], precision.dtype)
     expected = [False] * (len(sizes) + 2) + [True] * len(none)
-    assert told(library, f"not_positive{lane}", x) == expected
+    assert evaluate_check(library, f"not_positive{lane}", x) == expected
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_what_is_not_finite(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    info = np.finfo(of.dtype)
+def test_check_for_values_that_are_not_finite(
+    library: ctypes.CDLL, precision: Any, lane: str
+) -> None:
+    info = np.finfo(precision.dtype)
     finite = [0.0, -0.0, 1.0, info.max, -info.max, info.tiny, -info.smallest_subnormal]
-    x = np.array([*finite, np.inf, -np.inf, np.nan, -np.nan], of.dtype)
-    assert told(library, f"not_finite{lane}", x) == [False] * len(finite) + [True] * 4
+    x = np.array([*finite, np.inf, -np.inf, np.nan, -np.nan], precision.dtype)
+    assert evaluate_check(library, f"not_finite{lane}", x) == [False] * len(finite) + [True] * 4
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_any_sign_bit_counts_and_nothing_else(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    integer = np.int32 if of.suffix else np.int64
+def test_failure_mask_depends_on_sign_bits_only(
+    library: ctypes.CDLL, precision: Any, lane: str
+) -> None:
+    integer = np.int32 if precision.suffix else np.int64
     least, most = np.iinfo(integer).min, np.iinfo(integer).max
     count = getattr(library, f"count{lane}")()
-    assert count == VECTORS[lane] // np.dtype(of.dtype).itemsize
+    assert count == VECTORS[lane] // np.dtype(precision.dtype).itemsize
     failed = getattr(library, f"any{lane}")
     for rest in (0, 1, most):
         bits = np.full(count, rest, integer)
         assert not failed(bench.pointer(bits))
         for place in range(count):
-            for found in (-1, least):
-                bits[place] = found
+            for value in (-1, least):
+                bits[place] = value
                 assert failed(bench.pointer(bits))
             bits[place] = rest
     assert failed(bench.pointer(np.full(count, -1, integer)))
 
 
 @pytest.mark.parametrize("lane", VECTORS)
-def test_the_same_number_everywhere(library: ctypes.CDLL, of: Any, lane: str) -> None:
-    for number in (1.5, -0.0, 0.0, np.inf, np.finfo(of.dtype).smallest_subnormal):
-        x = np.array([number], of.dtype)
-        to = np.full(VECTORS[lane] // x.itemsize + 1, 7, of.dtype)
+def test_broadcast_of_one_number(library: ctypes.CDLL, precision: Any, lane: str) -> None:
+    for number in (1.5, -0.0, 0.0, np.inf, np.finfo(precision.dtype).smallest_subnormal):
+        x = np.array([number], precision.dtype)
+        to = np.full(VECTORS[lane] // x.itemsize + 1, 7, precision.dtype)
         getattr(library, f"same{lane}")(bench.pointer(x), bench.pointer(to))
-        assert to.tobytes() == x.tobytes() * (len(to) - 1) + of.dtype(7).tobytes()
+        assert to.tobytes() == x.tobytes() * (len(to) - 1) + precision.dtype(7).tobytes()
 
 
-def test_four_numbers_are_put_anywhere(library: ctypes.CDLL, of: Any) -> None:
-    """And nowhere else; two points are interleaved as the generator has it."""
-    x, y = np.arange(1, 14, dtype=of.dtype), -np.arange(1, 14, dtype=of.dtype)
+def test_four_numbers_are_stored_at_any_position(library: ctypes.CDLL, precision: Any) -> None:
+    """No other element changes; two points are interleaved as the generator defines it."""
+    x, y = np.arange(1, 14, dtype=precision.dtype), -np.arange(1, 14, dtype=precision.dtype)
     for at in range(8):
-        to = np.zeros(16, of.dtype)
+        to = np.zeros(16, precision.dtype)
         library.put(bench.pointer(x[at : at + 4]), bench.pointer(to[at : at + 4]))
         assert to.tolist() == [0] * at + x[at : at + 4].tolist() + [0] * (12 - at)
-        both = np.zeros((4, 2), of.dtype)
+        both = np.zeros((4, 2), precision.dtype)
         from_x, from_y = x[at : at + 4], y[9 - at : 13 - at]
         library.interleave(*map(bench.pointer, (from_x, from_y, both)))
         places = [interleaved_index(k) for k in range(4)]

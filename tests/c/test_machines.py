@@ -1,7 +1,7 @@
-"""The C on other machines: compiled for each, and its self-test run there by QEMU.
+"""The generated C on other machines: cross-compiled, and its self-test run by QEMU.
 
-Compilers are Debian's cross compilers, else ziglang's for what is compiled alone. What is not
-installed is skipped by its name.
+Compilers are Debian's cross compilers, else ziglang for code that is not linked. Machines whose
+tools are not installed are skipped, with the name of the tool.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ CACHE = ROOT / "build" / "tests" / "zig"  # of ziglang's libraries
 
 @dataclass(frozen=True)
 class Machine:
-    """How to compile for a machine and to run there; by ziglang for `target`.
+    """How to compile and run for a machine; with ziglang for `target`.
 
-    bare: what a program is linked with where no system is beneath it.
+    bare: files and flags that a program is linked with if there is no operating system.
     """
 
     gcc: str
@@ -57,7 +57,7 @@ def _cortex(cpu: str, fpu: str, board: str) -> Machine:
 
 
 def _risc_v(cpu: str, abi: str) -> Machine:
-    """With picolibc, whose start and semihosting suit QEMU's board as they are."""
+    """Use picolibc, whose startup code and semihosting fit QEMU's board."""
     memory = "__flash=0x80000000,__flash_size=4M,__ram=0x80400000,__ram_size=4M".split(",")
     return Machine(
         "riscv64-unknown-elf-gcc",
@@ -96,17 +96,17 @@ def generated(name: str, real: str) -> dict[str, str]:
 
 
 def compiler(machine: Machine, alone: bool) -> list[str]:
-    """The cross compiler's command; alone: of what is not linked, where ziglang will do."""
+    """Return the cross compiler's command; if `alone` (nothing is linked), ziglang will do."""
     if path := shutil.which(machine.gcc):
         return [path, *machine.flags]
-    there = alone and not machine.bare  # it has no headers of a bare machine
+    there = alone and not machine.bare  # ziglang has no headers of a bare machine
     if not there or importlib.util.find_spec("ziglang") is None:
         pytest.skip(f"{machine.gcc} is not installed" + " nor ziglang" * there)
     return [sys.executable, "-m", "ziglang", "cc", "-target", *machine.target.split()]
 
 
 def runner(machine: Machine) -> list[str]:
-    """The command that runs a program of the machine."""
+    """Return the command that runs a program of the machine."""
     name, *words = machine.run
     if machine.gcc.startswith("i686") and platform.machine() == "x86_64":
         return []
@@ -121,25 +121,25 @@ def zig(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("name", SCENE_NAMES)
 @pytest.mark.parametrize("machine", MACHINES)
-def test_it_compiles_small_and_bounded(
+def test_code_is_small_and_stack_is_bounded(
     machine: str, name: str, real: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a word, its stack known; of a double pendulum less than 10 kB, 1 kB of stack."""
+    """Issue no warnings; the double pendulum needs at most 10 kB of code and 1 kB of stack."""
     command = compiler(MACHINES[machine], alone=True)
     strict = "-Os -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
-    if machine == "windows":  # its isfinite() names the conversion that it does not make
+    if machine == "windows":  # its isfinite() warns about a conversion
         strict += " -Wno-float-conversion"
     monkeypatch.setenv("EOMC_CFLAGS", strict)
     if machine == "windows":  # no ELF
         with pytest.raises(eomc.EomcError, match="makes no ELF object"):
             sizes.measure(generated(name, real), name, Compiler(tuple(command), ""))
         return
-    found = sizes.measure(generated(name, real), name, Compiler(tuple(command), ""))
-    # the older convention of 64-bit PowerPC has a writable descriptor for each function
-    descriptors = 24 * len(found.functions) if machine == "ppc64" else 0
-    assert found.faults == () and found.writable in (0, descriptors)
-    assert 500 < found.code < 10_000
-    step = next(f for f in found.functions if f.name == f"{name}_rk4_step")
+    measurement = sizes.measure(generated(name, real), name, Compiler(tuple(command), ""))
+    # The older calling convention of 64-bit PowerPC has a writable descriptor for each function.
+    descriptors = 24 * len(measurement.functions) if machine == "ppc64" else 0
+    assert measurement.faults == () and measurement.writable in (0, descriptors)
+    assert 500 < measurement.code < 10_000
+    step = next(f for f in measurement.functions if f.name == f"{name}_rk4_step")
     assert step.stack is not None and 50 < step.stack < 1000
 
 
@@ -147,10 +147,8 @@ def test_it_compiles_small_and_bounded(
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("name", SCENE_NAMES)
 @pytest.mark.parametrize("machine", MACHINES)
-def test_the_self_test_passes_there(
-    machine: str, name: str, real: str, form: str, tmp_path: Path
-) -> None:
-    """Angles up to the stated limits, D, bias and accelerations as computed here in Python."""
+def test_self_test_passes(machine: str, name: str, real: str, form: str, tmp_path: Path) -> None:
+    """Compare sines up to the angle limit, D, bias and accelerations with those of Python."""
     its = MACHINES[machine]
     run, command = runner(its), compiler(its, alone=False)
     write_files(generated(name, real), tmp_path)
@@ -158,7 +156,7 @@ def test_the_self_test_passes_there(
     how = ["-std=c99", "-Os"] if form == "plain" else ["-std=gnu99", "-O2"]
     files = ["selftest.c", f"{at}/{name}.c"]
     if machine == "i386" and form == "fast":
-        how += ["-msse2", "-mfpmath=sse"]  # which it asks for
+        how += ["-msse2", "-mfpmath=sse"]  # required by its ABI
     words = [
         *command,
         *how,
@@ -169,16 +167,20 @@ def test_the_self_test_passes_there(
         "-o",
         "selftest",
     ]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     program = "selftest" if run else "./selftest"
-    done = subprocess.run([*run, program], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert re.fullmatch(rf"{name}: right in \d+ cases\s+", done.stdout), done.stdout + done.stderr
+    process = subprocess.run(
+        [*run, program], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert re.fullmatch(rf"{name}: right in \d+ cases\s+", process.stdout), (
+        process.stdout + process.stderr
+    )
 
 
 @pytest.mark.parametrize("machine", ["cortex-m4f", "rv32imac"])
-def test_a_wrong_number_is_seen_there(machine: str, tmp_path: Path) -> None:
-    """On an emulated bare core: the self-test is run, and tells."""
+def test_self_test_detects_a_wrong_number(machine: str, tmp_path: Path) -> None:
+    """Use an emulated bare core, to prove that the self-test runs and reports."""
     its = MACHINES[machine]
     run, command = runner(its), compiler(its, alone=False)
     for file, text in generated("double_pendulum", "float").items():
@@ -186,7 +188,7 @@ def test_a_wrong_number_is_seen_there(machine: str, tmp_path: Path) -> None:
             (tmp_path / file).write_text(text.replace("9.81f", "9.82f"), encoding="utf-8")
     files = ["selftest.c", "double_pendulum.c", *its.bare, "-lm", "-o", "selftest"]
     subprocess.run([*command, "-std=c99", "-I.", *files], cwd=tmp_path, check=True)
-    done = subprocess.run(
+    process = subprocess.run(
         [*run, "selftest"], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )
-    assert "bias is off by" in done.stdout and done.returncode != 0
+    assert "bias is off by" in process.stdout and process.returncode != 0

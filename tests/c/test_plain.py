@@ -1,4 +1,4 @@
-"""The plain form of C: what compilers say of it, what it computes and refuses, how it is made."""
+"""Portable C: compiler warnings, results, refusals, and how it is generated."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Ws
 PLAIN = ROOT / "build" / "tests" / "plain"
 STEPPERS = 'method = ["rk4", "dp8", "euler", "gauss4", "gauss6", "gauss8", "gauss16"]\n'
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
-# rows, a time in the forces, an input
+# Constraints, time in the forces, an input.
 ROD = """
 eomc = 1
 name = "rod"
@@ -59,8 +59,8 @@ rod = "x**2 + y**2 - l**2"
 h = 0.005
 duration = 1.0
 """
-# by name: the scene, and what it has under [run] besides
-WISHES = {
+# By name: the scene, and lines added under [run].
+VARIANTS = {
     "steppers": ("cartpole", STEPPERS + 'linearize = "parameters"\n'),
     "driven": ("cartpole_driven", STEPPERS + "linearize = true\ndiscretize = true\n"),
     "verlet": ("kepler_orbit", 'method = ["rk4", "euler", "verlet"]\nbatch = true\n'),
@@ -75,96 +75,100 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 @cache
-def made(name: str) -> System:
-    """A scene of scenes/, or one of WISHES, its start assembled."""
-    source, run = WISHES.get(name, (name, ""))
+def assembled_system(name: str) -> System:
+    """Return a scene of scenes/ or of VARIANTS, with its initial state assembled."""
+    source, run = VARIANTS.get(name, (name, ""))
     own = {"": EVERYTHING, "rod": ROD}
     text = own.get(source) or (SCENES / f"{source}.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", "[run]\n" + run)
-    if name in WISHES:
+    if name in VARIANTS:
         text = re.sub(r"^name *= .*", f'name = "plain_{name}"', text, count=1, flags=re.MULTILINE)
     return assembled(system.from_scene(scene.parse(text, f"{name}.toml")))
 
 
 @cache
 def generated(name: str) -> dict[str, str]:
-    """The C of both forms by file, as it lies in a build."""
-    files = eomc.sources(made(name)).files
+    """Return the files of optimised and portable C of a build."""
+    files = eomc.sources(assembled_system(name)).files
     return {file: text for file, text in files.items() if file.endswith((".c", ".h"))}
 
 
-def both(name: str) -> tuple[ModuleType, ModuleType]:
-    """The modules of the fast and of the plain form."""
-    return eomc.load(made(name), PLAIN), eomc.load(made(name), PLAIN, form="plain")
+def load_both_forms(name: str) -> tuple[ModuleType, ModuleType]:
+    """Return the modules of optimised and of portable C."""
+    return eomc.load(assembled_system(name), PLAIN), eomc.load(
+        assembled_system(name), PLAIN, form="plain"
+    )
 
 
 def kit(name: str, folder: Path) -> str:
-    """The generated C as `eomc build` writes it; the name that it bears."""
+    """Write the generated C as `eomc build` does; return its name."""
     (folder / "fast").mkdir()
     write_files(generated(name), folder)
-    return made(name).name
+    return assembled_system(name).name
 
 
 def run(*command: str, cwd: Path) -> str:
-    """What a command prints; it has nothing to complain of."""
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
+    """Run a command that must succeed without warnings; return its output."""
+    process = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+    assert (process.returncode, process.stderr) == (0, "")
+    return process.stdout
 
 
 # --- compilers ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "everything"))
-def test_strict_gcc_has_nothing_to_say(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", tiers([*NAMES, *VARIANTS], "everything"))
+def test_strict_gcc_issues_no_warnings(name: str, tmp_path: Path) -> None:
     name = kit(name, tmp_path)
     (tmp_path / "twice.c").write_text(f'#include "{name}.h"\n#include "{name}.h"\n')
     files = [f"{name}.c", "main.c", "selftest.c", "twice.c"]
     run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", *files, cwd=tmp_path)
 
 
-@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "single", "everything"))
-def test_strict_clang_and_cpp_have_nothing_to_say(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", tiers([*NAMES, *VARIANTS], "single", "everything"))
+def test_strict_clang_and_cpp_issue_no_warnings(name: str, tmp_path: Path) -> None:
     name = kit(name, tmp_path)
     run(needs("clang"), *STRICT, "-O1", "-c", f"{name}.c", cwd=tmp_path)
     cpp = ["-std=c++11", *STRICT[1:], "-fsyntax-only", "-x", "c++"]
     run(needs("g++"), *cpp, f"{name}.c", cwd=tmp_path)
 
 
-@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "everything"))
+@pytest.mark.parametrize("name", tiers([*NAMES, *VARIANTS], "everything"))
 def test_both_forms_have_the_same_prototypes(name: str) -> None:
     def prototypes(header: str) -> set[str]:
         bare = re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
-        found = re.findall(r"^\w[\w *]*\b\w+\([^;{]*\);", bare, re.MULTILINE)
-        return {re.sub(r"\s+", "", p) for p in found}
+        declarations = re.findall(r"^\w[\w *]*\b\w+\([^;{]*\);", bare, re.MULTILINE)
+        return {re.sub(r"\s+", "", p) for p in declarations}
 
-    files, title = generated(name), made(name).name
+    files, title = generated(name), assembled_system(name).name
     plain, fast = prototypes(files[f"{title}.h"]), prototypes(files[f"fast/{title}.h"])
     assert plain == fast
     assert len(plain) > 8
 
 
-@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "cartpole", "rod", "driven"))
+@pytest.mark.parametrize("name", tiers([*NAMES, *VARIANTS], "cartpole", "rod", "driven"))
 def test_workspaces_have_only_members_that_the_portable_source_uses(name: str) -> None:
-    files, title = generated(name), made(name).name
+    files, title = generated(name), assembled_system(name).name
     workspaces = re.findall(r"typedef struct \{([^}]*)\} \w+_memory;", files[f"{title}.h"])
-    assert len(workspaces) == len(made(name).run.methods) + bool(made(name).run.tolerance)
+    assert len(workspaces) == len(assembled_system(name).run.methods) + bool(
+        assembled_system(name).run.tolerance
+    )
     for member in set(re.findall(r"(\w+)(?:\[\d+\])?[,;]", "".join(workspaces))):
         assert f"memory->{member}" in files[f"{title}.c"], member
 
 
 @pytest.mark.parametrize("name", tiers(["cartpole", "driven", "everything"], "cartpole"))
-def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path) -> None:
+def test_object_exports_the_public_names_only(name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     run("cc", "-std=c99", "-O2", "-c", f"{title}.c", cwd=tmp_path)
     lines = run(needs("nm"), "-P", f"{title}.o", cwd=tmp_path).splitlines()
-    found = [(line.split()[1], line.split()[0]) for line in lines]
+    symbols = [(line.split()[1], line.split()[0]) for line in lines]
     mathematics = """sin cos sincos tan asin acos atan atan2 sinh cosh tanh exp log sqrt pow fabs
         fmin fmax""".split()
     header = (tmp_path / f"{title}.h").read_text(encoding="utf-8")
-    assert not [s for kind, s in found if kind == "U" and s not in mathematics]
-    assert not [s for kind, s in found if kind in "BbDdCcSsGg"], "writable data"
-    public = {s for kind, s in found if kind in "TR"}
+    assert not [s for kind, s in symbols if kind == "U" and s not in mathematics]
+    assert not [s for kind, s in symbols if kind in "BbDdCcSsGg"], "writable data"
+    public = {s for kind, s in symbols if kind in "TR"}
     assert public == {s for s in public if re.search(rf"\b{s}[\[(;]|\b{s};", header)}
     assert all(s.startswith(f"{title}_") for s in public)
     assert {f"{title}_{what}" for what in ("D", "acceleration", "defaults", "q0", "qd0")} <= public
@@ -172,7 +176,7 @@ def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cartpole", "chain", "driven"])
-def test_it_is_smaller_than_the_fast_form(name: str, tmp_path: Path) -> None:
+def test_portable_object_is_smaller_than_optimised_object(name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     sizes = []
     for file in (f"{title}.c", f"fast/{title}.c"):
@@ -183,24 +187,24 @@ def test_it_is_smaller_than_the_fast_form(name: str, tmp_path: Path) -> None:
         assert sizes[0] < 3000
 
 
-def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -> None:
+def test_header_and_source_of_different_forms_are_refused(tmp_path: Path) -> None:
     """Their workspaces differ."""
     title = kit("cartpole", tmp_path)
     (tmp_path / f"{title}.h").write_text(generated("cartpole")[f"fast/{title}.h"])
     for flags in ([], ["-ffast-math"]):
         command = ["cc", "-std=c99", *flags, "-c", f"{title}.c"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode != 0
-        assert ("is of another build or form" in done.stderr) == (not flags or True)
+        process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert process.returncode != 0
+        assert ("is of another build or form" in process.stderr) == (not flags or True)
     (tmp_path / f"{title}.h").write_text(generated("cartpole")[f"{title}.h"])
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode != 0 and "with -ffast-math" in done.stderr
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert process.returncode != 0 and "with -ffast-math" in process.stderr
 
 
 @pytest.mark.parametrize("form", ["plain", "fast"])
 @pytest.mark.parametrize("name", tiers(["gcc", "clang"], "gcc"))
 def test_flags_that_ignore_nan_are_refused(name: str, form: str, tmp_path: Path) -> None:
-    """-ffinite-math-only alone is the part of -ffast-math that removes the checks."""
+    """-ffinite-math-only is the part of -ffast-math that removes the checks."""
     title, level = kit("cartpole", tmp_path), ["-std=gnu99", "-fsyntax-only"]
     source = f"{title}.c" if form == "plain" else f"fast/{title}.c"
     for flags, refused in (
@@ -208,19 +212,19 @@ def test_flags_that_ignore_nan_are_refused(name: str, form: str, tmp_path: Path)
         (["-O3", "-funroll-loops"], False), (["-fno-finite-math-only"], False),
         (["-fno-math-errno", "-fno-trapping-math"], False),
     ):  # fmt: skip
-        done = subprocess.run(
+        process = subprocess.run(
             [needs(name), *level, *flags, source], cwd=tmp_path, capture_output=True, text=True
         )
-        assert (done.returncode != 0) == refused, (flags, done.stderr)
-        assert ("no NaN would be noticed" in done.stderr) == refused
+        assert (process.returncode != 0) == refused, (flags, process.stderr)
+        assert ("no NaN would be noticed" in process.stderr) == refused
 
 
-# --- what it computes -----------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
-def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[CheckResult]:
-    """The rows of the plain form that a check has."""
-    comparison = Comparison(made(name), fast, np.random.default_rng(0), states, plain)
+def check_plain(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[CheckResult]:
+    """Return the check's results for portable C."""
+    comparison = Comparison(assembled_system(name), fast, np.random.default_rng(0), states, plain)
     checks_plain.report(comparison)
     return comparison.results
 
@@ -228,33 +232,33 @@ def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> lis
 @pytest.mark.parametrize(
     "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "driven")
 )
-def test_it_agrees_with_the_reference_and_the_fast_form(name: str) -> None:
-    fast, plain = both(name)
-    rows = compared(name, fast, plain, states=6)
+def test_portable_c_agrees_with_reference_and_optimised_c(name: str) -> None:
+    fast, plain = load_both_forms(name)
+    rows = check_plain(name, fast, plain, states=6)
     assert [row for row in rows if not row.passed] == []
     assert {f"plain C beside fast: {method}" for method in fast.methods} < {r.name for r in rows}
 
 
 @pytest.mark.slow
-def test_a_wrong_weight_is_found_by_check(tmp_path: Path) -> None:
+def test_check_detects_a_wrong_weight(tmp_path: Path) -> None:
     right = resources.text
 
     def wrong(folder: str, name: str) -> str:
         return right(folder, name).replace("2*(a2[i] + a3[i])", "(a2[i] + 3*a3[i])")
 
-    # by another name: within a process the same build is the same module
-    named = dataclasses.replace(made("cartpole"), name="plain_wrong")
+    # The name differs because a process loads one module for each build.
+    system_with_other_name = dataclasses.replace(assembled_system("cartpole"), name="plain_wrong")
     render.environment.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resources, "text", wrong)
-        plain = eomc.load(named, tmp_path, form="plain")
+        plain = eomc.load(system_with_other_name, tmp_path, form="plain")
     render.environment.cache_clear()
-    rows = compared("cartpole", both("cartpole")[0], plain, states=4)
+    rows = check_plain("cartpole", load_both_forms("cartpole")[0], plain, states=4)
     failed = {row.name for row in rows if not row.passed}
     assert failed == {"plain C: one step", "plain C: run", "plain C beside fast: rk4"}
 
 
-def test_the_commands_of_the_page_compile_the_self_test(tmp_path: Path) -> None:
+def test_documented_commands_compile_the_self_test(tmp_path: Path) -> None:
     title, page = kit("cartpole", tmp_path), (ROOT / "docs" / "c.md").read_text(encoding="utf-8")
     commands = re.findall(r"^cc .*selftest.*?(?= *#)", page, re.M)
     assert len(commands) == 2
@@ -266,8 +270,8 @@ def test_the_commands_of_the_page_compile_the_self_test(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", tiers(["cartpole", "everything"], "cartpole"))
 @pytest.mark.parametrize("form", tiers(["plain", "fast", "mixed"], "plain", "mixed"))
-def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: Path) -> None:
-    """Mixed: the program sees the header of the one form, and is linked with the other's source."""
+def test_example_and_self_test_work_with_both_forms(name: str, form: str, tmp_path: Path) -> None:
+    """ "Mixed": the program includes the header of one form and links the source of the other."""
     title = kit(name, tmp_path)
     at = "." if form == "plain" else "fast"
     if form == "mixed":
@@ -279,18 +283,18 @@ def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: 
     assert re.fullmatch(rf"{title}: right in \d+ cases\n", run("./a.out", cwd=tmp_path))
     run("cc", "-std=c99", "-O0", f"-I{at}", "main.c", source, "-lm", "-o", "main", cwd=tmp_path)
     _, *rows = run("./main", cwd=tmp_path).splitlines()
-    s, module = made(name).run, both(name)[form == "plain"]
+    s, module = assembled_system(name).run, load_both_forms(name)[form == "plain"]
     steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
-    wanted = module.simulate(steps=steps, every=max(1, steps // 200))
-    found = np.array([[float(x) for x in row.split(",")] for row in rows])
-    wanted = np.column_stack(
-        [wanted.t, wanted.q, wanted.qd, *wanted.outputs.values(), wanted.energy]
+    expected = module.simulate(steps=steps, every=max(1, steps // 200))
+    values = np.array([[float(x) for x in row.split(",")] for row in rows])
+    expected = np.column_stack(
+        [expected.t, expected.q, expected.qd, *expected.outputs.values(), expected.energy]
     )
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.max(np.abs(wanted)))
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
 
 
-def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
-    plain = eomc.load(made("driven"), PLAIN, form="plain")
+def test_run_equals_its_steps_for_any_split() -> None:
+    plain = eomc.load(assembled_system("driven"), PLAIN, form="plain")
     for method in plain.methods:
         whole = plain.simulate(steps=7, h=0.01, method=method)
         q, qd = plain.start
@@ -300,9 +304,9 @@ def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
 
 
 @pytest.mark.parametrize(("method", "stages"), [("gauss4", 2), ("gauss6", 3), ("gauss8", 4)])
-def test_each_sweep_evaluates_all_stages(method: str, stages: int) -> None:
-    """And a step begins with one evaluation; two sweeps at least tell that they contract."""
-    plain = eomc.load(made("driven"), PLAIN, form="plain")
+def test_each_iteration_evaluates_all_stages(method: str, stages: int) -> None:
+    """A step begins with one evaluation; the contraction rate needs at least two iterations."""
+    plain = eomc.load(assembled_system("driven"), PLAIN, form="plain")
     run = plain.simulate(steps=20, h=0.01, method=method)
     sweeps, rest = divmod(run.evaluations - 20, stages)
     assert rest == 0 and 2 * 20 <= sweeps <= 12 * 20
@@ -310,14 +314,14 @@ def test_each_sweep_evaluates_all_stages(method: str, stages: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["many", "verlet"])
-def test_a_batch_is_a_loop_over_instances(name: str) -> None:
-    fast, plain = both(name)
+def test_batch_equals_loop_over_instances(name: str) -> None:
+    fast, plain = load_both_forms(name)
     random = np.random.default_rng(5)
     q0, qd0 = (x + 0.1 * random.standard_normal((9, 2)) for x in fast.start)
-    qd0[4] = 1e300  # one that may not go on, and leaves the others alone
+    qd0[4] = 1e300  # this instance fails and must not affect the others
     for method in fast.methods:
-        given: dict[str, Any] = {"steps": 30, "every": 10, "method": method}
-        one, other = (m.simulate_batch(q0, qd0, **given) for m in (fast, plain))
+        options: dict[str, Any] = {"steps": 30, "every": 10, "method": method}
+        one, other = (m.simulate_batch(q0, qd0, **options) for m in (fast, plain))
         good = np.arange(9) != 4
         np.testing.assert_allclose(other.q[good], one.q[good], rtol=1e-9, atol=1e-9)
         assert np.array_equal(one.status, other.status)
@@ -326,8 +330,8 @@ def test_a_batch_is_a_loop_over_instances(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_stiff_motion_in_long_steps() -> None:
-    """A decay of 10,000 1/s in steps of 10 ms, and signals that answer the state as stiffly."""
+def test_stiff_motion_with_long_steps() -> None:
+    """A decay of 10,000 1/s with steps of 10 ms, and equally stiff feedback signals."""
     text = """
 eomc = 1
 name = "plain_stiff"
@@ -353,7 +357,7 @@ method = ["gauss4", "gauss6", "gauss8"]
         np.testing.assert_allclose(other.q, one.q, rtol=1e-6, atol=1e-9)
 
 
-# --- what it refuses ------------------------------------------------------------------------------
+# --- refusals -------------------------------------------------------------------------------------
 
 REFUSED = """
 #include <NAME.h>
@@ -402,10 +406,10 @@ STEP = """    {
 """
 
 
-def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> None:
-    """1: D is not positive definite, 2: not finite; NULL is of <stdio.h>."""
+def test_refused_calls_leave_the_arguments_unchanged(tmp_path: Path) -> None:
+    """Status 1: D is not positive definite, 2: not finite; NULL comes from <stdio.h>."""
     title = kit("steppers", tmp_path)
-    methods = made("steppers").run.methods
+    methods = assembled_system("steppers").run.methods
     steps = "".join(
         STEP.replace("METHOD", m).replace("NAME_OK", f"{title.upper()}_OK") for m in methods
     )
@@ -414,10 +418,10 @@ def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> No
     for at in (".", "fast"):
         files = ["refused.c", f"{at}/{title}.c", "-lm", "-o", "refused"]
         run("cc", "-std=c99", "-O0", f"-I{at}", *files, cwd=tmp_path)
-        told = run("./refused", cwd=tmp_path).splitlines()
-        assert told[:5] == ["speed 2 1", "slopes 2 1", "mass 1 1", "slopes 1 1", "nan 2 1"], at
+        lines = run("./refused", cwd=tmp_path).splitlines()
+        assert lines[:5] == ["speed 2 1", "slopes 2 1", "mass 1 1", "slopes 1 1", "nan 2 1"], at
         expected = [line for m in methods for line in (f"{m} 1 1", f"{m} 0 1", f"{m} 1 1")]
-        assert told[5:] == expected, at
+        assert lines[5:] == expected, at
 
 
 # --- large systems --------------------------------------------------------------------------------
@@ -425,36 +429,38 @@ def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["everything", "single", "driven", "slopes"])
-def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Into static functions that hand values on in a struct; the self-test passes."""
+def test_long_functions_are_outlined(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The static functions pass values in a struct; the self-test passes."""
     for size in ("LARGE", "PORTABLE_LARGE"):
         monkeypatch.setattr(outline, size, 5)
     for size in ("PIECE", "PORTABLE_PIECE"):
         monkeypatch.setattr(outline, size, 8)
-    small = eomc.sources(made(name))
+    small = eomc.sources(assembled_system(name))
     title = small.name
     for file in (f"{title}.h", f"{title}.c", "selftest.c"):
         (tmp_path / file).write_text(small.files[file], encoding="utf-8")
     text = small.files[f"{title}.c"]
     assert f"{title}_acceleration_2(" in text
-    assert (f"{title}_slopes_2(" in text) == made(name).run.needs_derivatives
+    assert (f"{title}_slopes_2(" in text) == assembled_system(name).run.needs_derivatives
     assert f"{title}_kinetic_energy_2(" in text
     run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", f"{title}.c", cwd=tmp_path)
     run("cc", "-std=c99", "-I.", "selftest.c", f"{title}.c", "-lm", cwd=tmp_path)
     assert re.fullmatch(rf"{title}: right in \d+ cases\n", run("./a.out", cwd=tmp_path))
-    fast, _ = both(name)
-    plain = eomc.load(made(name), tmp_path / "modules", form="plain")
-    assert [row for row in compared(name, fast, plain, states=3) if not row.passed] == []
+    fast, _ = load_both_forms(name)
+    plain = eomc.load(assembled_system(name), tmp_path / "modules", form="plain")
+    assert [row for row in check_plain(name, fast, plain, states=3) if not row.passed] == []
 
 
-def test_portable_functions_stay_whole_where_optimised_ones_are_cut() -> None:
+def test_portable_functions_are_not_outlined_where_optimised_ones_are() -> None:
     files = generated("bricard")
     assert re.search(r"\bbricard_acceleration_\w*2\(", files["fast/bricard.c"])
     assert not re.search(r"\bbricard_\w+_2\(", files["bricard.c"])
 
 
 @pytest.mark.slow
-def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
+def test_chain_of_thirty_links_is_evaluated_by_columns(tmp_path: Path) -> None:
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
     text = text.replace("n = { value = 5,", "n = { value = 30,")
     text = re.sub(r"^name *= .*", 'name = "plain_links"', text, count=1, flags=re.MULTILINE)
@@ -464,24 +470,29 @@ def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
     source = eomc.sources(links).files["plain_links.c"]
     assert "plain_links_D_column(" in source
     q, qd = np.random.default_rng(3).standard_normal((2, len(links.q)))
-    for name, given in (("D", (q,)), ("C", (q, qd)), ("bias", (q, qd)), ("acceleration", (q, qd))):
-        one, other = (getattr(m, name)(*given) for m in (fast, plain))
+    for name, arguments in (
+        ("D", (q,)),
+        ("C", (q, qd)),
+        ("bias", (q, qd)),
+        ("acceleration", (q, qd)),
+    ):
+        one, other = (getattr(m, name)(*arguments) for m in (fast, plain))
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.max(np.abs(one)))
     one, other = (m.linearize(q, qd)[0] for m in (fast, plain))
     np.testing.assert_allclose(other, one, rtol=1e-7, atol=1e-9 * np.max(np.abs(one)))
 
 
-# --- how it is made -------------------------------------------------------------------------------
+# --- generation -----------------------------------------------------------------------------------
 
 
-def test_a_function_prints_itself() -> None:
-    given = (
+def test_text_of_a_function() -> None:
+    arguments = (
         c_function.output_array("double", "x", "N"),
         c_function.input_array("double", "y"),
         CArgument("int", "n"),
     )
     f = CFunction(
-        "f", "void", given, (Block("", ("x[0] = n;",)),), frozenset("xn"), "static", ("x = n.",)
+        "f", "void", arguments, (Block("", ("x[0] = n;",)),), frozenset("xn"), "static", ("x = n.",)
     )
     assert f.prototype == "static void f(double x[N], const double *y, int n)"
     assert f.call(y="0", n="2*n") == "f(x, 0, 2*n)"
@@ -493,7 +504,7 @@ def test_a_function_prints_itself() -> None:
     assert CFunction("g", "int", ()).prototype == "int g(void)"
 
 
-def test_long_lines_are_broken() -> None:
+def test_long_lines_are_wrapped() -> None:
     call = "    *status = " + "long_name(" + ", ".join(f"argument_{k}" for k in range(12)) + ");"
     text = c_function.break_long_lines(f"/* {'word ' * 30}*/\n{call}")
     first, second, *rest = text.split("\n")
@@ -502,7 +513,7 @@ def test_long_lines_are_broken() -> None:
     assert rest[1].startswith("        argument_")
 
 
-def test_the_cart_pole_reads_at_a_sitting() -> None:
+def test_portable_c_of_the_cart_pole_is_short() -> None:
     files = generated("cartpole")
     assert files["cartpole.c"].count("\n") < 260
     assert files["cartpole.h"].count("\n") < 110

@@ -1,4 +1,4 @@
-"""The C in projects of others: alone in a folder, CMake, pkg-config, twice in one program."""
+"""Generated C in other projects: a folder, CMake, pkg-config, two versions in one program."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def eomc(*words: str) -> Result:
     return CliRunner().invoke(main, words)
 
 
-def made(folder: Path, *words: str) -> Path:
-    """The C of the cart-pole, as the command writes it."""
-    done = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(folder), *words)
-    assert done.exit_code == 0, done.output
+def build_c(folder: Path, *words: str) -> Path:
+    """Write the C of the cart-pole with `eomc build --c`; return the folder."""
+    result = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(folder), *words)
+    assert result.exit_code == 0, result.output
     return folder
 
 
@@ -55,31 +55,31 @@ def use(prefix: str = "cartpole") -> str:
 
 
 def cmake(*words: str, at: Path) -> None:
-    done = run(needs("cmake"), *words, cwd=at)
-    assert done.returncode == 0, done.stdout + done.stderr
+    process = run(needs("cmake"), *words, cwd=at)
+    assert process.returncode == 0, process.stdout + process.stderr
 
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """What the program prints, compiled by hand."""
-    folder = made(tmp_path_factory.mktemp("by_hand"))
+    """Output of the program compiled by hand."""
+    folder = build_c(tmp_path_factory.mktemp("by_hand"))
     (folder / "use.cpp").write_text(use(), encoding="utf-8")
     compiled(needs("gcc"), "-std=c99", "-O2", "-c", "cartpole.c", cwd=folder)
     compiled(needs("g++"), "-I.", "use.cpp", "cartpole.o", "-lm", cwd=folder)
-    said = run("./a.out", cwd=folder).stdout
-    assert re.fullmatch(r"0 1\.155\d+\n", said)
-    return said
+    output = run("./a.out", cwd=folder).stdout
+    assert re.fullmatch(r"0 1\.155\d+\n", output)
+    return output
 
 
 # --- the command ----------------------------------------------------------------------------------
 
 
-def test_only_the_c_is_written_and_no_compiler_called(
+def test_build_c_writes_c_only_and_calls_no_compiler(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.setenv("CC", "/nowhere/cc")
-    folder = made(tmp_path / "deep" / "cartpole")
+    folder = build_c(tmp_path / "deep" / "cartpole")
     there = {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file()}
     assert there == {
         "cartpole.h", "cartpole.c", "fast/cartpole.h", "fast/cartpole.c", "main.c", "selftest.c",
@@ -87,25 +87,25 @@ def test_only_the_c_is_written_and_no_compiler_called(
     }  # fmt: skip
     assert sorted(os.listdir(tmp_path)) == ["deep"]
     again = (folder / "main.c").read_bytes()
-    made(folder)
+    build_c(folder)
     assert (folder / "main.c").read_bytes() == again
     costs = (folder / "costs.txt").read_text(encoding="utf-8")
     assert re.search(r"^acceleration +3 +9 +1 +1 +0$", costs, re.MULTILINE)
 
 
-def test_files_of_others_stay(tmp_path: Path) -> None:
+def test_foreign_files_are_not_overwritten(tmp_path: Path) -> None:
     for name in ("main.c", "CMakeLists.txt"):
         (tmp_path / name).write_text("mine", encoding="utf-8")
-    done = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(tmp_path))
-    assert done.exit_code == 2 and "main.c, CMakeLists.txt: give another folder" in done.output
+    result = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(tmp_path))
+    assert result.exit_code == 2 and "main.c, CMakeLists.txt: give another folder" in result.output
     assert sorted(os.listdir(tmp_path)) == ["CMakeLists.txt", "main.c"]
     (tmp_path / "file").write_text("", encoding="utf-8")
-    done = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(tmp_path / "file" / "c"))
-    assert done.exit_code == 2 and "can't be written" in done.output
+    result = eomc("build", str(SCENES / "cartpole.toml"), "--c", str(tmp_path / "file" / "c"))
+    assert result.exit_code == 2 and "can't be written" in result.output
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--prefix", "a"], "goes with --c"),
         (["--c", "a", "--prefix", "double"], "--prefix: 'double' is"),
@@ -113,17 +113,17 @@ def test_files_of_others_stay(tmp_path: Path) -> None:
         (["--c", "a", str(SCENES / "acrobot.toml")], "takes one scene"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
-    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_contradictory_options_are_refused(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = eomc("build", str(SCENES / "cartpole.toml"), *words)
-    assert done.exit_code == 2 and said in done.output
+    result = eomc("build", str(SCENES / "cartpole.toml"), *words)
+    assert result.exit_code == 2 and message in result.output
     assert os.listdir(tmp_path) == []
 
 
-def test_a_build_has_the_same_files(tmp_path: Path, quickly_compiled: None) -> None:
-    folder = made(tmp_path / "c")
+def test_module_build_has_the_same_files(tmp_path: Path, quickly_compiled: None) -> None:
+    folder = build_c(tmp_path / "c")
     built = pipeline.build(SCENES / "cartpole.toml", tmp_path).folder
     for file in folder.rglob("*"):
         if file.is_file():
@@ -131,9 +131,9 @@ def test_a_build_has_the_same_files(tmp_path: Path, quickly_compiled: None) -> N
 
 
 @pytest.mark.slow
-def test_two_versions_in_one_program(tmp_path: Path, printed: str) -> None:
-    """The same scene twice, and the second with another gravity: by another prefix."""
-    made(tmp_path / "a")
+def test_two_versions_link_into_one_program(tmp_path: Path, printed: str) -> None:
+    """Build a scene twice, the second time with another gravity and another prefix."""
+    build_c(tmp_path / "a")
     heavier = (SCENES / "cartpole.toml").read_text(encoding="utf-8").replace("9.8,", "19.6,")
     (tmp_path / "cartpole.toml").write_text(heavier, encoding="utf-8")
     words = ["--c", str(tmp_path / "b"), "--prefix", "heavier"]
@@ -162,7 +162,7 @@ def test_two_versions_in_one_program(tmp_path: Path, printed: str) -> None:
 
 
 def built(project: Path, text: str, *words: str) -> str:
-    """What the C++ project of this CMakeLists.txt prints."""
+    """Return the output of the C++ project with this CMakeLists.txt."""
     (project / "CMakeLists.txt").write_text(text, encoding="utf-8")
     (project / "robot.cpp").write_text(use(), encoding="utf-8")
     cmake("-S", ".", "-B", "out", *words, at=project)
@@ -171,25 +171,25 @@ def built(project: Path, text: str, *words: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_cpp_project_adds_the_folder(tmp_path: Path, printed: str) -> None:
+def test_cpp_project_adds_the_folder(tmp_path: Path, printed: str) -> None:
     needs("cmake"), needs("g++")
-    made(tmp_path / "cartpole")
+    build_c(tmp_path / "cartpole")
     assert built(tmp_path, SUBDIRECTORY) == printed
 
 
 @pytest.mark.slow
-def test_a_cpp_project_adds_the_fast_form(tmp_path: Path, printed: str) -> None:
+def test_cpp_project_adds_optimised_c(tmp_path: Path, printed: str) -> None:
     needs("cmake"), needs("g++")
-    made(tmp_path / "cartpole")
+    build_c(tmp_path / "cartpole")
     fast = built(tmp_path, SUBDIRECTORY, "-DCARTPOLE_FAST=ON")
     assert float(fast.split()[1]) == pytest.approx(float(printed.split()[1]), rel=1e-14)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["OFF", "ON"])
-def test_a_shared_library_is_built_and_installed(form: str, tmp_path: Path) -> None:
-    """CMake's own switch; functions of the library are found by ctypes."""
-    made(tmp_path / "cartpole")
+def test_shared_library_is_built_and_installed(form: str, tmp_path: Path) -> None:
+    """Use CMake's own switch; ctypes calls functions of the installed library."""
+    build_c(tmp_path / "cartpole")
     words = ["BUILD_SHARED_LIBS=ON", f"CARTPOLE_FAST={form}", "CMAKE_C_VISIBILITY_PRESET=hidden"]
     cmake("-S", "cartpole", "-B", "library", *(f"-D{w}" for w in words), at=tmp_path)
     cmake("--build", "library", at=tmp_path)
@@ -201,8 +201,8 @@ def test_a_shared_library_is_built_and_installed(form: str, tmp_path: Path) -> N
     assert run(sys.executable, "-c", code, cwd=tmp_path).stdout == "True\n"
 
 
-def test_a_library_is_shared_where_cmake_is_told_so(tmp_path: Path) -> None:
-    text = (made(tmp_path) / "CMakeLists.txt").read_text(encoding="utf-8")
+def test_cmake_decides_whether_the_library_is_shared(tmp_path: Path) -> None:
+    text = (build_c(tmp_path) / "CMakeLists.txt").read_text(encoding="utf-8")
     assert re.search(r"^add_library\(eomc_cartpole \$\{sources\}/cartpole.c\)$", text, re.M)
     for kind in ("ARCHIVE", "LIBRARY", "RUNTIME"):
         assert f"{kind} DESTINATION" in text
@@ -210,8 +210,8 @@ def test_a_library_is_shared_where_cmake_is_told_so(tmp_path: Path) -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """The folder into which CMake has installed it, moved from where it was installed."""
-    made(tmp_path / "cartpole")
+    """Folder into which CMake installed the library, moved afterwards."""
+    build_c(tmp_path / "cartpole")
     cmake("-S", "cartpole", "-B", "library", f"-DCMAKE_INSTALL_PREFIX={tmp_path}/no", at=tmp_path)
     cmake("--build", "library", at=tmp_path)
     cmake("-E", "chdir", "library", "ctest", "--output-on-failure", at=tmp_path)
@@ -220,7 +220,7 @@ def installed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_cpp_project_finds_what_is_installed(
+def test_cpp_project_finds_the_installed_package(
     tmp_path: Path, installed: Path, printed: str
 ) -> None:
     needs("cmake"), needs("g++")
@@ -230,9 +230,11 @@ def test_a_cpp_project_finds_what_is_installed(
 
 
 @pytest.mark.slow
-def test_pkg_config_finds_what_is_installed(tmp_path: Path, installed: Path, printed: str) -> None:
-    (found,) = installed.rglob("cartpole.pc")
-    where = {**os.environ, "PKG_CONFIG_PATH": str(found.parent)}
+def test_pkg_config_finds_the_installed_package(
+    tmp_path: Path, installed: Path, printed: str
+) -> None:
+    (pc_file,) = installed.rglob("cartpole.pc")
+    where = {**os.environ, "PKG_CONFIG_PATH": str(pc_file.parent)}
     words = [needs("pkg-config"), "--cflags", "--libs", "cartpole"]
     flags = subprocess.run(words, env=where, capture_output=True, text=True, check=True).stdout
     (tmp_path / "use.cpp").write_text(use(), encoding="utf-8")
@@ -240,7 +242,7 @@ def test_pkg_config_finds_what_is_installed(tmp_path: Path, installed: Path, pri
     assert run("./a.out", cwd=tmp_path).stdout == printed
 
 
-def test_the_fast_form_is_compiled_by_cmake_as_for_the_module(tmp_path: Path) -> None:
-    text = (made(tmp_path) / "CMakeLists.txt").read_text(encoding="utf-8")
+def test_cmake_compiles_optimised_c_with_the_flags_of_modules(tmp_path: Path) -> None:
+    text = (build_c(tmp_path) / "CMakeLists.txt").read_text(encoding="utf-8")
     flags = [flag for flag in compiler.FLAGS if flag != "-march=native"]
     assert " ".join(flags) in text

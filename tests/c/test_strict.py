@@ -1,6 +1,7 @@
-"""The plain C under every standard and level, sanitizers, valgrind and MISRA; what its object has.
+"""Portable C under all standards and levels, sanitizers, valgrind and MISRA; its object code.
 
-No heap, nothing writable, no recursion, a bounded stack: read from what the compiler made.
+The object has no heap use, writable data or recursion, and a bounded stack, as read from the
+compiler's output.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from c.test_plain import NAMES, WISHES, generated, kit, made
+from c.test_plain import NAMES, VARIANTS, assembled_system, generated, kit
 from compilers import STRICT, clang, compiled, run
 from conftest import ROOT, needs, tiers
 
@@ -35,7 +36,7 @@ MATHEMATICS |= {f"{name}f" for name in MATHEMATICS}  # single precision
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "name"), [*product(("gcc", "g++", "clang", "clang++"), MOST)])
-def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) -> None:
+def test_compilers_issue_no_warnings(which: str, name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     cpp = which.endswith("++")
     call = clang(cpp) if which.startswith("clang") else [needs(which)]
@@ -49,8 +50,8 @@ def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOST)
-def test_clang_cl_has_nothing_to_say(name: str, tmp_path: Path) -> None:
-    """Clang as Visual C++, its command line and language, with ziglang's headers of Windows."""
+def test_clang_cl_issues_no_warnings(name: str, tmp_path: Path) -> None:
+    """Use clang as Visual C++ (command line and dialect), with ziglang's Windows headers."""
     ziglang = pytest.importorskip("ziglang", reason="ziglang is not installed")
     title, library = kit(name, tmp_path), Path(ziglang.__file__).parent / "lib"
     call = [sys.executable, "-m", "ziglang", "clang", "--driver-mode=cl"]
@@ -71,17 +72,17 @@ def test_clang_cl_has_nothing_to_say(name: str, tmp_path: Path) -> None:
         for f, n in (*product(["plain"], MOST), *product(["fast"], ["cartpole", "verlet", "chain"]))
     ],
 )
-def test_sanitizers_find_nothing(form: str, name: str, tmp_path: Path) -> None:
+def test_sanitizers_report_no_errors(form: str, name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     at = "." if form == "plain" else "fast"
     how = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     how += ["-std=c99" if form == "plain" else "-std=gnu99", f"-I{at}"]
     for program in ("selftest", "main"):
         files = [f"{program}.c", f"{at}/{title}.c", "-lm", "-o", program]
-        done = run(needs("gcc"), *how, *files, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        done = run(f"./{program}", cwd=tmp_path)
-        assert (done.returncode, done.stderr) == (0, "")
+        process = run(needs("gcc"), *how, *files, cwd=tmp_path)
+        assert process.returncode == 0, process.stderr
+        process = run(f"./{program}", cwd=tmp_path)
+        assert (process.returncode, process.stderr) == (0, "")
 
 
 STEPS = """
@@ -100,42 +101,49 @@ int main(void)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["plain", "fast"])
-def test_valgrind_sees_no_heap_and_no_fault(form: str, tmp_path: Path) -> None:
+def test_valgrind_reports_no_heap_use_and_no_errors(form: str, tmp_path: Path) -> None:
     valgrind, title = needs("valgrind"), kit("cartpole", tmp_path)
     at = "." if form == "plain" else "fast"
     (tmp_path / "steps.c").write_text(STEPS.replace("NAME", title), encoding="utf-8")
-    for program, blocks in (("steps", "0 allocs"), ("selftest", "1 allocs")):  # stdio's one
+    for program, blocks in (("steps", "0 allocs"), ("selftest", "1 allocs")):  # allocated by stdio
         files = [f"{program}.c", f"{at}/{title}.c", "-lm", "-o", program]
         compiled("cc", "-std=gnu99", "-g", "-O2", f"-I{at}", *files, cwd=tmp_path)
-        done = run(valgrind, "--error-exitcode=9", f"./{program}", cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert f"total heap usage: {blocks}" in done.stderr
+        process = run(valgrind, "--error-exitcode=9", f"./{program}", cwd=tmp_path)
+        assert process.returncode == 0, process.stderr
+        assert f"total heap usage: {blocks}" in process.stderr
 
 
-# --- the object -----------------------------------------------------------------------------------
+# --- object code ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("level", tiers(["-Os", "-O0", "-O2", "-O3"], "-Os"))
-@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "cartpole"))
-def test_the_object_is_bounded(name: str, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing writable, no function calls itself, every stack known; only <math.h> is called."""
+@pytest.mark.parametrize("name", tiers([*NAMES, *VARIANTS], "cartpole"))
+def test_object_has_bounded_stack_and_no_writable_data(
+    name: str, level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also, no function is recursive, and only functions of <math.h> are called."""
     monkeypatch.setenv("EOMC_CFLAGS", level)
     gcc = compiler.Compiler((needs("gcc"),), "")
-    title = made(name).name
-    found = sizes.measure(generated(name), title, gcc)
-    assert (found.faults, found.writable) == ((), 0)
-    names = {f.name for f in found.functions}
-    public = [f for f in found.functions if "." not in f.name]
-    assert {f"{title}_acceleration", f"{title}_{made(name).run.methods[0]}_run"} <= names
+    title = assembled_system(name).name
+    measurement = sizes.measure(generated(name), title, gcc)
+    assert (measurement.faults, measurement.writable) == ((), 0)
+    names = {f.name for f in measurement.functions}
+    public = [f for f in measurement.functions if "." not in f.name]
+    assert {
+        f"{title}_acceleration",
+        f"{title}_{assembled_system(name).run.methods[0]}_run",
+    } <= names
     assert all(f.code > 0 and f.stack is not None and f.total_stack is not None for f in public)
-    called = {x for f in found.functions for x in f.calls} - names
+    called = {x for f in measurement.functions for x in f.calls} - names
     assert called <= MATHEMATICS | {"memcpy", "memset", "memmove"}, called - MATHEMATICS
     run_of, step_of = (
-        next(f for f in public if f.name == f"{title}_{made(name).run.methods[0]}_{what}")
+        next(
+            f for f in public if f.name == f"{title}_{assembled_system(name).run.methods[0]}_{what}"
+        )
         for what in ("run", "step")
     )
     assert run_of.total_stack is not None and step_of.total_stack is not None
-    if level == "-O0":  # where nothing is inlined
+    if level == "-O0":  # without inlining
         assert run_of.total_stack > step_of.total_stack > (step_of.stack or 0)
 
 
@@ -149,29 +157,31 @@ def test_the_object_is_bounded(name: str, level: str, monkeypatch: pytest.Monkey
          "x_f: its stack has no bound"),
     ],
 )  # fmt: skip
-def test_what_is_unbounded_is_told(text: str, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unbounded_stack_is_reported(
+    text: str, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
     gcc = compiler.Compiler((needs("gcc"),), "")
-    found = sizes.measure({"x.h": "", "x.c": text}, "x", gcc)
-    assert fault in "\n".join(found.faults)
-    assert next(f for f in found.functions if f.name == "x_f").total_stack is None
+    measurement = sizes.measure({"x.h": "", "x.c": text}, "x", gcc)
+    assert fault in "\n".join(measurement.faults)
+    assert next(f for f in measurement.functions if f.name == "x_f").total_stack is None
 
 
 def test_writable_data_and_constants_are_counted() -> None:
     text = (
         "int x_a; int x_b = 3; const double x_c[4] = { 1, 2, 3, 4 };\nint x_f(void) { return 7; }"
     )
-    found = sizes.measure({"x.h": "", "x.c": text}, "x", compiler.find_compiler())
-    assert (found.writable, found.constants) == (8, 32)
-    assert found.code > 0 and [f.name for f in found.functions] == ["x_f"]
+    measurement = sizes.measure({"x.h": "", "x.c": text}, "x", compiler.find_compiler())
+    assert (measurement.writable, measurement.constants) == (8, 32)
+    assert measurement.code > 0 and [f.name for f in measurement.functions] == ["x_f"]
 
 
-def test_sizes_need_a_compiler_that_makes_objects(tmp_path: Path) -> None:
+def test_sizes_need_a_compiler_that_produces_objects(tmp_path: Path) -> None:
     (tmp_path / "cc").write_text("#!/bin/sh\necho no object > x.o\n", encoding="utf-8")
     os.chmod(tmp_path / "cc", 0o755)
-    for command, said in ((str(tmp_path / "cc"), "no ELF object"), ("false", "failed"),
+    for command, message in ((str(tmp_path / "cc"), "no ELF object"), ("false", "failed"),
                           ("true", "no ELF object"), ("/nowhere", "can't be run")):  # fmt: skip
-        with pytest.raises(EomcError, match=said):
+        with pytest.raises(EomcError, match=message):
             sizes.measure({"x.h": "", "x.c": ""}, "x", compiler.Compiler((command,), ""))
 
 
@@ -207,32 +217,39 @@ discretize = true
 """
 
 
-BY_VERSION = ("2.4", "7.3", "12.2", "13.5", "14.1", "21.15")  # found by some versions only
+BY_VERSION = (
+    "2.4",
+    "7.3",
+    "12.2",
+    "13.5",
+    "14.1",
+    "21.15",
+)  # reported by some versions of cppcheck only
 
 
 def eventful() -> dict[str, str]:
-    """The C of a scene with limits, an output, a jump and adaptive steps."""
+    """Return the C of a scene with limits, an output, a jump and adaptive steps."""
     return dict(eomc.sources(system.from_scene(scene.parse(EVENTFUL, "eventful.toml"))).files)
 
 
 @pytest.mark.slow
-def test_misra_rules_are_kept_but_for_those_that_are_told(tmp_path: Path) -> None:
-    """By cppcheck's addon, over all scenes; docs/c.md has those that are not, and why.
+def test_misra_deviations_are_documented(tmp_path: Path) -> None:
+    """Compare cppcheck's findings over all scenes with the deviations listed in docs/c.md.
 
-    Which rules are found depends on the addon's version, but none that the page does not name.
+    Which deviations cppcheck reports depends on its version, but all are listed.
     """
     cppcheck, text = needs("cppcheck"), (ROOT / "docs" / "c.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([\d., ]+?)(?: ¹)? \| (?:required|advisory) \|", text, re.MULTILINE)
-    told = {rule for row in rows for rule in row.split(", ")}
-    found = set()
-    for name in [*NAMES, *WISHES, "eventful"]:
-        title = name if name == "eventful" else made(name).name
+    documented = {rule for row in rows for rule in row.split(", ")}
+    reported = set()
+    for name in [*NAMES, *VARIANTS, "eventful"]:
+        title = name if name == "eventful" else assembled_system(name).name
         files = eventful() if name == "eventful" else generated(name)
         for end in "hc":
             file = f"{title}.{end}"
             (tmp_path / file).write_text(files[file], encoding="utf-8")
         words = ["--addon=misra", "--enable=style", "--std=c99", "--suppress=misra-config"]
-        done = run(cppcheck, *words, f"{title}.c", cwd=tmp_path)
-        assert done.returncode == 0 and ": error:" not in done.stderr, done.stderr
-        found |= set(re.findall(r"\[misra-c2012-([\d.]+)\]", done.stderr))
-    assert found <= told and told - found <= {*BY_VERSION}
+        process = run(cppcheck, *words, f"{title}.c", cwd=tmp_path)
+        assert process.returncode == 0 and ": error:" not in process.stderr, process.stderr
+        reported |= set(re.findall(r"\[misra-c2012-([\d.]+)\]", process.stderr))
+    assert reported <= documented and documented - reported <= {*BY_VERSION}
