@@ -36,10 +36,12 @@ _COUNTERS = ("steps", "evaluations", "rejected", "stiff_steps")
 MAX_EVALUATIONS = 2**31 - 1  # of an instance; fits in long on every machine
 _EVALUATIONS_PER_STATE = 8 * 64  # for a state between two steps: stages times iterations, at most
 _FIRST_CHUNK_STEPS = 64  # steps of an instance before the first check of Ctrl-C
-_NAMES = (
-    "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "initial_state", "h_most",
-    "stiff", "_period", "fixed_method", "_max_evaluations",
-)  # fmt: skip
+_SAVED_FIELDS = {  # fields by the names that they have in files
+    "tol": "tol", "evaluations": "evaluations", "rejected": "rejected",
+    "stiff_steps": "stiff_steps", "reached": "reached", "_times": "_times",
+    "_begin": "initial_state", "_h_most": "h_most", "_stiff": "stiff", "_period": "_period",
+    "_by": "fixed_method", "_max_evaluations": "_max_evaluations",
+}  # fmt: skip
 _EVENT_FIELDS = ("event_instances", "which", "event_rows")  # of a saved run
 _ENDS = np.array([*STATUS, FULL])
 
@@ -176,7 +178,9 @@ class AdaptiveBatchRun(BatchRun):
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the arrays and numbers that a file of the run contains, by name."""
-        arrays = super().to_arrays() | {name: getattr(self, name) for name in _NAMES}
+        arrays = super().to_arrays() | {
+            key: getattr(self, name) for key, name in _SAVED_FIELDS.items()
+        }
         if self.event_data is not None:
             arrays |= zip(_EVENT_FIELDS, self.event_data, strict=True)
             arrays |= {"stopped": self._stopped, "limit": self._limit}
@@ -186,7 +190,8 @@ class AdaptiveBatchRun(BatchRun):
     def from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> AdaptiveBatchRun:
         """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
         fields_of_batch = BatchRun.from_arrays(model, arrays).field_values()
-        run = cls(*fields_of_batch, **{name: arrays[name] for name in _NAMES if name in arrays})
+        own = {name: arrays[key] for key, name in _SAVED_FIELDS.items() if key in arrays}
+        run = cls(*fields_of_batch, **own)
         if "which" in arrays:
             run.event_data = tuple(arrays[name] for name in _EVENT_FIELDS)
             run._stopped, run._limit = arrays["stopped"], arrays["limit"]

@@ -20,7 +20,7 @@ from .requests import Progress
 from .status import STATUS
 from .trajectory_data import parts
 
-_NAMES = ("_times", "initial_state")
+_SAVED_FIELDS = {"_times": "_times", "_begin": "initial_state"}  # by names in files
 _INTERRUPTED = STATUS.index("interrupted")
 
 
@@ -54,13 +54,15 @@ class TimedBatchRun(BatchRun):
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the arrays and numbers that a file of the run contains, by name."""
-        return super().to_arrays() | {name: getattr(self, name) for name in _NAMES}
+        return super().to_arrays() | {
+            key: getattr(self, name) for key, name in _SAVED_FIELDS.items()
+        }
 
     @classmethod
     def from_arrays(cls, model: Any, arrays: Mapping[str, Any]) -> TimedBatchRun:
         """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
         fields_of_batch = BatchRun.from_arrays(model, arrays).field_values()
-        own: Any = {name: arrays.get(name) for name in _NAMES}
+        own: Any = {name: arrays.get(key) for key, name in _SAVED_FIELDS.items()}
         return cls(*fields_of_batch, **own)
 
     def settings(self) -> tuple[Any, ...]:

@@ -16,14 +16,15 @@ from .atomic_write import File, atomic_write
 from .interfaces import CompiledModel
 from .package import eventful, warn
 
-KINDS = (
-    "Run",
-    "AdaptiveRun",
-    "TimedRun",
-    "BatchRun",
-    "TimedBatchRun",
-    "AdaptiveBatchRun",
-)
+KINDS = {  # names of classes in files, and the classes
+    "Run": "Run",
+    "AdaptiveRun": "AdaptiveRun",
+    "SteppedRun": "AdaptiveRun",  # fixed steps with events, in files of earlier versions
+    "TimedRun": "TimedRun",
+    "BatchRun": "BatchRun",
+    "TimedBatchRun": "TimedBatchRun",
+    "AdaptiveBatchRun": "AdaptiveBatchRun",
+}
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
 _KIND = "eomc {} 1"  # name of the class and version of the format
 
@@ -59,7 +60,7 @@ def _text(events: Any) -> str:
 def read(model: CompiledModel, file: File) -> tuple[Any, str, dict[str, Any]]:
     """Read an .npz file that `run.save` has written.
 
-    Return the model, the name of the run's class (one of KINDS) and the arrays by name. The
+    Return the model, the name of the run's class and the arrays by name. The
     returned model is extended by events if the run had additional events. A warning is issued if
     the run is of another version of the scene. Raises ValueError if the file is not a saved run of
     the scene, OSError if it cannot be read.
@@ -90,7 +91,7 @@ def read(model: CompiledModel, file: File) -> tuple[Any, str, dict[str, Any]]:
         raise ValueError(
             f"{file}: has numbers of {arrays['q'].dtype}, {model.info.name} {model.info.dtype}"
         )
-    return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
+    return model, KINDS[kind], {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
 
 
 def _model_with_events(model: CompiledModel, arrays: dict[str, Array], file: File) -> Any:
