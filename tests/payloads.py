@@ -93,7 +93,7 @@ FEW = [
         "spliced", "lines", "controls", "NUL", "half a character",
     )
 ]  # fmt: skip
-payloads = pytest.mark.parametrize("given", PAYLOADS.values(), ids=PAYLOADS)
+payloads = pytest.mark.parametrize("payload", PAYLOADS.values(), ids=PAYLOADS)
 
 RAW = re.compile(
     r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"

@@ -1,6 +1,6 @@
-"""Free text is data: every field is crossed with every payload, and none is executed.
+"""Free text is data: every field is combined with every payload, and none is executed.
 
-What is shown on terminals, in pages and figures: test_texts_shown.py.
+Text on terminals, in pages and in figures: test_texts_shown.py.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ from eomc.scene.read import parse
 
 
 @pytest.fixture(autouse=True)
-def harmless() -> Iterator[None]:
+def no_payload_runs() -> Iterator[None]:
     with nothing_ran():
         yield
 
 
 @pytest.mark.parametrize("name", ["docstring", "comment"])
-def test_these_payloads_run_where_they_are_pasted(name: str, tmp_path: Path) -> None:
-    """Else none of the tests below could fail."""
+def test_payloads_run_when_pasted_into_code(name: str, tmp_path: Path) -> None:
+    """Otherwise none of the tests below could fail."""
     with pytest.raises(AssertionError, match="a text was executed"), nothing_ran():
         if name == "docstring":
             exec(f'"""{PAYLOADS[name]}"""')
@@ -76,20 +76,22 @@ def test_these_payloads_run_where_they_are_pasted(name: str, tmp_path: Path) -> 
 # --- the reader -----------------------------------------------------------------------------------
 
 
-def hidden(text: str, lines: bool) -> bool:
-    """Whether the reader should refuse a text, from the tables of Unicode."""
-    strange = ("Cc", "Zl", "Zp", "Cs")
-    marks = [unicodedata.lookup(f"{way} MARK") for way in ("LEFT-TO-RIGHT", "RIGHT-TO-LEFT")]
+def should_be_refused(text: str, lines: bool) -> bool:
+    """Return whether the reader should refuse a text, by the tables of Unicode."""
+    control_categories = ("Cc", "Zl", "Zp", "Cs")
+    marks = [
+        unicodedata.lookup(f"{direction} MARK") for direction in ("LEFT-TO-RIGHT", "RIGHT-TO-LEFT")
+    ]
     return any(
-        (unicodedata.category(c) in strange and not (lines and c in "\t\n"))
+        (unicodedata.category(c) in control_categories and not (lines and c in "\t\n"))
         or (unicodedata.bidirectional(c) in "LRE RLE PDF LRO RLO LRI RLI FSI PDI".split())
         or c in (*marks, unicodedata.lookup("ARABIC LETTER MARK"))
         for c in text
     )
 
 
-def test_every_free_text_that_a_scene_may_have_is_crossed() -> None:
-    """So that a new table is not forgotten here; those of one model count as one."""
+def test_every_free_text_field_of_a_scene_is_tested() -> None:
+    """A new table must not be forgotten here; tables of one model count as one."""
     checked = (texts.checked_line, texts.checked_lines)
     models = {"": schema.Document, **schema._MODELS}
     known = {
@@ -98,32 +100,32 @@ def test_every_free_text_that_a_scene_may_have_is_crossed() -> None:
         for name, field in model.model_fields.items()
         if any(getattr(rule, "func", None) in checked for rule in field.metadata)
     }
-    ways = (key.split(".") for _, key in fields())
-    crossed = {(models[way[0] if len(way) > 1 else ""], way[-1]) for way in ways}
-    crossed.add((schema.LoopTable, "note"))  # which is read alone, below
-    assert crossed == known and len(known) > 12
+    paths = (key.split(".") for _, key in fields())
+    tested = {(models[path[0] if len(path) > 1 else ""], path[-1]) for path in paths}
+    tested.add((schema.LoopTable, "note"))  # which has a test of its own, below
+    assert tested == known and len(known) > 12
 
 
 @pytest.mark.parametrize(
     ("which", "key"), tiers(fields(), *range(0, len(fields()), 4)), ids=[key for _, key in fields()]
 )
 def test_the_reader_refuses_hidden_characters_and_names_line_and_key(which: int, key: str) -> None:
-    for name, given in PAYLOADS.items():
-        written = filled({which: given})
+    for name, payload in PAYLOADS.items():
+        text = filled({which: payload})
         try:
-            parse(written, "f.toml")
+            parse(text, "f.toml")
             refused = False
-        except SceneError as fault:
+        except SceneError as error:
             refused = True
-            (problem,) = fault.problems
-            if name == "half a character":  # which TOML itself has no way to write
+            (problem,) = error.problems
+            if name == "half a character":  # which TOML itself cannot express
                 assert "not TOML" in problem.message
             else:
                 assert problem.key == key
                 assert re.search(r"U\+[0-9A-F]{4}|line break", problem.message)
-                assert f"{key.split('.')[-1]} = " in written.splitlines()[problem.line - 1]
-            assert not RAW.search(str(fault))
-        assert refused == hidden(given, lines=key.endswith("note")), name
+                assert f"{key.split('.')[-1]} = " in text.splitlines()[problem.line - 1]
+            assert not RAW.search(str(error))
+        assert refused == should_be_refused(payload, lines=key.endswith("note")), name
 
 
 LOOP = """eomc = 1
@@ -152,25 +154,25 @@ note = "@"
 
 
 @payloads
-def test_the_note_of_a_loop(given: str) -> None:
-    """Of scenes that are read, and not generated from so far."""
+def test_loop_note_with_hidden_characters_is_refused(payload: str) -> None:
+    """Scenes with this note are read but no code is generated from them here."""
     try:
-        parse(LOOP.replace('"@"', quoted(given)), "f.toml")
+        parse(LOOP.replace('"@"', quoted(payload)), "f.toml")
         refused = False
-    except SceneError as fault:
+    except SceneError as error:
         refused = True
-        assert not RAW.search(str(fault))
-    assert refused == hidden(given, lines=True)
+        assert not RAW.search(str(error))
+    assert refused == should_be_refused(payload, lines=True)
 
 
-def test_ordinary_texts_and_notes_of_several_lines_pass() -> None:
+def test_ordinary_texts_and_multiline_notes_are_accepted() -> None:
     note = "first line\nsecond *line*,\n\n\tindented: θ"
     for which, key in fields():
         parse(filled({which: ORDINARY}), "f.toml")
         if key.endswith("note"):
             parse(filled({which: note}), "f.toml")
-    made = from_scene(parse(filled({1: note, 3: note}), "f.toml"))
-    files = eomc.sources(made).files
+    system = from_scene(parse(filled({1: note, 3: note}), "f.toml"))
+    files = eomc.sources(system).files
     assert " * first line second *line*, indented: θ\n" in files["fields.h"]
     assert "/* plain, first line second *line*, indented: θ */" in files["fields.h"]
     assert "x: plain, first line second *line*, indented: θ\n" in files["__init__.py"]
@@ -179,9 +181,9 @@ def test_ordinary_texts_and_notes_of_several_lines_pass() -> None:
 # --- what is generated ----------------------------------------------------------------------------
 
 
-def code(face: str) -> str:
-    """The Python of a face without its literals."""
-    tree = ast.parse(face)
+def code_without_literals(module_text: str) -> str:
+    """Return the syntax tree of the Python module with empty string literals."""
+    tree = ast.parse(module_text)
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             node.value = ""
@@ -198,21 +200,23 @@ def plain_tokens(folder: Path) -> str:
     return tokens(plain_files(), folder)
 
 
-@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
-def test_texts_change_no_code(given: str, tmp_path: Path, tmp_path_factory: Any) -> None:
-    files, folder = generated(given), tmp_path_factory.getbasetemp()
+@pytest.mark.parametrize("payload", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
+def test_texts_do_not_change_generated_code(
+    payload: str, tmp_path: Path, tmp_path_factory: Any
+) -> None:
+    files, folder = generated(payload), tmp_path_factory.getbasetemp()
     assert tokens(files, tmp_path) == plain_tokens(folder)
-    face = files["__init__.py"]
-    assert code(face) == code(plain_files()["__init__.py"])
-    assert repr(given) in face
+    module_text = files["__init__.py"]
+    assert code_without_literals(module_text) == code_without_literals(plain_files()["__init__.py"])
+    assert repr(payload) in module_text
     for name, text in files.items():
         assert not RAW.search(text), name
         assert not re.search(r"(\\|\?\?/)$", text, re.M) or name.endswith(".py"), name
-    doc = ast.get_docstring(ast.parse(face), clean=False)
-    assert doc is not None and doc.startswith(texts.line(given) + ": compiled equations")
+    doc = ast.get_docstring(ast.parse(module_text), clean=False)
+    assert doc is not None and doc.startswith(texts.line(payload) + ": compiled equations")
 
 
-def test_ordinary_text_stays_readable(tmp_path: Path) -> None:
+def test_ordinary_text_is_written_unchanged(tmp_path: Path) -> None:
     files = generated(ORDINARY, "Καρό.toml")
     tokens(files, tmp_path)
     for name in ("fields.h", "fields.c", "main.c", "selftest.c", "__init__.py"):
@@ -225,7 +229,7 @@ def test_ordinary_text_stays_readable(tmp_path: Path) -> None:
 
 
 def strings(value: Any) -> Iterator[str]:
-    """All strings in what a template is given."""
+    """Yield all strings in the value that a template receives."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict):
@@ -240,25 +244,25 @@ def strings(value: Any) -> Iterator[str]:
             yield from strings(each)
 
 
-def test_templates_are_given_free_text_only_as_free_text() -> None:
-    whole = derived()
-    marked = replace(whole, system=with_texts(whole.system, "MARKED"))
+def test_templates_receive_free_text_only_as_free_text() -> None:
+    model = derived()
+    marked = replace(model, system=with_texts(model.system, "MARKED"))
     target = Target(marked, DOUBLE)
-    given: list[Any] = [embedding.main_view(target), package.face_view(target, "_x")]
-    given += [package.binding_view(target), selftest.selftest_view(target)]
+    views: list[Any] = [embedding.main_view(target), package.face_view(target, "_x")]
+    views += [package.binding_view(target), selftest.selftest_view(target)]
 
     def show(view: Any) -> str:
-        given.append(view)
+        views.append(view)
         return ""
 
     portable.files(marked, show)
     files.files(files.steppers(target), show)
-    assert len(given) > 12
-    for view in given:
+    assert len(views) > 12
+    for view in views:
         assert not [s for s in strings(view) if "MARKED" in s], type(view)
 
 
-def test_free_text_is_not_printed_by_mistake() -> None:
+def test_printing_free_text_without_escape_raises() -> None:
     text = texts.FreeText("*/")
     for print_it in (str, "{}".format, lambda x: f"{x}", lambda x: "".join(map(str, [x]))):
         with pytest.raises(TypeError, match="free text"):
@@ -280,72 +284,74 @@ print(json.dumps([m.title, m.units, m.__doc__]))
 """
 
 
-def runs(made: System, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Build, import in another process, run; compile and run the C beside it too."""
+def run_module_and_programs(
+    system: System, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> list[Any]:
+    """Build and import the module in another process; compile and run the C programs too."""
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
-    built = eomc.build(made, folder)
+    built = eomc.build(system, folder)
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONIOENCODING": "utf-8"}
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", IMPORTED], env=environment, capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     for file in ("main.c", "selftest.c"):
         command = [needs("gcc"), "-std=c99", "-Wall", "-Wextra", "-Werror", "-I."]
         parts = ("-o", file[:-2], file, "fields.c", "-lm")
         subprocess.run([*command, *parts], cwd=built.folder, check=True)
         printed = subprocess.run([f"./{file[:-2]}"], cwd=built.folder, capture_output=True)
         assert printed.returncode == 0 and not RAW.search(printed.stdout.decode())
-    reported: list[Any] = json.loads(done.stdout)
+    reported: list[Any] = json.loads(process.stdout)
     return reported
 
 
 def test_all_payloads_at_once_build_import_and_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    every = " ".join(PAYLOADS.values())
-    made = replace(with_texts(derived().system, every), digest="0" * 64)
-    title, units, doc = runs(made, tmp_path, monkeypatch)
-    assert title == every and units == dict.fromkeys(("x", "m", "g", "u", "y"), every)
-    assert texts.line(every) in doc
+    all_payloads = " ".join(PAYLOADS.values())
+    system = replace(with_texts(derived().system, all_payloads), digest="0" * 64)
+    title, units, doc = run_module_and_programs(system, tmp_path, monkeypatch)
+    assert title == all_payloads and units == dict.fromkeys(("x", "m", "g", "u", "y"), all_payloads)
+    assert texts.line(all_payloads) in doc
 
 
 @pytest.mark.slow
 @payloads
 def test_each_payload_builds_imports_and_runs(
-    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    payload: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = replace(with_texts(derived().system, given), digest="0" * 64)
-    title, units, _ = runs(made, tmp_path, monkeypatch)
-    assert title == given and units == dict.fromkeys(("x", "m", "g", "u", "y"), given)
+    system = replace(with_texts(derived().system, payload), digest="0" * 64)
+    title, units, _ = run_module_and_programs(system, tmp_path, monkeypatch)
+    assert title == payload and units == dict.fromkeys(("x", "m", "g", "u", "y"), payload)
 
 
 @pytest.mark.parametrize(
-    "given", tiers(PAYLOADS.values(), *(PAYLOADS[k] for k in ("docstring", "spliced", "NUL"))),
+    "payload", tiers(PAYLOADS.values(), *(PAYLOADS[k] for k in ("docstring", "spliced", "NUL"))),
     ids=PAYLOADS,
 )  # fmt: skip
-def test_systems_made_in_python(given: str) -> None:
-    x, m = sympy.Symbol(given), sympy.Symbol(given + "m")
-    v = sympy.Symbol(f"{given}_dot")
-    made = System.make(
-        "made", {x: 1.0}, m * v**2 / 2, m * x**2, parameters={m: 1}, units={x: given, m: given},
-        title=given,
+def test_systems_defined_in_python_generate_no_payload(payload: str) -> None:
+    x, m = sympy.Symbol(payload), sympy.Symbol(payload + "m")
+    v = sympy.Symbol(f"{payload}_dot")
+    system = System.make(
+        "made", {x: 1.0}, m * v**2 / 2, m * x**2, parameters={m: 1}, units={x: payload, m: payload},
+        title=payload,
     )  # fmt: skip
-    for name, text in eomc.sources(made).files.items():
+    for name, text in eomc.sources(system).files.items():
         assert not RAW.search(text), name
         if name.endswith(".py"):
             ast.parse(text)
     namespace: dict[str, Any] = {}
-    exec(write_equations(made, "python"), namespace)
-    assert namespace["__doc__"].startswith(texts.line(given) + ": D qdd")
-    text, latex = (write_equations(made, form) for form in ("text", "latex"))
+    exec(write_equations(system, "python"), namespace)
+    assert namespace["__doc__"].startswith(texts.line(payload) + ": D qdd")
+    text, latex = (write_equations(system, form) for form in ("text", "latex"))
     ours = {"begin", "end", "ddot", "dot", "frac", "left", "mathrm", "quad", "right"}
-    # names only, and those are plain
+    # only names, which are plain
     assert {*re.findall(r"\\([A-Za-z]+)", latex)} <= ours and not re.search("[$#%]", latex)
-    for shown in (text, latex, equations_text.write_costs(made)):
+    for shown in (text, latex, equations_text.write_costs(system)):
         assert not RAW.search(shown)
 
 
-def test_names_that_no_reader_has_checked_stand_in_no_code() -> None:
+def test_unchecked_names_are_not_written_to_code() -> None:
     whole = derived()
     x = whole.system.coordinates[0]
     for changed in (
@@ -357,7 +363,7 @@ def test_names_that_no_reader_has_checked_stand_in_no_code() -> None:
             render.render(replace(whole, system=changed), "_extension")
 
 
-def test_titles_and_units_are_texts() -> None:
+def test_titles_and_units_must_be_strings() -> None:
     x, v = sympy.symbols("x x_dot")
 
     class Odd(str):
@@ -367,6 +373,6 @@ def test_titles_and_units_are_texts() -> None:
     for wrong in (3, None, b"x", sympy.Symbol("x")):
         with pytest.raises(EomcError, match="a title or unit is a text"):
             System.make("made", [x], v**2, title="x", units={x: wrong})  # type: ignore[dict-item]
-    made = System.make("made", [x], v**2, title=Odd("x"), units={x: Odd("y")})
-    face = eomc.sources(made).files["__init__.py"]
-    assert "system(" not in face and "title='x'" in face
+    system = System.make("made", [x], v**2, title=Odd("x"), units={x: Odd("y")})
+    module_text = eomc.sources(system).files["__init__.py"]
+    assert "system(" not in module_text and "title='x'" in module_text

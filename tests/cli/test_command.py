@@ -1,4 +1,4 @@
-"""The command as a user calls it: what it prints, and its exit status."""
+"""Call the command as a user does and check its output and its exit status."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ SCENES = Path(__file__).parents[2] / "scenes"
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None) -> Path:
-    """An empty directory with two scenes, in which the command is run."""
+def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None) -> Path:
+    """Change to a new folder with two scenes, in which the command is run."""
     for name in ("cartpole", "kapitza_pendulum"):
         shutil.copy(SCENES / f"{name}.toml", tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -35,74 +35,81 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None
 
 
 @pytest.fixture
-def there(here: Path) -> Path:
-    """As `here`, the cart-pole built."""
-    return built(here, "cartpole")
+def built_folder(scene_folder: Path) -> Path:
+    """Return `scene_folder` with the cart-pole built."""
+    return folder_with_module(scene_folder, "cartpole")
 
 
-def built(here: Path, name: str) -> Path:
-    """`here`, with the module of a scene."""
-    shutil.copytree(pipeline.build(SCENES / f"{name}.toml", KEPT).folder, here / "build" / name)
-    return here
+def folder_with_module(scene_folder: Path, name: str) -> Path:
+    """Return `scene_folder` with the module of a scene."""
+    shutil.copytree(
+        pipeline.build(SCENES / f"{name}.toml", KEPT).folder, scene_folder / "build" / name
+    )
+    return scene_folder
 
 
 def eomc(*words: str) -> Result:
     return CliRunner().invoke(main, words)
 
 
-def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
+def test_new_scene_runs_unchanged(scene_folder: Path) -> None:
     assert eomc("new", "crane").exit_code == 0
     ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png", "--animate", "a.html")
     assert ran.exit_code == 0, ran.output
     assert "error at the end about" in ran.output and "steps a second" in ran.output
     rows = np.genfromtxt("run.csv", delimiter=",", names=True)
     assert rows.dtype.names == ("t", "theta", "theta_dot", "torque", "energy") and len(rows) == 2001
-    assert (here / "run.png").read_bytes().startswith(b"\x89PNG")
-    page = (here / "a.html").read_text(encoding="utf-8")
+    assert (scene_folder / "run.png").read_bytes().startswith(b"\x89PNG")
+    page = (scene_folder / "a.html").read_text(encoding="utf-8")
     assert "<h1>Crane</h1>" in page and '"bob"' in page and "wrote a.html" in ran.output
     again = eomc("new", "crane")
     assert again.exit_code == 2 and "is there already" in again.output
 
 
-def test_a_new_scene_says_how_it_gets_a_tolerance(here: Path) -> None:
+def test_new_scene_explains_how_to_set_a_tolerance(scene_folder: Path) -> None:
     assert eomc("new", "crane").exit_code == 0
-    text = (here / "crane.toml").read_text(encoding="utf-8")
-    (here / "crane.toml").write_text(text.replace("# tolerance", "tolerance"), encoding="utf-8")
+    text = (scene_folder / "crane.toml").read_text(encoding="utf-8")
+    (scene_folder / "crane.toml").write_text(
+        text.replace("# tolerance", "tolerance"), encoding="utf-8"
+    )
     assert pipeline.read("crane.toml").run.tolerance == 1e-9
 
 
-def test_scenes_that_come_with_eomc_are_listed_and_copied(here: Path) -> None:
+def test_included_scenes_are_listed_and_copied(scene_folder: Path) -> None:
     shipped = {file.stem for file in SCENES.glob("*.toml")}
     own, others = eomc("list").output.split("with eomc come")
     assert "cartpole.toml" in own and "acrobot" not in own
     assert {line.split()[0] for line in others.splitlines()[1:]} == shipped
-    found = json.loads(eomc("list", "--json").output)
-    assert {row["name"] for row in found if row["shipped"]} == shipped
+    entries = json.loads(eomc("list", "--json").output)
+    assert {row["name"] for row in entries if row["shipped"]} == shipped
     assert not [row for row in json.loads(eomc("list", ".", "--json").output) if row["shipped"]]
     for words, name in ((["--from", "acrobot"], "acrobot"), (["arm", "--from", "acrobot"], "arm")):
         assert eomc("new", *words).exit_code == 0
-        text = (here / f"{name}.toml").read_text(encoding="utf-8")
-        assert pipeline.read(here / f"{name}.toml").name == name
+        text = (scene_folder / f"{name}.toml").read_text(encoding="utf-8")
+        assert pipeline.read(scene_folder / f"{name}.toml").name == name
         assert text.replace(f'"{name}"', '"acrobot"', 1) == (SCENES / "acrobot.toml").read_text()
-    assert eomc("new").exit_code == 0 and pipeline.read(here / "pendulum.toml").name == "pendulum"
+    assert (
+        eomc("new").exit_code == 0
+        and pipeline.read(scene_folder / "pendulum.toml").name == "pendulum"
+    )
 
 
-def test_every_scene_that_comes_with_eomc_has_its_name_in_one_place(here: Path) -> None:
+def test_every_included_scene_is_named_in_one_place(scene_folder: Path) -> None:
     for file in SCENES.glob("*.toml"):
-        (here / "renamed.toml").unlink(missing_ok=True)
+        (scene_folder / "renamed.toml").unlink(missing_ok=True)
         assert eomc("new", "renamed", "--from", file.stem).exit_code == 0
-        assert pipeline.name_and_digest(here / "renamed.toml")[0] == "renamed"
+        assert pipeline.name_and_digest(scene_folder / "renamed.toml")[0] == "renamed"
 
 
-def test_build_check_and_list(here: Path) -> None:
+def test_build_check_and_list(scene_folder: Path) -> None:
     assert "built in" in eomc("build", "cartpole.toml").output
     assert "up to date" in eomc("build", "cartpole.toml").output
     checked = eomc("check", "cartpole.toml", "--json")
     assert checked.exit_code == 0 and json.loads(checked.output)[0]["passed"] is True
-    found = json.loads(eomc("list", "--json").output)
-    rows = {row["name"]: row["built"] for row in found if not row["shipped"]}
+    entries = json.loads(eomc("list", "--json").output)
+    rows = {row["name"]: row["built"] for row in entries if not row["shipped"]}
     assert rows == {"cartpole": True, "kapitza_pendulum": False}
-    scene = here / "cartpole.toml"
+    scene = scene_folder / "cartpole.toml"
     scene.write_text(scene.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
     assert not json.loads(eomc("list", "--json").output)[0]["built"]
 
@@ -116,28 +123,30 @@ sys.exit(", ".join(slow & set(sys.modules)) or 0)
 """
 
 
-def test_what_does_nothing_imports_nothing_slow(there: Path) -> None:
-    """Help, and a build that is there, in a tenth of a second."""
+def test_help_and_current_build_import_no_slow_module(built_folder: Path) -> None:
+    """Help, and the build of a current module, finish in a tenth of a second."""
     for words in (["--help"], ["build", "cartpole.toml"]):
         command = [sys.executable, "-c", LIGHT, *words]
-        done = subprocess.run(command, capture_output=True, text=True)
-        assert (done.returncode, done.stderr) == (0, "")
-    assert "is up to date" in done.stdout
+        process = subprocess.run(command, capture_output=True, text=True)
+        assert (process.returncode, process.stderr) == (0, "")
+    assert "is up to date" in process.stdout
 
 
 @pytest.mark.slow
-def test_where_the_energy_went_is_told(there: Path) -> None:
+def test_energy_balance_is_printed(built_folder: Path) -> None:
     assert "J, changed by at most" in eomc("run", "cartpole.toml").output
-    built(there, "kapitza_pendulum")
-    told = eomc("run", "kapitza_pendulum.toml").output
-    assert "energy K + P 8.73323504 J, changed by at most 18 J; it is not conserved\n" in told
-    assert "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in told
+    folder_with_module(built_folder, "kapitza_pendulum")
+    output = eomc("run", "kapitza_pendulum.toml").output
+    assert "energy K + P 8.73323504 J, changed by at most 18 J; it is not conserved\n" in output
+    assert (
+        "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in output
+    )
     words = ["--json", "--every", "99"]
-    said = json.loads(eomc("run", "kapitza_pendulum.toml", *words).output)["energy"]["balance"]
-    assert said["is_resolved"] and said["forces"] == pytest.approx(-1.71, abs=1e-3)
+    balance = json.loads(eomc("run", "kapitza_pendulum.toml", *words).output)["energy"]["balance"]
+    assert balance["is_resolved"] and balance["forces"] == pytest.approx(-1.71, abs=1e-3)
 
 
-def test_parameters_and_start_on_the_command_line(there: Path) -> None:
+def test_parameters_and_initial_values_on_the_command_line(built_folder: Path) -> None:
     words = ["--set", "m_c=1+2", "--start", "theta=pi/3", "--start", "x_dot=-l", "--json"]
     summary = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
     assert summary["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
@@ -145,18 +154,18 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("assignment", "message"),
     [
         ("force=30", "but an input: --input force=30"),
         ("theta=1", "but a coordinate: --start theta=1"),
         ("theta_dot=2", "but a velocity: --start theta_dot=2"),
     ],
 )
-def test_what_is_no_parameter_is_told_where_it_belongs(
-    driven: ModuleType, given: str, said: str
+def test_names_that_are_no_parameters_are_refused_with_the_right_option(
+    driven: ModuleType, assignment: str, message: str
 ) -> None:
-    with pytest.raises(EomcError, match=f"is not a parameter, {said}"):
-        run._overrides(Path("driven.toml"), driven, [given], [])
+    with pytest.raises(EomcError, match=f"is not a parameter, {message}"):
+        run._overrides(Path("driven.toml"), driven, [assignment], [])
 
 
 INPUTS = """eomc = 1
@@ -179,26 +188,26 @@ x = "f + free + w"
 """
 
 
-def test_inputs_are_held_on_the_command_line(there: Path, driven: ModuleType) -> None:
-    built(there, "cartpole_driven")
-    shutil.copy(SCENES / "cartpole_driven.toml", there)
+def test_constant_inputs_on_the_command_line(built_folder: Path, driven: ModuleType) -> None:
+    folder_with_module(built_folder, "cartpole_driven")
+    shutil.copy(SCENES / "cartpole_driven.toml", built_folder)
     words = ["--input", "force=m_c/4", "--set", "m_c=4", "--duration", "0.5", "--json"]
-    done = json.loads(eomc("run", "cartpole_driven.toml", *words).output)
+    result = json.loads(eomc("run", "cartpole_driven.toml", *words).output)
     alone = driven.simulate(u=1.0, duration=0.5, params={"m_c": 4.0})
-    assert [*done["q"].values()] == pytest.approx(alone.q[-1], rel=1e-12)
-    for given, said in (
+    assert [*result["q"].values()] == pytest.approx(alone.q[-1], rel=1e-12)
+    for assignment, message in (
         ("Force=1", "--input: 'Force' is not an input; did you mean 'force'"),
         ("push=1", "--input: 'push' is not an input; there are force"),
         ("force", "write --input NAME=VALUE"),
     ):
-        assert said in eomc("run", "cartpole_driven.toml", "--input", given).output
+        assert message in eomc("run", "cartpole_driven.toml", "--input", assignment).output
     assert (
         "'x' is not an input: there are none"
         in eomc("run", "cartpole.toml", "--input", "x=1").output
     )
 
 
-def test_inputs_that_are_not_held_have_constant_signals(tmp_path: Path) -> None:
+def test_inputs_without_zero_order_hold_have_constant_signals(tmp_path: Path) -> None:
     scene = tmp_path / "inputs.toml"
     scene.write_text(INPUTS, encoding="utf-8")
     module: Any = SimpleNamespace(inputs=("f", "free", "w"), defaults={"m": 2.0}, start=(0, 0))
@@ -214,17 +223,17 @@ def test_inputs_that_are_not_held_have_constant_signals(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "said"),
+    ("option", "message"),
     [("--rate", "--start NAME_dot=VALUE"), ("--params", "--set NAME=VALUE"), ("--dt", "is --h")],
 )
-def test_options_of_other_names_are_told_by_what_is_meant(option: str, said: str) -> None:
-    done = eomc("run", "cartpole.toml", option, "x=1")
-    assert done.exit_code == 2 and f"No such option '{option}': " in done.output
-    assert said in done.output
+def test_common_names_of_options_suggest_the_option_of_eomc(option: str, message: str) -> None:
+    result = eomc("run", "cartpole.toml", option, "x=1")
+    assert result.exit_code == 2 and f"No such option '{option}': " in result.output
+    assert message in result.output
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["run", "cartpole.toml", "--set", "mc=3"], "did you mean 'm_c'?"),
         (["run", "cartpole.toml", "--set", "Q=1"], "is not a parameter; there are m_c, m_p, l"),
@@ -246,27 +255,29 @@ def test_options_of_other_names_are_told_by_what_is_meant(option: str, said: str
         (["list", "nowhere"], "is not a folder"),
     ],
 )
-def test_bad_input_is_status_2_and_says_what_to_do(
-    there: Path, words: list[str], said: str
+def test_bad_input_exits_with_status_2_and_a_remedy(
+    built_folder: Path, words: list[str], message: str
 ) -> None:
     if "cartpole_bodies.toml" in words:
-        shutil.copy(SCENES / "cartpole_bodies.toml", built(there, "cartpole_bodies"))
-    done = eomc(*words)
-    assert done.exit_code == 2, done.output
-    assert said in done.output
+        shutil.copy(
+            SCENES / "cartpole_bodies.toml", folder_with_module(built_folder, "cartpole_bodies")
+        )
+    result = eomc(*words)
+    assert result.exit_code == 2, result.output
+    assert message in result.output
 
 
-def test_run_tells_events_that_it_is_asked_for(there: Path) -> None:
+def test_run_prints_requested_events(built_folder: Path) -> None:
     options = ["--duration", "3", "--event", "level = theta - pi", "--event", "far=x+0.4"]
-    found = json.loads(eomc("run", "cartpole.toml", *options, "--json").output)
-    level, far = found["events"]["level"], found["events"]["far"]
-    assert len(level) == len(far) == 2 and found["tolerance"] == 1e-9
-    module = pipeline.load(there / "cartpole.toml", there / "build")
+    summary = json.loads(eomc("run", "cartpole.toml", *options, "--json").output)
+    level, far = summary["events"]["level"], summary["events"]["far"]
+    assert len(level) == len(far) == 2 and summary["tolerance"] == 1e-9
+    module = pipeline.load(built_folder / "cartpole.toml", built_folder / "build")
     for times, column, value in ((level, "theta", np.pi), (far, "x", -0.4)):
         states = module.simulate(h=1e-3, duration=3.0)(np.array(times))[0]
         assert states[:, module.coordinates.index(column)] == pytest.approx(value, abs=1e-8)
-    told = eomc("run", "cartpole.toml", "--duration", "1.5", *options[2:]).output
-    assert re.search(r"event level: 1 time, at t = [\d.]+ s\n", told), told
+    output = eomc("run", "cartpole.toml", "--duration", "1.5", *options[2:]).output
+    assert re.search(r"event level: 1 time, at t = [\d.]+ s\n", output), output
     wrong = eomc("run", "cartpole.toml", "--event", "level=thta")
     assert wrong.exit_code == 2
     assert (
@@ -276,7 +287,7 @@ def test_run_tells_events_that_it_is_asked_for(there: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_event_that_ends_a_run_is_told(here: Path) -> None:
+def test_event_that_stops_a_run_is_printed(scene_folder: Path) -> None:
     scene = """eomc = 1
 name = "dropped"
 [coordinates]
@@ -292,41 +303,45 @@ name = "ground"
 when = "y"
 action = "stop"
 """
-    (here / "dropped.toml").write_text(scene, encoding="utf-8")
-    told = eomc("run", "dropped.toml").output
-    assert re.search(r"event half: 1 time, at t = 0.319\d* s\n", told), told
-    assert re.search(r"event ground: 1 time, at t = 0.4515\d* s, which ends the run\n", told), told
+    (scene_folder / "dropped.toml").write_text(scene, encoding="utf-8")
+    output = eomc("run", "dropped.toml").output
+    assert re.search(r"event half: 1 time, at t = 0.319\d* s\n", output), output
+    assert re.search(r"event ground: 1 time, at t = 0.4515\d* s, which ends the run\n", output), (
+        output
+    )
 
 
-def test_two_scenes_of_one_name_do_not_replace_each_other(here: Path) -> None:
+def test_scenes_of_the_same_name_do_not_replace_each_other(scene_folder: Path) -> None:
     shutil.copy("cartpole.toml", "copy.toml")
-    done = eomc("build", "cartpole.toml", "copy.toml")
-    assert done.exit_code == 2 and "both named 'cartpole'" in done.output
-    assert not (here / "build").exists()
+    result = eomc("build", "cartpole.toml", "copy.toml")
+    assert result.exit_code == 2 and "both named 'cartpole'" in result.output
+    assert not (scene_folder / "build").exists()
 
 
-def test_a_run_that_cannot_go_on_is_status_1(there: Path) -> None:
-    done = eomc("run", "cartpole.toml", "--h", "3", "--duration", "30")
-    assert done.exit_code == 1 and "would no longer be finite" in done.output
+def test_run_that_fails_exits_with_status_1(built_folder: Path) -> None:
+    result = eomc("run", "cartpole.toml", "--h", "3", "--duration", "30")
+    assert result.exit_code == 1 and "would no longer be finite" in result.output
 
 
-def test_show(here: Path) -> None:
+def test_show_prints_equations_in_every_format(scene_folder: Path) -> None:
     text = eomc("show", "kapitza_pendulum.toml").output
     assert "mass matrix" in text and "Jacobi integral" in text
     assert r"\begin{align*}" in eomc("show", "kapitza_pendulum.toml", "--latex").output
     space: dict[str, object] = {}
-    exec(eomc("show", "kapitza_pendulum.toml", "--python").output, space)  # it is Python
+    exec(
+        eomc("show", "kapitza_pendulum.toml", "--python").output, space
+    )  # the output is valid Python
     assert str(space["D"]) == "Matrix([[l**2*m]])"
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
 
 
 @pytest.mark.slow
-def test_fractions_stay_exact_in_python(here: Path) -> None:
-    """What would be divided by Python itself: a number of a sum, an exponent."""
-    text = (here / "cartpole.toml").read_text(encoding="utf-8")
+def test_rationals_are_exact_in_python_output(scene_folder: Path) -> None:
+    """Python itself would divide the numbers of a sum or an exponent."""
+    text = (scene_folder / "cartpole.toml").read_text(encoding="utf-8")
     text = text.replace('kinetic   = "', 'kinetic   = "x_dot**2/20 + ')
     text = text.replace('potential = "', 'potential = "m_p*(1 + x**2)**(3/10) + ')
-    (here / "odd.toml").write_text(text, encoding="utf-8")
+    (scene_folder / "odd.toml").write_text(text, encoding="utf-8")
     space: dict[str, Any] = {}
     exec(eomc("show", "odd.toml", "--python").output, space)
     assert not any(x.has(sympy.Float) for x in (space["D"], space["g_"], space["potential"]))
@@ -353,9 +368,9 @@ inertia = [0.1, 0.2, 0.3]
 
 
 @pytest.mark.slow  # SymPy simplifies for most of a minute
-def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
+def test_long_rationals_of_skew_axes_are_printed_as_decimals(scene_folder: Path) -> None:
     """D = n.J n + m |n x c|^2 with n = (1, 2, 3)/sqrt(14), which has no short fraction."""
-    (here / "slanted.toml").write_text(SLANTED, encoding="utf-8")
+    (scene_folder / "slanted.toml").write_text(SLANTED, encoding="utf-8")
     for form in ([], ["--latex"], ["--python"]):
         text = eomc("show", "slanted.toml", *form).output
         assert "mass matrix" in text or form
@@ -368,39 +383,41 @@ def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])
-def test_help_has_an_example(command: str) -> None:
+def test_help_contains_an_example(command: str) -> None:
     assert f"eomc {command}" in eomc(command, "--help").output
 
 
-def test_a_name_without_its_file_suggests_the_file(here: Path) -> None:
-    done = eomc("run", "cartpole")
-    assert done.exit_code == 2
-    assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in done.output
+def test_scene_name_without_suffix_suggests_the_file(scene_folder: Path) -> None:
+    result = eomc("run", "cartpole")
+    assert result.exit_code == 2
+    assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in result.output
 
 
-def test_a_scene_that_comes_with_eomc_is_told_how_to_have(here: Path) -> None:
-    """One of that name that lies here comes first."""
+def test_name_of_an_included_scene_suggests_new_from(scene_folder: Path) -> None:
+    """A file of that name in the current folder takes precedence."""
     for name in ("bricard", "bricard.toml"):
-        done = eomc("run", name)
-        assert done.exit_code == 2
-        told = f"{name}: there is no such file; eomc new --from bricard writes the one that comes"
-        assert told in done.output
+        result = eomc("run", name)
+        assert result.exit_code == 2
+        message = (
+            f"{name}: there is no such file; eomc new --from bricard writes the one that comes"
+        )
+        assert message in result.output
     eomc("new", "--from", "bricard")
     assert "did you mean 'bricard.toml'?" in eomc("check", "bricard").output
 
 
-def test_of_a_command_that_there_is_not_the_nearest_is_told(here: Path) -> None:
-    for name, told in (
+def test_unknown_command_suggests_the_nearest_one(scene_folder: Path) -> None:
+    for name, message in (
         ("runn", "'runn'; did you mean 'run'?"),
         ("simulate", "'simulate': they are build, check,"),
         ("cartpole.toml", "'cartpole.toml': they are build, check,"),
     ):
-        done = eomc(name, "cartpole.toml")
-        assert done.exit_code == 2 and f"No such command {told}" in done.output
+        result = eomc(name, "cartpole.toml")
+        assert result.exit_code == 2 and f"No such command {message}" in result.output
 
 
-def test_a_folder_that_is_none_suggests_the_option(here: Path) -> None:
-    (here / "file").write_text("", encoding="utf-8")
-    done = eomc("build", "cartpole.toml", "--build", "file")
-    assert done.exit_code == 2
-    assert "choose another place with --build DIR" in done.output and "root=" not in done.output
+def test_build_folder_that_is_a_file_suggests_the_option(scene_folder: Path) -> None:
+    (scene_folder / "file").write_text("", encoding="utf-8")
+    result = eomc("build", "cartpole.toml", "--build", "file")
+    assert result.exit_code == 2
+    assert "choose another place with --build DIR" in result.output and "root=" not in result.output

@@ -1,4 +1,4 @@
-"""Free text as it is shown: on terminals, in pages and figures, in the scenes of robots."""
+"""Test free text on terminals, in pages and figures, and in scenes imported from robots."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from eomc.toolchain.cache import Built
 
 
 @pytest.fixture(autouse=True)
-def harmless() -> Iterator[None]:
+def no_payload_runs() -> Iterator[None]:
     with nothing_ran():
         yield
 
@@ -57,45 +57,47 @@ def harmless() -> Iterator[None]:
 class Tags(HTMLParser):
     def __init__(self, page: str) -> None:
         super().__init__()
-        self.seen: list[Any] = []
+        self.tags: list[Any] = []
         self.titles: list[str] = []
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.seen.append((tag, attrs))
+        self.tags.append((tag, attrs))
 
     def handle_data(self, data: str) -> None:
-        if self.seen and self.seen[-1][0] in ("title", "h1"):
+        if self.tags and self.tags[-1][0] in ("title", "h1"):
             self.titles.append(data)
 
 
 @pytest.mark.slow
-def test_the_page_of_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "_svg", lambda draw, size: Markup("<svg></svg>"))  # no texts
+def test_report_page_escapes_titles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        page, "_svg", lambda draw, size: Markup("<svg></svg>")
+    )  # figures without text
     measured = cost_of_digits.measure(
         derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8")
     )
-    plain = Tags(page.write_page(replace(measured, title="plain"))).seen
-    for name, given in PAYLOADS.items():
-        text = page.write_page(replace(measured, title=given))
+    plain = Tags(page.write_page(replace(measured, title="plain"))).tags
+    for name, payload in PAYLOADS.items():
+        text = page.write_page(replace(measured, title=payload))
         assert not RAW.search(text), name
-        read = Tags(text)
-        assert read.seen == plain, name
-        assert texts.line(given) in "".join(read.titles), name
+        tags = Tags(text)
+        assert tags.tags == plain, name
+        assert texts.line(payload) in "".join(tags.titles), name
 
 
-def drawn(title: str, unit: str) -> Any:
-    made = with_texts(derived().system, unit)
-    return plot.make_figure(replace(made, title=title), curves())
+def figure_with(title: str, unit: str) -> Any:
+    system = with_texts(derived().system, unit)
+    return plot.make_figure(replace(system, title=title), curves())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", ["latex", "dollar", "dollar behind a backslash", "escape", "NUL"])
-def test_figures(given: str, tmp_path: Path) -> None:
-    text = PAYLOADS[given]
-    drawn(text, text).savefig(tmp_path / "figure.svg")
-    made = with_texts(derived().system, text)
-    plot.write_figure(made, curves(), tmp_path / "drawn.svg", title=text)
+@pytest.mark.parametrize("name", ["latex", "dollar", "dollar behind a backslash", "escape", "NUL"])
+def test_figures_with_hostile_texts_are_valid_svg(name: str, tmp_path: Path) -> None:
+    text = PAYLOADS[name]
+    figure_with(text, text).savefig(tmp_path / "figure.svg")
+    system = with_texts(derived().system, text)
+    plot.write_figure(system, curves(), tmp_path / "drawn.svg", title=text)
     for file in ("figure.svg", "drawn.svg"):
         ElementTree.parse(tmp_path / file)
 
@@ -106,73 +108,73 @@ def curves() -> plot.RunCurves:
     return plot.RunCurves(t, q, q, 5 + 0 * t)
 
 
-def test_no_text_of_a_figure_is_mathematics_or_latex() -> None:
+def test_figure_text_is_not_read_as_mathematics_or_latex() -> None:
     import matplotlib
     from matplotlib.cbook import is_math_text
 
-    every = " ".join(PAYLOADS.values())
+    all_payloads = " ".join(PAYLOADS.values())
     with matplotlib.rc_context({"text.usetex": True}):
-        made = drawn(every, "m")
-    found = [text for text in made.findobj(matplotlib.text.Text) if text.get_text()]
-    assert found and not any(text.get_usetex() for text in found)
-    for given in PAYLOADS.values():
-        shown = texts.figure(given)
+        figure = figure_with(all_payloads, "m")
+    texts_of_figure = [text for text in figure.findobj(matplotlib.text.Text) if text.get_text()]
+    assert texts_of_figure and not any(text.get_usetex() for text in texts_of_figure)
+    for payload in PAYLOADS.values():
+        shown = texts.figure(payload)
         assert not is_math_text(shown) and not RAW.search(shown)
-        assert shown.replace(r"\$", "$") == texts.line(given)  # as matplotlib draws it
-        assert is_math_text(f"$x$ ({shown})")  # and the name before a unit stays mathematics
+        assert shown.replace(r"\$", "$") == texts.line(payload)  # as matplotlib draws the text
+        assert is_math_text(f"$x$ ({shown})")  # the name before a unit is still mathematics
 
 
 # --- the command ----------------------------------------------------------------------------------
 
 
-def said(*words: str, status: int = 0) -> str:
-    """What the command prints, which never steers a terminal."""
-    done = CliRunner().invoke(main, words)
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    assert done.exit_code == status, done.output
-    assert not RAW.search(done.output), done.output
-    return done.output
+def output_of(*words: str, status: int = 0) -> str:
+    """Return the output of the command, which contains no terminal control sequence."""
+    result = CliRunner().invoke(main, words)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert result.exit_code == status, result.output
+    assert not RAW.search(result.output), result.output
+    return result.output
 
 
-def file_name(given: str) -> str:
-    """A payload as the name of a file."""
+def file_name(payload: str) -> str:
+    """Return a payload as a file name."""
     return os.fsdecode(
-        given.replace("/", "∕").replace("\0", "").replace("\ud800", "")
+        payload.replace("/", "∕").replace("\0", "").replace("\ud800", "")
         .encode("utf-8", "surrogateescape")[:150].decode("utf-8", "surrogateescape")
         .encode("utf-8", "surrogateescape") + b"\xff"
     )  # fmt: skip
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
     return tmp_path
 
 
-def test_hostile_file_names(here: Path) -> None:
-    for given in PAYLOADS.values():
-        file = file_name(given) + ".toml"
+def test_hostile_file_names_are_escaped(work_folder: Path) -> None:
+    for payload in PAYLOADS.values():
+        file = file_name(payload) + ".toml"
         Path(file).write_text(filled({}), encoding="utf-8")
-        made = eomc.read(Path(file))
-        assert made.file.isprintable() and not RAW.search(made.file)
+        system = eomc.read(Path(file))
+        assert system.file.isprintable() and not RAW.search(system.file)
         Path(file).write_text(filled({}).replace('"m"', '"mm"'), encoding="utf-8")
-        assert "'mm' is not declared" in said("build", file, status=2)
-        output = said("build", "no " + file, status=2)
+        assert "'mm' is not declared" in output_of("build", file, status=2)
+        output = output_of("build", "no " + file, status=2)
         assert len(output.splitlines()) == 1 and "there is no such file" in output
-        assert "one would replace" in said("build", file, str(here / file), status=2)
-    assert len(said("list", ".").splitlines()) == len(PAYLOADS)
-    assert len(json.loads(said("list", ".", "--json"))) == len(PAYLOADS)
+        assert "one would replace" in output_of("build", file, str(work_folder / file), status=2)
+    assert len(output_of("list", ".").splitlines()) == len(PAYLOADS)
+    assert len(json.loads(output_of("list", ".", "--json"))) == len(PAYLOADS)
 
 
 @pytest.mark.slow
-def test_the_commands_print_no_text_raw(here: Path) -> None:
-    """A scene with all that the reader lets through, under a name that steers terminals."""
-    every = " ".join(PLAIN.values())
+def test_commands_escape_all_texts(work_folder: Path) -> None:
+    """The scene has all texts that the reader accepts, and a file name with control sequences."""
+    all_payloads = " ".join(PLAIN.values())
     file = "f\x1b]0;owned\x07[red]\n'\".toml"
-    Path(file).write_text(filled({k: every for k, _ in fields()}), encoding="utf-8")
-    assert "built in" in said("build", file)
-    out = said(
+    Path(file).write_text(filled({k: all_payloads for k, _ in fields()}), encoding="utf-8")
+    assert "built in" in output_of("build", file)
+    out = output_of(
         "run",
         file,
         "--out",
@@ -184,22 +186,27 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
         "--build",
         "b\x1b[31m",
     )
-    assert out.startswith(every)
-    assert json.loads(said("run", file, "--json"))["scene"] == "fields"
-    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,y,energy"  # names only
+    assert out.startswith(all_payloads)
+    assert json.loads(output_of("run", file, "--json"))["scene"] == "fields"
+    assert (
+        Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,y,energy"
+    )  # the header contains names only
     ElementTree.parse("x.svg")
     page = Path("x.html").read_text(encoding="utf-8")
-    assert str(texts.html(every)) in page and every not in page
+    assert str(texts.html(all_payloads)) in page and all_payloads not in page
     for form in ([], ["--cost"], ["--python"], ["--latex"]):
-        said("show", file, *form)
+        output_of("show", file, *form)
     namespace: dict[str, Any] = {}
-    exec(said("show", file, "--python"), namespace)
-    said("check", file)
-    said("dof", file)
-    assert every in said("list") and json.loads(said("list", ".", "--json"))[0]["title"] == every
+    exec(output_of("show", file, "--python"), namespace)
+    output_of("check", file)
+    output_of("dof", file)
+    assert (
+        all_payloads in output_of("list")
+        and json.loads(output_of("list", ".", "--json"))[0]["title"] == all_payloads
+    )
 
 
-def test_the_command_prints_through_its_border_alone() -> None:
+def test_only_the_terminal_module_prints() -> None:
     for file in Path(terminal.__file__).parent.glob("*.py"):
         source = file.read_text(encoding="utf-8")
         assert source.count("click.echo(") == 2 * (file.name == "terminal.py")
@@ -220,42 +227,44 @@ with terminal.progress_bar({given!r}, False) as progress:
 
 
 @pytest.mark.parametrize("name", ["markup", "escape"])
-def test_what_is_going_on_is_shown_as_it_is(name: str) -> None:
-    """Rich's own markup and controls are its business; those of a file's name are text."""
-    given = PAYLOADS[name][:40]
-    shown = watched("-c", TERMINAL.format(given=given))
-    assert shown.count(texts.line(given).encode()) >= 2
-    assert b"\x1b]0" not in shown and b"\x1b]8" not in shown
+def test_progress_shows_texts_literally(name: str) -> None:
+    """Rich writes its own markup and controls; those in a file name are text."""
+    payload = PAYLOADS[name][:40]
+    terminal_output = terminal_output_of("-c", TERMINAL.format(given=payload))
+    assert terminal_output.count(texts.line(payload).encode()) >= 2
+    assert b"\x1b]0" not in terminal_output and b"\x1b]8" not in terminal_output
 
 
-def test_a_build_says_what_is_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Deriving a robot's equations takes a minute."""
+def test_build_shows_which_scene_is_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deriving the equations of a robot takes a minute."""
     files = [tmp_path / "one.toml", tmp_path / "two.toml"]
     for file in files:
         text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
         file.write_text(text.replace("mass_spring", file.stem), encoding="utf-8")
-    said: list[str] = []
+    messages: list[str] = []
 
-    def built(scene: Path, root: Path, **_: Any) -> Built:
+    def fake_build(scene: Path, root: Path, **_: Any) -> Built:
         return Built(scene.stem, root / scene.stem, False, "")
 
-    monkeypatch.setattr(build.pipeline, "build", built)
-    monkeypatch.setattr(build, "status_line", lambda what, _: said.append(what) or nullcontext())
+    monkeypatch.setattr(build.pipeline, "build", fake_build)
+    monkeypatch.setattr(
+        build, "status_line", lambda what, _: messages.append(what) or nullcontext()
+    )
     for names in (files, files[:1]):
         assert CliRunner().invoke(main, ["build", *map(str, names)]).exit_code == 0
-    assert said == ["building one, 1 of 2", "building two, 2 of 2", "building one"]
+    assert messages == ["building one, 1 of 2", "building two, 2 of 2", "building one"]
 
 
-def watched(*words: str) -> bytes:
-    """What Python shows where a person is watching."""
-    ours, theirs = pty.openpty()
+def terminal_output_of(*words: str) -> bytes:
+    """Return what Python writes to an interactive terminal."""
+    controller, terminal_end = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "200"}
-    process = subprocess.Popen([sys.executable, *words], stderr=theirs, env=environment)
-    os.close(theirs)
+    process = subprocess.Popen([sys.executable, *words], stderr=terminal_end, env=environment)
+    os.close(terminal_end)
     shown = b""
     while True:
         try:
-            shown += os.read(ours, 65536)
+            shown += os.read(controller, 65536)
         except OSError:
             break
     assert process.wait() == 0, shown
@@ -288,24 +297,26 @@ def attribute(text: str) -> str:
 
 
 @pytest.mark.parametrize("kind", tiers([URDF, MJCF], URDF), ids=["urdf", "mjcf"])
-def test_robot_files_with_hostile_names(kind: str, here: Path) -> None:
+def test_robot_files_with_hostile_names_are_imported(kind: str, work_folder: Path) -> None:
     imported = 0
-    for k, (name, given) in enumerate(PAYLOADS.items()):
-        file = file_name(given) + ".xml"
-        if re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]", given):  # which XML can't hold
+    for k, (name, payload) in enumerate(PAYLOADS.items()):
+        file = file_name(payload) + ".xml"
+        if re.search(
+            r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]", payload
+        ):  # which XML cannot represent
             data = kind.format(attribute("\x01"), attribute("b"))
             Path(file).write_text(data, encoding="utf-8")
-            assert "not XML" in said("import", file, status=2), name
+            assert "not XML" in output_of("import", file, status=2), name
             continue
-        data = kind.format(attribute(given), attribute(given + "b"))
+        data = kind.format(attribute(payload), attribute(payload + "b"))
         Path(file).write_text(data, encoding="utf-8")
-        output = said("import", file, "--out", f"s{k}.toml")
+        output = output_of("import", file, "--out", f"s{k}.toml")
         assert "wrote" in output, name
-        read = scene.read(f"s{k}.toml")
-        assert read.title.startswith(texts.line(given)), name
+        imported_scene = scene.read(f"s{k}.toml")
+        assert imported_scene.title.startswith(texts.line(payload)), name
         wrong = data.replace('type="revolute"', 'type="none"').replace('"hinge"', '"none"')
         Path(file).write_text(wrong, encoding="utf-8")
-        said("import", file, status=2)
+        output_of("import", file, status=2)
         imported += 1
     assert imported >= len(PLAIN) + 8
 
@@ -318,15 +329,15 @@ def test_robot_files_with_hostile_names(kind: str, here: Path) -> None:
         "docstring", "spliced by a trigraph",
     ),
 )  # fmt: skip
-def test_imported_robots_run(kind: str, name: str, here: Path) -> None:
-    given = PAYLOADS[name]
-    Path("r.xml").write_text(kind.format(attribute(given), attribute("b")), encoding="utf-8")
-    said("import", "r.xml", "--out", "r.toml")
-    made = eomc.read("r.toml")
-    files = eomc.sources(made).files
+def test_imported_robots_with_hostile_names_run(kind: str, name: str, work_folder: Path) -> None:
+    payload = PAYLOADS[name]
+    Path("r.xml").write_text(kind.format(attribute(payload), attribute("b")), encoding="utf-8")
+    output_of("import", "r.xml", "--out", "r.toml")
+    system = eomc.read("r.toml")
+    files = eomc.sources(system).files
     bare = {name: text for name, text in files.items() if not name.endswith(".py")}
-    assert "constructor" not in tokens(bare, here)
+    assert "constructor" not in tokens(bare, work_folder)
     docstring = ast.get_docstring(ast.parse(files["__init__.py"]))
-    assert docstring is not None and texts.line(given) in docstring
+    assert docstring is not None and texts.line(payload) in docstring
     if name == "spliced by a trigraph":
-        said("run", "r.toml", "--duration", "0.01", "--build", str(here / "built"))
+        output_of("run", "r.toml", "--duration", "0.01", "--build", str(work_folder / "built"))
