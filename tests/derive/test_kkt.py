@@ -1,4 +1,4 @@
-"""Accelerations and multipliers under constraints against a dense solve of the KKT system."""
+"""Compare accelerations and multipliers under constraints with a dense solve of the KKT system."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from eomc.program.interpret import evaluator
 from eomc.program.program import Program, build, matrix
 
 
-def constrained(system: System, **rows: str) -> System:
-    """The system with holonomic rows over its own names."""
-    made = System.make(
+def with_constraints(system: System, **rows: str) -> System:
+    """Return the system with holonomic constraints in its own coordinates."""
+    result = System.make(
         system.name, [c.name for c in system.coordinates], system.kinetic, outputs=rows,
         parameters={p.name: p.value for p in system.parameters},
     )  # fmt: skip
-    return replace(system, constraints=tuple(Constraint(o.name, o.formula) for o in made.outputs))
+    return replace(system, constraints=tuple(Constraint(o.name, o.formula) for o in result.outputs))
 
 
 DOUBLE = System.make(
@@ -40,14 +40,14 @@ STATE = {
 
 
 def values(program: Program, name: str) -> np.ndarray:
-    """The results of a function at the state."""
+    """Return the results of a function at the state."""
     return np.array(evaluator(program[name], exact=True)(STATE)[0])
 
 
 @pytest.mark.parametrize("massless", [False, True])
-def test_accelerations_and_multipliers_solve_the_dense_system(massless: bool) -> None:
-    system = constrained(DOUBLE, **LINKS)
-    if massless:  # x2 is moved by nothing but its row
+def test_accelerations_and_multipliers_solve_the_dense_kkt_system(massless: bool) -> None:
+    system = with_constraints(DOUBLE, **LINKS)
+    if massless:  # only the constraint moves x2
         kinetic = system.kinetic.subs(symbol("x2_dot"), 0)
         system = replace(system, kinetic=kinetic)
     program = build(derive(system))
@@ -57,7 +57,7 @@ def test_accelerations_and_multipliers_solve_the_dense_system(massless: bool) ->
     bias = values(program, "bias")
     np.testing.assert_allclose(D @ a + bias, A.T @ multipliers, atol=1e-13)
     qd = np.array([STATE[f"{c.name}_dot"] for c in system.coordinates])
-    # d(A qd)/dt by differences of the rates along qd
+    # d(A qd)/dt by differences of the constraint velocities along qd
     rates = evaluator(program["constraint_rates"], exact=True)
     by = 1e-6
     moved = [
@@ -68,19 +68,19 @@ def test_accelerations_and_multipliers_solve_the_dense_system(massless: bool) ->
     np.testing.assert_allclose(A @ a, -(moved[1] - moved[0]) / (2 * by), rtol=1e-9)
 
 
-def test_a_row_that_depends_on_others_here_is_dropped_and_told() -> None:
-    twice = constrained(DOUBLE, **LINKS, again="2*x1**2 + 2*y1**2 - 2*l**2")
+def test_locally_redundant_constraint_is_dropped_and_reported() -> None:
+    twice = with_constraints(DOUBLE, **LINKS, again="2*x1**2 + 2*y1**2 - 2*l**2")
     program = build(derive(twice))
     *_, inverses = np.split(values(program, "projection"), [8])
     assert sum(inverses == 0) == 1
-    alone = values(build(derive(constrained(DOUBLE, **LINKS))), "acceleration")
+    alone = values(build(derive(with_constraints(DOUBLE, **LINKS))), "acceleration")
     np.testing.assert_allclose(values(program, "acceleration"), alone, rtol=1e-13)
     first, _, again = values(program, "multipliers")
     assert 0 in (first, again)
 
 
-def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of_D() -> None:
-    program = build(derive(constrained(DOUBLE, **LINKS)))
+def test_projection_is_minimal_in_the_metric_of_the_mass_matrix() -> None:
+    program = build(derive(with_constraints(DOUBLE, **LINKS)))
     off = STATE | {"x1": 0.6003, "y2": -1.2797}
     names = [c.name for c in DOUBLE.coordinates]
     d = np.array(evaluator(program["projection"], exact=True)(off)[0])
@@ -88,7 +88,7 @@ def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of
     phi = np.array(evaluator(program["constraints"], exact=True)(off)[0])
     D = np.array(matrix(program, "D", off))
     np.testing.assert_allclose(A @ d[:4], -phi, atol=1e-15)
-    null = np.linalg.svd(A)[2][2:]  # D dq is of A's rows alone
+    null = np.linalg.svd(A)[2][2:]  # D dq lies in the row space of A
     np.testing.assert_allclose(null @ D @ d[:4], 0, atol=1e-16)
     after = {n: off[n] + x for n, x in zip(names, d[:4], strict=True)}
     after |= {f"{n}_dot": off[f"{n}_dot"] + x for n, x in zip(names, d[4:8], strict=True)}
@@ -97,17 +97,17 @@ def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of
     assert np.abs(left).max() < 1e-3 * np.abs(before).max()
 
 
-def test_a_row_with_a_number_in_it_never_fades() -> None:
+def test_constraint_with_a_constant_gradient_is_never_redundant() -> None:
     x, zero, one = symbol("x1"), sympy.S.Zero, sympy.S.One
     assert _pivot_limit([x, zero], 1e-5) == sympy.Float("1e-05")
     assert _pivot_limit([zero, zero], 1e-5) == sympy.Float("1e-05")
     assert _pivot_limit([x, -one], 1e-5) == _pivot_limit([zero, one], 1e-5) == 0
 
 
-def test_a_pivot_that_varies_is_checked_where_its_entry_of_D_is_a_number() -> None:
+def test_variable_pivot_is_checked_where_its_entry_of_D_is_constant() -> None:
     kinetic = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (x_dot*y_dot + y_dot*z_dot)*cos(x)/2"
-    made = System.make("mixed", ["x", "y", "z"], kinetic, constraints={"row": "x + y*z"})
-    program = build(derive(made))
+    system = System.make("mixed", ["x", "y", "z"], kinetic, constraints={"row": "x + y*z"})
+    program = build(derive(system))
     state = {"x": 0.3, "y": -0.3, "z": 1.0, "x_dot": 0.2, "y_dot": -0.1, "z_dot": 0.4, "t": 0.0}
     a = np.array(evaluator(program["acceleration"], exact=True)(state)[0])
     D = np.array(matrix(program, "D", state))

@@ -1,7 +1,7 @@
-"""The fast derivation, by sweeps and routes, is Euler and Lagrange: against the plain reference.
+"""Compare the fast derivation of Lagrange's equations with the plain reference.
 
-Random small systems with everything that a kinetic energy may contain. The program is evaluated
-in Python, so nothing is compiled here; tests/runtime and `eomc check` hold the C against it.
+Random small systems have every term that a kinetic energy may contain. Python evaluates the
+program, and nothing is compiled here; tests/runtime and `eomc check` compare the C with it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ A, B = symbol("a"), symbol("b")  # parameters
 U = symbol("u")  # an input
 NAMES = ("x", "theta", "phi")
 
-# the program's name of a value, and the reference's
+# the name of a value in the program and in the reference
 VALUES = {**check.VALUES, "signal": "signals"}
 
 
@@ -54,7 +54,7 @@ VALUES = {**check.VALUES, "signal": "signals"}
 
 @st.composite
 def expressions(draw: Any, leaves: list[sympy.Expr], depth: int = 2) -> sympy.Expr:
-    """A smooth, bounded expression without poles over some of the leaves."""
+    """Draw a smooth, bounded expression without poles in some of the leaves."""
     if depth == 0 or draw(st.integers(0, 3)) == 0:
         return draw(st.sampled_from(leaves))
     one, two = (draw(expressions(leaves, depth - 1)) for _ in range(2))
@@ -80,14 +80,14 @@ def expressions(draw: Any, leaves: list[sympy.Expr], depth: int = 2) -> sympy.Ex
 
 @st.composite
 def systems(draw: Any) -> System:
-    """1 to 3 coordinates; K from squares and moving points, and whatever else may be in it."""
+    """Draw 1 to 3 coordinates, and K from squares and moving points with optional further terms."""
     q = [symbol(name) for name in NAMES[: draw(st.integers(1, 3))]]
     qd = [symbol(f"{name}_dot") for name in NAMES[: len(q)]]
     timed, linear, friction, inputs = (draw(st.booleans()) for _ in range(4))
-    still = [*q, A, B] + [t] * timed
-    over = expressions(still)
+    leaves_without_velocities = [*q, A, B] + [t] * timed
+    over = expressions(leaves_without_velocities)
 
-    # so that D > 0 whatever else is in it
+    # so that D > 0 whatever the other terms are
     kinetic = sum((A + k) * v**2 / 2 for k, v in enumerate(qd))
     for _ in range(draw(st.integers(0, 2))):
         combination = sum(draw(over) * v for v in draw(st.lists(st.sampled_from(qd), max_size=2)))
@@ -95,10 +95,10 @@ def systems(draw: Any) -> System:
     definitions: dict[sympy.Symbol, sympy.Expr] = {}
     points = [symbol(f"y{k}") for k in range(draw(st.integers(0, 2)))]
     for point in points:
-        known = [*still, *definitions]
+        known = [*leaves_without_velocities, *definitions]
         definitions[point] = draw(expressions(known)) + draw(st.sampled_from(q))
         kinetic += A * dot(point) ** 2 / 2
-    potential = draw(expressions([*still, *points]))
+    potential = draw(expressions([*leaves_without_velocities, *points]))
     if linear:
         kinetic += draw(over) * draw(st.sampled_from(qd)) + draw(over)
     dissipation = sympy.S.Zero
@@ -120,58 +120,65 @@ def systems(draw: Any) -> System:
     )  # fmt: skip
 
 
-def compiled(made: System) -> Program:
-    return program.build(derive(made))
+def build_program(system: System) -> Program:
+    return program.build(derive(system))
 
 
 states = partial(links.states, seed=5)
 
 
-def plain(reference: SymbolicReference, name: str, state: Mapping[str, float]) -> np.ndarray:
-    """The reference's value of a field, or of the acceleration."""
-    made = reference.system
-    q, qd, u = ([state[x.name] for x in xs] for xs in (made.q, made.qd, made.u))
-    params = {p.name: state[p.name] for p in made.parameters}
+def reference_value(
+    reference: SymbolicReference, name: str, state: Mapping[str, float]
+) -> np.ndarray:
+    """Return the reference's value of a field or of the acceleration."""
+    system = reference.system
+    q, qd, u = ([state[x.name] for x in xs] for xs in (system.q, system.qd, system.u))
+    params = {p.name: state[p.name] for p in system.parameters}
     if name == "acceleration":
         return np.ravel(reference.acceleration(q, qd, state["t"], u, params))
     return np.ravel(reference.evaluate(name, q, qd, state["t"], u, params))
 
 
-def assert_agree(made: System) -> None:
-    """Every value of the program is the reference's, to rounding."""
-    quick, reference = compiled(made), plainly(made)
-    for state in states(made):
-        size = 1 + max(np.max(np.abs(plain(reference, n, state))) for n in ("D", "bias", "tau"))
-        for ours, theirs in [*VALUES.items(), ("acceleration", "acceleration")]:
-            expected = plain(reference, theirs, state)
-            if ours not in quick:  # left out, where it says nothing
-                if ours == "jacobi":
+def assert_agree(system: System) -> None:
+    """Assert that every value of the program equals the reference's, to rounding."""
+    program_functions, reference = build_program(system), plainly(system)
+    for state in states(system):
+        size = 1 + max(
+            np.max(np.abs(reference_value(reference, n, state))) for n in ("D", "bias", "tau")
+        )
+        for name, reference_name in [*VALUES.items(), ("acceleration", "acceleration")]:
+            expected = reference_value(reference, reference_name, state)
+            if name not in program_functions:  # trivial functions are omitted
+                if name == "jacobi":
                     np.testing.assert_allclose(
-                        expected, plain(reference, "energy", state), rtol=1e-11, atol=1e-11 * size
+                        expected,
+                        reference_value(reference, "energy", state),
+                        rtol=1e-11,
+                        atol=1e-11 * size,
                     )
                 else:
-                    assert not np.any(expected), ours
+                    assert not np.any(expected), name
                 continue
-            found, regular = evaluate(quick[ours], state)
+            result, regular = evaluate(program_functions[name], state)
             assert regular
             scale = size * (1 + np.max(np.abs(expected)))
             np.testing.assert_allclose(
-                found, expected, rtol=1e-11, atol=1e-12 * scale, err_msg=ours
+                result, expected, rtol=1e-11, atol=1e-12 * scale, err_msg=name
             )
 
 
 @pytest.mark.slow
 @FEW
 @given(systems())
-def test_a_random_system_is_derived_as_by_the_textbook(made: System) -> None:
-    assert_agree(made)
+def test_random_system_agrees_with_reference(system: System) -> None:
+    assert_agree(system)
 
 
 @pytest.mark.slow
 @MANY
 @given(systems())
-def test_many_random_systems_are_derived_as_by_the_textbook(made: System) -> None:
-    assert_agree(made)
+def test_many_random_systems_agree_with_reference(system: System) -> None:
+    assert_agree(system)
 
 
 @pytest.mark.parametrize("route", ["lagrange", "expanded", "cancelled"])
@@ -182,26 +189,26 @@ def test_many_random_systems_are_derived_as_by_the_textbook(made: System) -> Non
         "foucault_pendulum",
     ),
 )
-def test_every_route_is_the_same_motion(
+def test_every_route_gives_the_same_acceleration(
     name: str, route: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whichever is cheapest is kept, so each is looked at by itself."""
-    right = program.cheapest
+    """Only the cheapest route is used, so each one is tested by itself."""
+    cheapest = program.cheapest
 
-    def this_one(name: str, made: System, routes: Mapping[str, Any]) -> Any:
-        return right(name, made, {route: routes[route]} if route in routes else routes)
+    def only_this_route(name: str, system: System, routes: Mapping[str, Any]) -> Any:
+        return cheapest(name, system, {route: routes[route]} if route in routes else routes)
 
-    monkeypatch.setattr(program, "cheapest", this_one)
-    made = scene_system(name)
-    assert compiled(made)["acceleration"].route == route
-    assert_agree(made)
+    monkeypatch.setattr(program, "cheapest", only_this_route)
+    system = scene_system(name)
+    assert build_program(system)["acceleration"].route == route
+    assert_agree(system)
 
 
-def test_a_wrong_sign_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = Program.__getitem__
+def test_comparison_detects_a_wrong_sign(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Program.__getitem__
 
-    def wrong(self: Program, name: str) -> Any:
-        function = right(self, name)
+    def with_negative_coriolis_matrix(self: Program, name: str) -> Any:
+        function = original(self, name)
         if name != "C":
             return function
         from dataclasses import replace
@@ -211,18 +218,18 @@ def test_a_wrong_sign_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
             outputs=tuple(replace(o, coefficient=-o.coefficient) for o in function.outputs),
         )
 
-    made = scene_system("cartpole")
-    assert_agree(made)
-    monkeypatch.setattr(Program, "__getitem__", wrong)
+    system = scene_system("cartpole")
+    assert_agree(system)
+    monkeypatch.setattr(Program, "__getitem__", with_negative_coriolis_matrix)
     with pytest.raises(AssertionError, match="C"):
-        assert_agree(made)
+        assert_agree(system)
 
 
 # --- what it costs -------------------------------------------------------------------------------
 
 
 def chain(links: int) -> str:
-    """A planar chain with relative angles, its energies over the positions of the masses."""
+    """Write a planar chain in relative angles, with energies from the positions of the masses."""
     angles = [f"q{k}" for k in range(1, links + 1)]
     lines = ["eomc = 1", f'name = "chain_{links}"', "[coordinates]"]
     lines += [f'{q} = {{ unit = "rad", start = 0.1 }}' for q in angles]
@@ -238,60 +245,62 @@ def chain(links: int) -> str:
 
 
 @pytest.mark.slow
-def test_ten_links_are_derived_in_two_seconds_at_1800_flops() -> None:
-    made = from_scene(parse(chain(10), "chain_10.toml"))
+def test_ten_links_are_derived_in_two_seconds_with_1800_flops() -> None:
+    system = from_scene(parse(chain(10), "chain_10.toml"))
 
-    def derived() -> tuple[float, Program]:
-        begun = time.process_time()
-        quick = compiled(made)
-        return time.process_time() - begun, quick
+    def derivation() -> tuple[float, Program]:
+        start = time.process_time()
+        program_functions = build_program(system)
+        return time.process_time() - start, program_functions
 
-    spent, quick = derived()
+    spent, program_functions = derivation()
     if spent >= 2:  # perhaps the machine was busy
-        spent, _ = derived()
-    assert quick["acceleration"].cost.flops <= 1800
-    assert quick["bias"].cost.flops < quick["acceleration"].cost.flops
-    assert spent < 2  # of CPU time; usual was 1.2
+        spent, _ = derivation()
+    assert program_functions["acceleration"].cost.flops <= 1800
+    assert program_functions["bias"].cost.flops < program_functions["acceleration"].cost.flops
+    assert spent < 2  # of CPU time; usual is 1.2
 
 
 @pytest.mark.slow
-def test_three_links_are_right() -> None:
+def test_three_links_agree_with_reference() -> None:
     assert_agree(from_scene(parse(chain(3), "chain_3.toml")))
 
 
-def test_what_is_constant_costs_nothing_at_run_time() -> None:
-    """D = m: its reciprocal is the parameters' work, and C is zero."""
-    quick = compiled(scene_system("mass_spring"))
-    assert quick["acceleration"].cost.divisions == 0
-    assert [a.value.function for a in quick["acceleration"].early if isinstance(a.value, Call)] == [
-        "reciprocal"
-    ]
-    assert quick["D"].cost.flops == 0
-    assert [o.coefficient for o in quick["C"].outputs] == [0]
-    assert "tau" not in quick
-    assert "power" not in quick
-    assert "jacobi" not in quick
-    assert "signal" not in quick
+def test_constant_terms_cost_nothing_at_run_time() -> None:
+    """D = m: its reciprocal is precomputed from parameters, and C is zero."""
+    program_functions = build_program(scene_system("mass_spring"))
+    assert program_functions["acceleration"].cost.divisions == 0
+    assert [
+        a.value.function
+        for a in program_functions["acceleration"].early
+        if isinstance(a.value, Call)
+    ] == ["reciprocal"]
+    assert program_functions["D"].cost.flops == 0
+    assert [o.coefficient for o in program_functions["C"].outputs] == [0]
+    assert "tau" not in program_functions
+    assert "power" not in program_functions
+    assert "jacobi" not in program_functions
+    assert "signal" not in program_functions
 
 
-def test_a_diagonal_mass_matrix_is_not_eliminated() -> None:
-    """Three masses on springs: three divisions, all by the parameters."""
+def test_diagonal_mass_matrix_needs_no_elimination() -> None:
+    """Three masses on springs need three divisions, all by parameters."""
     n = 3
     x, v = ([symbol(f"x{k}{end}") for k in range(n)] for end in ("", "_dot"))
     m = [symbol(f"m{k}") for k in range(n)]
-    made = System.make(
+    system = System.make(
         "masses", x, sum(m * v**2 for m, v in zip(m, v, strict=True)) / 2,
         sum((a - b) ** 2 for a, b in zip(x, [0, *x], strict=False)) / 2,
         parameters=dict.fromkeys(m, 1.0),
     )  # fmt: skip
-    quick = compiled(made)
-    assert quick["acceleration"].cost.divisions == 0
-    assert quick["acceleration"].cost.flops <= 12
-    assert_agree(made)
+    program_functions = build_program(system)
+    assert program_functions["acceleration"].cost.divisions == 0
+    assert program_functions["acceleration"].cost.flops <= 12
+    assert_agree(system)
 
 
 def arrow(n: int) -> System:
-    """n bodies on a cart, each coupled with it alone."""
+    """Return n bodies on a cart, each coupled with the cart only."""
     q = [symbol(f"q{k}") for k in range(n + 1)]
     (_, *angles), (cart, *rates) = q, [symbol(f"q{k}_dot") for k in range(n + 1)]
     pairs = zip(angles, rates, strict=True)
@@ -299,10 +308,10 @@ def arrow(n: int) -> System:
     return System.make("arrow", q, kinetic)
 
 
-def test_zeros_of_the_mass_matrix_are_not_computed() -> None:
-    """D of the arrow is eliminated from its tips without fill: so much more for each body."""
-    found = (program.accelerations(RouteInputs(derive(arrow(n))))[0] for n in (3, 4, 5))
-    flops = [acceleration.cost.flops for acceleration in found]
+def test_elimination_skips_zeros_of_the_mass_matrix() -> None:
+    """The arrow's D is eliminated from its tips without fill: each body adds a constant cost."""
+    functions = (program.accelerations(RouteInputs(derive(arrow(n))))[0] for n in (3, 4, 5))
+    flops = [acceleration.cost.flops for acceleration in functions]
     assert flops[2] - flops[1] == flops[1] - flops[0]
     ldl = derive(arrow(3)).ldl
     assert isinstance(ldl, Solution)
@@ -318,14 +327,14 @@ x, v, y, w = (symbol(name) for name in ("x", "x_dot", "y", "y_dot"))
 @pytest.mark.parametrize(
     "kinetic", [v**4 + v**2, sympy.sqrt(1 + v**2), v**2 * sympy.tanh(v), sympy.exp(v) + v**2, v**3]
 )
-def test_a_kinetic_energy_that_is_not_quadratic_is_refused(kinetic: sympy.Expr) -> None:
+def test_kinetic_energy_not_quadratic_in_velocities_is_refused(kinetic: sympy.Expr) -> None:
     with pytest.raises(EomcError, match="not quadratic in the velocities") as fault:
-        compiled(System.make("odd", [x], kinetic))
+        build_program(System.make("odd", [x], kinetic))
     assert "x_dot" in str(fault.value)
 
 
-def test_a_hidden_quadratic_is_no_fault() -> None:
-    """(v^2)^2/v^2, sin^2 + cos^2: what cancels is seen through."""
+def test_kinetic_energy_that_simplifies_to_a_quadratic_is_accepted() -> None:
+    """Terms that cancel are recognised: (v^2)^2/v^2, sin^2 + cos^2."""
     hidden = (1 + sympy.sin(x) ** 2 + sympy.cos(x) ** 2) * v**2 / 2 + (v + x) ** 2 - 2 * v * x
     assert_agree(System.make("hidden", [x], hidden))
 
@@ -334,21 +343,21 @@ def test_a_hidden_quadratic_is_no_fault() -> None:
     "kinetic",
     [sympy.S.Zero, v**2 / 2, v**2 / 2 + sympy.sin(x) * w, v**2 / 2 + y**2],
 )
-def test_a_coordinate_without_inertia_is_refused(kinetic: sympy.Expr) -> None:
+def test_coordinate_without_inertia_is_refused(kinetic: sympy.Expr) -> None:
     with pytest.raises(EomcError, match="has no inertia") as fault:
-        compiled(System.make("light", [x, y], kinetic, x**2 + y**2))
+        build_program(System.make("light", [x, y], kinetic, x**2 + y**2))
     assert "'y'" in str(fault.value) or kinetic == 0
     assert ("write y_dot**2" in str(fault.value)) == kinetic.has(w)
 
 
-def test_a_derivative_of_a_jump_is_refused() -> None:
+def test_derivative_of_a_discontinuity_is_refused() -> None:
     with pytest.raises((EomcError, SceneError), match="jumps"):
-        compiled(System.make("jump", [x], v**2 / 2, sympy.sign(x) * x**2))
+        build_program(System.make("jump", [x], v**2 / 2, sympy.sign(x) * x**2))
 
 
 @pytest.mark.parametrize("mass", ["m/2 + 1/4", "m/2 + sqrt(2)", "m*sqrt(3) + sqrt(2) + 1/3"])
-def test_irrational_constants_beside_parameters_stay(mass: str) -> None:
-    made = from_scene(
+def test_irrational_factors_of_parameters_are_preserved(mass: str) -> None:
+    system = from_scene(
         parse(
             f"""
             eomc = 1
@@ -365,4 +374,4 @@ def test_irrational_constants_beside_parameters_stay(mass: str) -> None:
             """
         )
     )
-    assert_agree(made)
+    assert_agree(system)

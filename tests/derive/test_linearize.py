@@ -1,4 +1,4 @@
-"""The exact derivatives of the accelerations against differences of the accelerations."""
+"""Compare exact derivatives of the accelerations with differences of the accelerations."""
 
 from __future__ import annotations
 
@@ -18,34 +18,37 @@ from eomc.verify.comparison import Comparison
 
 
 def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None) -> list[Any]:
-    """[A_q, A_qd, B] of one state by the C function."""
+    """Return [A_q, A_qd, B] at one state from the C function."""
     model: Any = m._model
     n, nu = len(m.coordinates), len(m.inputs)
-    made = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
-    held = None if u is None else np.ascontiguousarray(u, m.dtype)
-    given = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
-    found = model.c.lib.linearization(
-        1, *map(model.c.pointer, made), *map(model.c.pointer, given), t, model.c.pointer(held),
-        model.c.pointer(model.info.p0), model.c.tools[2],
+    matrices = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
+    inputs = None if u is None else np.ascontiguousarray(u, m.dtype)
+    state = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
+    result = model.c.lib.linearization(
+        1, *map(model.c.pointer, matrices), *map(model.c.pointer, state), t,
+        model.c.pointer(inputs), model.c.pointer(model.info.p0), model.c.tools[2],
     )  # fmt: skip
-    assert found >> 3 == 1 - (found & 7 != 0)
-    if found & 7:
-        raise ValueError(found & 7)
-    return made
+    assert result >> 3 == 1 - (result & 7 != 0)
+    if result & 7:
+        raise ValueError(result & 7)
+    return matrices
 
 
 def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
-    """The same by central differences of order 8: good to 1e-10 of a column or so."""
+    """Approximate them by central differences of order 8, accurate to 1e-10 of a column."""
     stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
     width = 4e-3
 
     def column(which: int, i: int) -> Any:
-        def at(k: int) -> Any:
+        def shifted_acceleration(k: int) -> Any:
             x = [np.array(q, float), np.array(qd, float), np.array(u, float)]
             x[which][i] += k * width
             return m.acceleration(x[0], x[1], t, x[2] if len(u) else None)
 
-        return sum(w * (at(k) - at(-k)) for k, w in stencil) / width
+        return (
+            sum(w * (shifted_acceleration(k) - shifted_acceleration(-k)) for k, w in stencil)
+            / width
+        )
 
     n = len(q)
     sizes = (n, n, len(u))
@@ -55,7 +58,7 @@ def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
     ]
 
 
-def with_slopes(scene: str) -> ModuleType:
+def with_derivatives(scene: str) -> ModuleType:
     return eomc.load(variant(scene, f"lin_{scene}", linearize='"parameters"'), MODULES)
 
 
@@ -67,8 +70,8 @@ def with_slopes(scene: str) -> ModuleType:
     ),
 )
 @pytest.mark.usefixtures("quickly_compiled")
-def test_against_differences(scene: str) -> None:
-    m = with_slopes(scene)
+def test_linearization_agrees_with_differences(scene: str) -> None:
+    m = with_derivatives(scene)
     rng = np.random.default_rng(3)
     q0, qd0 = m.start
     nu = len(m.inputs)
@@ -76,8 +79,8 @@ def test_against_differences(scene: str) -> None:
         q = q0 + 0.2 * rng.standard_normal(q0.shape)
         qd = qd0 + 0.3 * rng.standard_normal(q0.shape)
         u, t = rng.standard_normal(nu), 0.37
-        exact, near = linearization(m, q, qd, t, u), differences(m, q, qd, t, u)
-        for one, other in zip(exact, near, strict=True):
+        exact, approximation = linearization(m, q, qd, t, u), differences(m, q, qd, t, u)
+        for one, other in zip(exact, approximation, strict=True):
             size = np.max(np.abs(other), initial=1.0)
             assert np.max(np.abs(one - other), initial=0.0) < 1e-7 * size
     if nu:
@@ -89,28 +92,28 @@ def test_against_differences(scene: str) -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_linearize_is_the_slope_of_the_acceleration() -> None:
-    module: Any = with_slopes("cartpole_driven")
+def test_linearize_is_the_derivative_of_the_acceleration() -> None:
+    module: Any = with_derivatives("cartpole_driven")
     q, qd, u, d = np.array([0.3, 1.1]), np.array([-0.4, 0.7]), np.array([2.0]), 1e-6
     A, B = module.linearize(q, qd, u=u)
     assert A.shape == (4, 4) and B.shape == (4, 1)
     x = np.concatenate([q, qd, u])
 
-    def rate(x: Any) -> Any:
+    def acceleration(x: Any) -> Any:
         return module.rhs(0.0, x[:4], x[4:])
 
-    slopes = [(rate(x + e) - rate(x - e)) / (2 * d) for e in d * np.eye(5)]
-    # differences over 2e-6 of values below 100: off by d^2 and by rounding, 1e-16*100/1e-6
+    slopes = [(acceleration(x + e) - acceleration(x - e)) / (2 * d) for e in d * np.eye(5)]
+    # differences over 2e-6 of values below 100: errors of d^2 and of rounding, 1e-16*100/1e-6
     np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="expected"):
         module.linearize(q[None, None], qd[None, None], u=u)
-    for call in (module.linearize, module.sensitivity):  # t, then u, as of all functions
+    for call in (module.linearize, module.sensitivity):  # t, then u, as in all functions
         by_name = call(q, qd, t=0.5, u=u)
         assert all(map(np.array_equal, call(q, qd, 0.5, u), by_name))
 
 
 @pytest.mark.slow
-def test_a_long_chain_goes_column_by_column() -> None:
+def test_long_chain_is_linearized_by_columns() -> None:
     path = variant("chain", "lin_long", method='["rk4", "dp8", "gauss8"]')
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("n = { value = 5,", "n = { value = 9,"), encoding="utf-8")
@@ -118,21 +121,21 @@ def test_a_long_chain_goes_column_by_column() -> None:
     source = (MODULES / "lin_long" / "fast" / "lin_long.c").read_text(encoding="utf-8")
     assert "lin_long_slopes_column" in source
     q, qd = m.start
-    exact, near = linearization(m, q, qd + 0.3), differences(m, q, qd + 0.3, 0.0, [])
-    for one, other in zip(exact, near, strict=True):
+    exact, approximation = linearization(m, q, qd + 0.3), differences(m, q, qd + 0.3, 0.0, [])
+    for one, other in zip(exact, approximation, strict=True):
         assert np.max(np.abs(one - other), initial=0.0) < 1e-7 * np.max(np.abs(other), initial=1.0)
     ends = [m.simulate(h=0.01, duration=0.5, method=name).q[-1] for name in ("dp8", "gauss8")]
     assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
 
 
-def test_nothing_is_emitted_unless_asked_for() -> None:
+def test_linearization_is_emitted_only_on_request() -> None:
     files = eomc.sources(eomc.read(SCENES / "cartpole.toml")).files
     for form in ("", "fast/"):
         assert "slopes" not in files[f"{form}cartpole.c"]
         assert "linearization" not in files[f"{form}cartpole.h"]
 
 
-def test_jumping_forces_are_refused() -> None:
+def test_linearization_of_discontinuous_forces_is_refused() -> None:
     path = variant("mass_spring", "lin_jump", linearize="true")
     text = path.read_text(encoding="utf-8")
     q = next(iter(eomc.read(path).coordinates)).name
@@ -145,19 +148,19 @@ def test_jumping_forces_are_refused() -> None:
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "cartpole_driven", "heavy_top", "chain"), "cartpole_driven")
 )
-def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
-    """Against central differences, whose own error is that of h^2 and of rounding over h."""
-    m = with_slopes(name)
+def test_parameter_derivatives_agree_with_differences(name: str, modules: Modules) -> None:
+    """The central differences have errors of order h^2, and of rounding over h."""
+    m = with_derivatives(name)
     random = np.random.default_rng(3)
     q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
     u = random.standard_normal(len(m.inputs)) if m.inputs else None
     E = m.sensitivity(q, qd, u=u)
     assert E.shape == (len(q), len(m.parameters))
     for k, (p, value) in enumerate(m.defaults.items()):
-        by = 1e-5 * max(1.0, abs(value))
-        up, down = (m.acceleration(q, qd, u=u, params={p: value + s * by}) for s in (1, -1))
+        offset = 1e-5 * max(1.0, abs(value))
+        up, down = (m.acceleration(q, qd, u=u, params={p: value + s * offset}) for s in (1, -1))
         size = max(1.0, np.abs(E).max())
-        np.testing.assert_allclose(E[:, k], (up - down) / (2 * by), rtol=1e-6, atol=1e-7 * size)
+        np.testing.assert_allclose(E[:, k], (up - down) / (2 * offset), rtol=1e-6, atol=1e-7 * size)
     assert np.abs(E).max() > 0
     with pytest.raises(ValueError, match='linearize = "parameters"'):
         modules(name).sensitivity(q, qd, u=u)
@@ -191,7 +194,9 @@ STATES = np.random.default_rng(5).uniform(-1, 1, (2, 6, 2))
 
 @pytest.mark.parametrize("how", [{}, {"outputs": True}, {"closed": True, "outputs": True}])
 @pytest.mark.parametrize("t", [0.4, np.linspace(0, 1, 6)])
-def test_many_states_are_each_of_them(modules: Modules, how: dict[str, bool], t: Any) -> None:
+def test_batch_of_states_agrees_with_single_states(
+    modules: Modules, how: dict[str, bool], t: Any
+) -> None:
     m = modules.unoptimised(LOOP)
     q, qd = STATES
     many = m.linearize(q, qd, t=t, params={"k": 2.0}, **how)
@@ -205,7 +210,7 @@ def test_many_states_are_each_of_them(modules: Modules, how: dict[str, bool], t:
         m.linearize(q, qd, t=np.zeros(3))
 
 
-def test_the_state_that_has_none_is_named(modules: Modules) -> None:
+def test_state_without_linearization_is_named(modules: Modules) -> None:
     polar = 'eomc = 1\nname = "polar"\n[coordinates]\nr = { start = 1 }\nphi = {}\n[energy]\n'
     m = modules.unoptimised(
         polar + 'kinetic = "(r_dot**2 + r**2*phi_dot**2)/2"\n[run]\nlinearize = true\n'
@@ -215,27 +220,31 @@ def test_the_state_that_has_none_is_named(modules: Modules) -> None:
         m.linearize(q, qd)
 
 
-def test_the_closed_loop_is_that_of_the_motion(modules: Modules) -> None:
-    """Accelerations and outputs under the signals by differences: good to 1e-10 or so."""
+def test_closed_loop_linearization_agrees_with_differences(modules: Modules) -> None:
+    """Differences of accelerations and outputs under the signals, accurate to about 1e-10."""
     m = modules.unoptimised(LOOP)
     for q, qd in np.moveaxis(STATES, 1, 0):
         A, B, C, D = m.linearize(q, qd, t=0.4, closed=True, outputs=True)
-        held = m.linearize(q, qd, t=0.4, outputs=True)
-        assert np.array_equal(B, held[1]) and np.array_equal(D, held[3])
-        assert not np.array_equal(A, held[0])
+        with_constant_inputs = m.linearize(q, qd, t=0.4, outputs=True)
+        assert np.array_equal(B, with_constant_inputs[1]) and np.array_equal(
+            D, with_constant_inputs[3]
+        )
+        assert not np.array_equal(A, with_constant_inputs[0])
         x = np.hstack([q, qd])
-        for k, by in enumerate(1e-3 * np.eye(4)):
-            for found, f in ((A[2:, k], m.acceleration), (C[:, k], m.output)):
+        for k, offset in enumerate(1e-3 * np.eye(4)):
+            for result, f in ((A[2:, k], m.acceleration), (C[:, k], m.output)):
 
-                def at(j: int, f: Any = f, by: Any = by, x: Any = x) -> Any:
-                    return f(*np.split(x + j * by, 2), t=0.4)
+                def shifted(j: int, f: Any = f, offset: Any = offset, x: Any = x) -> Any:
+                    return f(*np.split(x + j * offset, 2), t=0.4)
 
                 stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-                near = sum(w * (at(j) - at(-j)) for j, w in stencil) / 1e-3
-                assert found == pytest.approx(near, rel=1e-9, abs=1e-9)
+                approximation = sum(w * (shifted(j) - shifted(-j)) for j, w in stencil) / 1e-3
+                assert result == pytest.approx(approximation, rel=1e-9, abs=1e-9)
 
 
-def test_a_loop_that_is_none_is_refused(modules: Modules, driven: ModuleType) -> None:
+def test_closed_loop_without_smooth_signals_is_refused(
+    modules: Modules, driven: ModuleType
+) -> None:
     m, jumps = modules.unoptimised(LOOP), LOOP.replace('x_dot**2",', 'sign(x_dot)",')
     assert "sign" in jumps
     for module, words in ((m, "give no u"), (modules.unoptimised(jumps), "has no loop to close")):
@@ -244,15 +253,15 @@ def test_a_loop_that_is_none_is_refused(modules: Modules, driven: ModuleType) ->
     modules.unoptimised(jumps).linearize([0, 0], [0, 0])
 
 
-def test_outputs_without_derivatives_are_told(modules: Modules) -> None:
-    """A method that needs those of accelerations has them, which is all that was asked for."""
+def test_linearization_of_outputs_without_derivatives_is_refused(modules: Modules) -> None:
+    """A method that needs derivatives of accelerations has only those."""
     text = LOOP.replace("linearize = true", 'method = "gauss4"')
     with pytest.raises(ValueError, match="without derivatives of its outputs"):
         modules.unoptimised(text).linearize([0, 0], [0, 0], outputs=True)
 
 
-def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
-    class Wrong:
+def test_check_detects_a_wrong_closed_loop(modules: Modules) -> None:
+    class WrongClosedLoop:
         def __getattr__(self, name: str) -> Any:
             return getattr(m, name)
 
@@ -260,9 +269,9 @@ def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
             A, B = m.linearize(*state, closed=closed, **how)
             return A + 1e-8 * closed * np.abs(A).max(), B
 
-    m, made = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
-    for module, passed in ((m, True), (Wrong(), False)):
-        of = Comparison(made, module, np.random.default_rng(0), 4)
+    m, system = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
+    for module, passed in ((m, True), (WrongClosedLoop(), False)):
+        of = Comparison(system, module, np.random.default_rng(0), 4)
         checks_inputs_outputs.report_closed_loop(of)
         assert [(row.name, row.passed) for row in of.results] == [("closed loop", passed)], (
             of.results

@@ -1,4 +1,4 @@
-"""What accelerations by link multipliers cost, and which systems they are not for."""
+"""Test the cost of accelerations by link multipliers, and which systems are unsuitable for them."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ BATCH = "\n[run]\nbatch = true\n"
 @pytest.mark.parametrize(
     "n, equal, unequal", tiers([(5, 82, 104), (10, 177, 224), (20, 367, 464)], 10)
 )
-def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
-    """19 a link, and five more where masses and lengths differ; up to 24 where none is to wait."""
+def test_flops_per_link_of_a_chain(n: int, equal: int, unequal: int) -> None:
+    """19 a link; 24 with unequal masses and lengths, or with short dependency chains."""
     chain = [k - 1 for k in range(n)]
     assert by_multipliers(made_of(links(chain) + BATCH)).cost.flops <= equal
     assert by_multipliers(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
@@ -58,8 +58,8 @@ def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
     assert prompt.divisions <= n // 2
 
 
-def test_a_chain_is_eliminated_from_both_ends() -> None:
-    """So that only half of its divisions wait for one another."""
+def test_chain_is_eliminated_from_both_ends() -> None:
+    """Then only half of its divisions depend on one another."""
     order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
     assert [order.index(k) for k in range(4)] == sorted(order.index(k) for k in range(4))
     assert [order.index(k) for k in (8, 7, 6, 5)] == sorted(order.index(k) for k in (5, 6, 7, 8))
@@ -67,67 +67,72 @@ def test_a_chain_is_eliminated_from_both_ends() -> None:
 
 
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
-def test_the_order_names_the_last_coordinate_of_each_angle(relative: bool) -> None:
-    """That of the link itself, whatever it is measured from."""
+def test_order_gives_the_last_coordinate_of_each_angle(relative: bool) -> None:
+    """It is the link's own coordinate, whatever the angle is measured from."""
     order = link_multipliers.solution(made_of(links(CHAIN, relative=relative))).order
     assert sorted(order) == [0, 1, 2, 3, 4]
 
 
-def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
-    """Their pivots depend on parameters alone; the others then from both ends."""
+def test_alternate_links_are_eliminated_first_for_one_trajectory() -> None:
+    """Their pivots depend on parameters only; the other links follow from both ends."""
     order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]))).order
     assert set(order[:5]) == {0, 2, 4, 6, 8}
     assert set(order[5:7]) == {1, 7}
 
 
-def test_divisions_do_not_wait_for_one_another() -> None:
-    """No reciprocal of what a place decides is made of another."""
+def test_divisions_do_not_depend_on_one_another() -> None:
+    """No reciprocal that depends on the position enters another one."""
     function = by_multipliers(made_of(links([k - 1 for k in range(12)])))
     values = {a.name: a.value for a in function.body}
 
-    def divisions_in_a_row(name: str) -> int:
+    def sequential_divisions(name: str) -> int:
         value = values.get(name)
         if value is None:
             return 0
-        before = max(map(divisions_in_a_row, value.names), default=0)
+        before = max(map(sequential_divisions, value.names), default=0)
         return before + (isinstance(value, Call) and value.function == "reciprocal")
 
-    made = [n for n, v in values.items() if isinstance(v, Call) and v.function == "reciprocal"]
-    assert len(made) >= 5
-    assert max(map(divisions_in_a_row, made)) == 1
+    reciprocals = [
+        n for n, v in values.items() if isinstance(v, Call) and v.function == "reciprocal"
+    ]
+    assert len(reciprocals) >= 5
+    assert max(map(sequential_divisions, reciprocals)) == 1
 
 
 @pytest.mark.parametrize(
     "size, n, longest", tiers([(1e-150, 12, 2), (1e-34, 40, 8), (1e34, 40, 8)], 1e-150)
 )
-def test_masses_of_any_size(
+def test_scaled_masses_give_the_same_accelerations(
     size: float, n: int, longest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Products of pivots stay in the range of a double; only ratios of masses count."""
+    """Products of pivots stay in the range of a double; only mass ratios matter."""
     monkeypatch.setattr(ldl, "MAX_PIVOTS_PER_PRODUCT", longest)
-    made = made_of(links([k - 1 for k in range(n)], equal=False))
-    ours, state = by_multipliers(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
+    system = made_of(links([k - 1 for k in range(n)], equal=False))
+    ours, state = by_multipliers(system), states(system)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
     scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
-    (expected, _), (found, regular) = evaluate(ours, state), evaluate(ours, scaled)
+    (expected, _), (result, regular) = evaluate(ours, state), evaluate(ours, scaled)
     assert regular
-    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    np.testing.assert_allclose(result, expected, rtol=1e-11)
 
 
 @pytest.mark.parametrize("n", tiers([9, 20], 9))
-def test_products_of_pivots_lose_nothing(n: int) -> None:
-    """In 40 digits; 20 links leave five products on one side of the last pivot, four on the other,
-    more than there may be in one."""
+def test_products_of_pivots_are_accurate(n: int) -> None:
+    """Compare in 40 digits.
+
+    20 links leave five products on one side of the last pivot and four on the other, more than one
+    product may contain.
+    """
     chain = links([k - 1 for k in range(n)], equal=False)
-    made = made_of(chain)
-    prompt, plain = by_multipliers(made), by_multipliers(made_of(chain + BATCH))
+    system = made_of(chain)
+    prompt, plain = by_multipliers(system), by_multipliers(made_of(chain + BATCH))
     assert prompt != plain
-    for state in states(made, 2):
-        (found, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
+    for state in states(system, 2):
+        (result, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
         size = np.max(np.abs(expected))
-        np.testing.assert_allclose(found, expected, rtol=4 * EPS, atol=4 * EPS * size)
+        np.testing.assert_allclose(result, expected, rtol=4 * EPS, atol=4 * EPS * size)
 
 
-def test_a_float_has_no_room_for_products_of_pivots() -> None:
+def test_single_precision_has_no_range_for_products_of_pivots() -> None:
     chain = links([k - 1 for k in range(9)])
     plain, many = (by_multipliers(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
         'real = "float"', "batch = true",
@@ -136,9 +141,9 @@ def test_a_float_has_no_room_for_products_of_pivots() -> None:
 
 
 @pytest.mark.parametrize("n", tiers((3, 5, 10), 3))
-def test_it_is_taken_where_it_is_the_cheapest(n: int) -> None:
-    made = made_of(links([k - 1 for k in range(n)]))
-    assert cheapest(made)[0].route == "multipliers"
+def test_route_is_chosen_where_it_is_the_cheapest(n: int) -> None:
+    system = made_of(links([k - 1 for k in range(n)]))
+    assert cheapest(system)[0].route == "multipliers"
 
 
 # --- where it is not ------------------------------------------------------------------------------
@@ -159,18 +164,18 @@ UNSUITED = {
 }
 
 
-@pytest.mark.parametrize("why", UNSUITED)
-def test_what_is_of_another_kind_is_passed_over_with_the_reason(why: str) -> None:
-    with pytest.raises(link_multipliers.UnsuitedError, match=why):
-        link_multipliers.solution(UNSUITED[why])
-    best, passed_over = cheapest(UNSUITED[why])
+@pytest.mark.parametrize("reason", UNSUITED)
+def test_unsuitable_system_is_refused_with_the_reason(reason: str) -> None:
+    with pytest.raises(link_multipliers.UnsuitedError, match=reason):
+        link_multipliers.solution(UNSUITED[reason])
+    best, passed_over = cheapest(UNSUITED[reason])
     assert "multipliers" not in dict(best.routes)
-    assert why in passed_over["multipliers"]
+    assert reason in passed_over["multipliers"]
 
 
-def test_a_negative_mass_is_reported() -> None:
-    """Where it is a number nothing is left of it to look at in a tape; D is indefinite."""
-    made = System.make(
+def test_negative_mass_is_reported() -> None:
+    """A constant mass leaves nothing to examine in a tape; D is indefinite."""
+    system = System.make(
         "negative",
         [a, b],
         sum(dot(e) ** 2 for e in FIRST) - 2 * sum(dot(e) ** 2 for e in hung(FIRST, R, b)),
@@ -178,9 +183,9 @@ def test_a_negative_mass_is_reported() -> None:
         parameters=PARAMETERS,
     )
     with pytest.raises(link_multipliers.UnsuitedError, match="no sum of masses"):
-        link_multipliers.solution(made)
-    acceleration, _ = cheapest(made)
-    for state in states(made):
+        link_multipliers.solution(system)
+    acceleration, _ = cheapest(system)
+    for state in states(system):
         assert not evaluate(acceleration, state)[1]
 
 
@@ -190,43 +195,43 @@ def test_angles_that_do_not_determine_the_coordinates() -> None:
         link_multipliers.solution(moving(points, [a, b, c]))
 
 
-@pytest.mark.parametrize("gone", ["m", "l", "m1", "l1", "m0", "l0"])
-def test_a_mass_or_link_of_nothing_is_singular(gone: str) -> None:
-    """Even where all that is left of it cancels."""
-    ours = by_multipliers(made_of(links([-1, 0, 1], equal=len(gone) == 1)))
-    state = states(made_of(links([-1, 0, 1], equal=len(gone) == 1)))[0]
+@pytest.mark.parametrize("name", ["m", "l", "m1", "l1", "m0", "l0"])
+def test_zero_mass_or_length_is_singular(name: str) -> None:
+    """Even where all terms that contain it cancel."""
+    ours = by_multipliers(made_of(links([-1, 0, 1], equal=len(name) == 1)))
+    state = states(made_of(links([-1, 0, 1], equal=len(name) == 1)))[0]
     assert evaluate(ours, state)[1]
     try:
-        _, regular = evaluate(ours, {**state, gone: 0.0})
-    except ArithmeticError:  # in C it is not finite
+        _, regular = evaluate(ours, {**state, name: 0.0})
+    except ArithmeticError:  # the C result is not finite
         return
     assert not regular
 
 
 @pytest.mark.slow
-def test_singular_and_regular_in_c(modules: Modules) -> None:
-    made = modules.unoptimised(links([-1, 0, 1, 2], more='potential = "0"'))
+def test_singular_and_regular_states_in_c(modules: Modules) -> None:
+    module = modules.unoptimised(links([-1, 0, 1, 2], more='potential = "0"'))
     q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
     state = {f"q{k}": v for k, v in enumerate(q)} | {f"q{k}_dot": v for k, v in enumerate(qd)}
     text = made_of(links([-1, 0, 1, 2], more='potential = "0"'))
     right, _ = independent(
         text, {**{p.name: p.value for p in text.parameters}, **state, "u": 0, "t": 0}
     )
-    np.testing.assert_allclose(made.acceleration(q, qd, t=0.0, u=[0.0]), right, rtol=1e-13)
-    for gone in "ml":
+    np.testing.assert_allclose(module.acceleration(q, qd, t=0.0, u=[0.0]), right, rtol=1e-13)
+    for name in "ml":
         with pytest.raises(ArithmeticError):
-            made.acceleration(q, qd, t=0.0, u=[0.0], params={gone: 0.0})
+            module.acceleration(q, qd, t=0.0, u=[0.0], params={name: 0.0})
 
 
 @pytest.mark.slow
-def test_a_scene_with_a_massless_link_keeps_the_way_by_d() -> None:
-    """D is regular with m0 = 0 where the links are not in line; 1/m0 is nothing to go by."""
+def test_massless_link_uses_the_route_by_the_mass_matrix() -> None:
+    """D is regular with m0 = 0 if the links are not collinear, but 1/m0 does not exist."""
     text = links([-1, 0, 1, 2], equal=False)
     assert cheapest(made_of(text))[0].route == "multipliers"
-    made = made_of(text.replace("m0 = 1.0", "m0 = 0.0"))
-    best, _ = cheapest(made)
+    system = made_of(text.replace("m0 = 1.0", "m0 = 0.0"))
+    best, _ = cheapest(system)
     assert "multipliers" in dict(best.routes)
     assert best.route != "multipliers"
-    values = {**states(made)[0], "m0": 0.0}
-    right, _ = independent(made, values)
+    values = {**states(system)[0], "m0": 0.0}
+    right, _ = independent(system, values)
     np.testing.assert_allclose(evaluate(best, values)[0], right, rtol=1e-12)

@@ -1,7 +1,7 @@
-"""Accelerations by link multipliers: the same as by D, at the promised cost, refused elsewhere.
+"""Test accelerations by link multipliers: values, cost, and systems that are refused.
 
-In 40 digits the route must be Lagrange's to the last bit of a double; in doubles it is held
-against verify/taylor.py, which shares nothing with it. Nothing is compiled but in the last tests.
+In 40 digits the route agrees with Lagrange's equations to the last bit of a double. In doubles it
+is compared with verify/taylor.py, which shares no code with it. Only the last tests compile C.
 """
 
 from __future__ import annotations
@@ -56,27 +56,27 @@ FEW = settings(
 MANY = settings(FEW, max_examples=24)
 
 
-def by_lagrange(made: System) -> Function:
-    _, found, _ = lagrange._by_lagrange(made)
-    assert isinstance(found, Solution)
-    return lower("acceleration", found.tape, found.acceleration, checks=found.pivots)
+def by_lagrange(system: System) -> Function:
+    _, function, _ = lagrange._by_lagrange(system)
+    assert isinstance(function, Solution)
+    return lower("acceleration", function.tape, function.acceleration, checks=function.pivots)
 
 
-def assert_right(made: System) -> Function:
-    """In 40 digits the route is Lagrange's, in doubles as near to jets as D's condition lets be."""
-    ours, theirs = by_multipliers(made), by_lagrange(made)
-    for state in states(made):
+def assert_agrees_with_lagrange(system: System) -> Function:
+    """Assert agreement with Lagrange's equations in 40 digits, and with jets in doubles."""
+    ours, theirs = by_multipliers(system), by_lagrange(system)
+    for state in states(system):
         exact, regular = evaluate(ours, state, exact=True)
         other, _ = evaluate(theirs, state, exact=True)
         assert regular
         size = np.max(np.abs(other))
-        # 40 digits less those that two eliminations lose, rounded to doubles
+        # 40 digits less the digits lost by two eliminations, rounded to doubles
         np.testing.assert_allclose(exact, other, rtol=4 * EPS, atol=4 * EPS * size)
-        right, condition = independent(made, state)
-        found, regular = evaluate(ours, state)
+        right, condition = independent(system, state)
+        result, regular = evaluate(ours, state)
         assert regular
         scale = (1 + np.max(np.abs(right))) * min(40 * condition * EPS, 1e-9)
-        assert np.max(np.abs(np.subtract(found, right))) <= scale
+        assert np.max(np.abs(np.subtract(result, right))) <= scale
     return ours
 
 
@@ -92,7 +92,7 @@ SHAPES = {
 }
 
 
-# of the four ways to write a tree the quick tier takes two
+# the quick tier takes two of the four ways to write a tree
 WAYS = pytest.mark.parametrize(
     "equal, relative",
     [
@@ -106,8 +106,8 @@ WAYS = pytest.mark.parametrize(
 
 @pytest.mark.parametrize("shape", tiers(SHAPES, "pendulum", "fork"))
 @WAYS
-def test_masses_on_links(shape: str, equal: bool, relative: bool) -> None:
-    assert_right(made_of(links(SHAPES[shape], equal, relative)))
+def test_masses_on_links_agree_with_lagrange(shape: str, equal: bool, relative: bool) -> None:
+    assert_agrees_with_lagrange(made_of(links(SHAPES[shape], equal, relative)))
 
 
 EVERYTHING = """potential = "m1*g*y1 + s*(x2 - 0.3)**2/2 + s*(q1 - q0)**2/2 + s*sin(q2)*y0*x1"
@@ -118,46 +118,48 @@ q2 = "sin(2*t) + u*x1" """
 
 
 @WAYS
-def test_springs_dampers_forces_inputs_and_a_driven_pivot(equal: bool, relative: bool) -> None:
+def test_forces_inputs_and_a_driven_pivot_agree_with_lagrange(equal: bool, relative: bool) -> None:
     more = EVERYTHING.replace("m1*", "m*") if equal else EVERYTHING
-    assert_right(made_of(links([-1, 0, 1], equal, relative, pivot="b*sin(3*t)", more=more)))
+    assert_agrees_with_lagrange(
+        made_of(links([-1, 0, 1], equal, relative, pivot="b*sin(3*t)", more=more))
+    )
 
 
 @pytest.mark.parametrize("relative", tiers([False, True], False), ids=["absolute", "relative"])
-def test_positions_may_be_written_out(relative: bool) -> None:
+def test_explicit_positions_are_recognised(relative: bool) -> None:
     costs = {
         by_multipliers(made_of(links(CHAIN, relative=relative, written=written))).cost
         for written in (False, True)
     }
     assert len(costs) == 1
-    assert_right(made_of(links([-1, 0, 0, 2], False, relative, written=True)))
+    assert_agrees_with_lagrange(made_of(links([-1, 0, 0, 2], False, relative, written=True)))
 
 
 @FEW
 @given(st.data())
-def test_any_tree_of_links(data: Any) -> None:
-    look_at_a_tree(data)
+def test_random_tree_of_links_agrees_with_lagrange(data: Any) -> None:
+    check_a_tree(data)
 
 
 @pytest.mark.slow
 @MANY
 @given(st.data())
-def test_many_trees_of_links(data: Any) -> None:
-    look_at_a_tree(data)
+def test_many_random_trees_of_links_agree_with_lagrange(data: Any) -> None:
+    check_a_tree(data)
 
 
-def look_at_a_tree(data: Any) -> None:
+def check_a_tree(data: Any) -> None:
     n = data.draw(st.integers(1, 6))
     parents = [data.draw(st.integers(-1, k - 1)) for k in range(n)]
     equal, relative, written = (data.draw(st.booleans()) for _ in range(3))
-    assert_right(made_of(links(parents, equal, relative, written)))
+    assert_agrees_with_lagrange(made_of(links(parents, equal, relative, written)))
 
 
 # --- what else is of this kind --------------------------------------------------------------------
 
 
-def two(first: tuple[Any, Any], q: list[Any], angle: Any = b, **others: Any) -> System:
-    """A mass, and one that hangs on it."""
+def double_pendulum(first: tuple[Any, Any], q: list[Any], angle: Any = b, **others: Any) -> System:
+    """Return a mass and a second one suspended from it."""
     return moving([first, hung(first, R, angle)], q, **others)
 
 
@@ -173,22 +175,22 @@ KINDS = {
         potential=k * (x**2 + cos(a) + 2 * cos(b) + x * b) / 3,
     ),
     "a wheel beside": moving([(x,), ON_CART], [x, a, b], m * B_DOT**2, potential=k * (x - b) ** 2),
-    "rotors": two(
+    "rotors": double_pendulum(
         hung(O, L, a),
         [a, b, c],
         more=(R * A_DOT**2 + k * C_DOT**2) / 2,
         potential=k * cos(a - c),
     ),
-    "on a parabola": two((a, a**2), [a, b]),
+    "on a parabola": double_pendulum((a, a**2), [a, b]),
     "on an ellipse": moving([(2 * cos(a), sin(a)), (2 * cos(a) + b, sin(a))], [a, b]),
-    "other axes": two((L * cos(a), L * sin(a)), [a, b]),
-    "from an angle": two(hung(O, L, a + k), [a, b], 2 * b),
+    "other axes": double_pendulum((L * cos(a), L * sin(a)), [a, b]),
+    "from an angle": double_pendulum(hung(O, L, a + k), [a, b], 2 * b),
     "in one factor": moving(
         [hung(O, L, a), (L * (sin(a) + sin(b)), -L * (cos(a) + cos(b)))], [a, b]
     ),
     "halfway": moving([hung(O, L / 2, a), hung(hung(O, L, a), R, b)], [a, b]),
-    "growing": two(hung((0, t**2), t, a), [a, b], b - t),
-    "sums and differences": two(
+    "growing": double_pendulum(hung((0, t**2), t, a), [a, b], b - t),
+    "sums and differences": double_pendulum(
         hung(O, L, a - 2 * b), [a, b], a + b / 3, forces={a: A_DOT * k, b: a - 3 * b}
     ),
     "heavier sideways": System.make(
@@ -203,16 +205,16 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_other_systems_of_the_kind(kind: str) -> None:
-    assert_right(KINDS[kind])
+def test_other_suitable_systems_agree_with_lagrange(kind: str) -> None:
+    assert_agrees_with_lagrange(KINDS[kind])
 
 
 @pytest.mark.slow
-def test_bodies_that_are_points_in_relative_angles() -> None:
+def test_point_bodies_in_relative_angles_agree_with_lagrange() -> None:
     """Their world coordinates depend on sums of angles."""
-    made = made_of(trees.chain(4, points=True))
-    assert made.tree is not None
-    assert_right(made)
+    system = made_of(trees.chain(4, points=True))
+    assert system.tree is not None
+    assert_agrees_with_lagrange(system)
     best, _ = cheapest(made_of(trees.chain(10, points=True)))
     assert best.route == "multipliers"
     assert {"articulated", "multipliers"} <= dict(best.routes).keys()

@@ -1,7 +1,7 @@
-"""Trees of bodies by the recursive routes, against the energies differentiated as Taylor series.
+"""Compare recursive routes of trees of bodies with Taylor series of the energies.
 
-verify/taylor.py starts from the energies over world coordinates and shares nothing else with
-newton_euler.py and articulated_body.py. Programs are evaluated in Python: nothing is compiled here.
+verify/taylor.py starts from the energies in world coordinates and shares no other code with
+newton_euler.py and articulated_body.py. Programs are evaluated in Python; nothing is compiled here.
 """
 
 from __future__ import annotations
@@ -37,54 +37,54 @@ from eomc.verify.taylor import TaylorReference
 
 FEW = settings(
     derandomize=True, deadline=None, max_examples=1, database=None,
-    suppress_health_check=list(HealthCheck), phases=(Phase.generate,),  # to shrink takes minutes
+    suppress_health_check=list(HealthCheck), phases=(Phase.generate,),  # shrinking takes minutes
 )  # fmt: skip
 MANY = settings(FEW, max_examples=25)
 
-VALUES = {**check.VALUES, "signal": "signals"}  # the program's names and the answer's
+VALUES = {**check.VALUES, "signal": "signals"}  # names in the program and in the reference
 EPS = 2.0**-52
-WORST = 1e5  # condition of D beyond which a state tells little: rounding alone may be 1e-9
+WORST = 1e5  # condition of D beyond which rounding alone may cause an error of 1e-9
 
 
-def made_of(text: str) -> System:
+def system_from(text: str) -> System:
     return from_scene(parse(text, "tree.toml"))
 
 
-def built(made: System) -> Program:
-    return program.build(lagrange.derive(made))
+def build_program(system: System) -> Program:
+    return program.build(lagrange.derive(system))
 
 
 @cache
-def built_from(text: str) -> Program:
-    return built(made_of(text))
+def program_from(text: str) -> Program:
+    return build_program(system_from(text))
 
 
-def accelerations(made: System) -> Function:
-    """By their cheapest route; nothing else is made."""
-    return program.accelerations(RouteInputs(lagrange.derive(made)))[0]
+def accelerations(system: System) -> Function:
+    """Build only the accelerations, by their cheapest route."""
+    return program.accelerations(RouteInputs(lagrange.derive(system)))[0]
 
 
 @cache
 def acceleration_of(text: str) -> Function:
-    return accelerations(made_of(text))
+    return accelerations(system_from(text))
 
 
 def every_route(
-    made: System, make: Callable[[System], object] = built
+    system: System, build: Callable[[System], object] = build_program
 ) -> dict[tuple[str, str], Function]:
-    """Each function by each of its routes, by (name, route); make: the accelerations, or all."""
-    found: dict[tuple[str, str], Function] = {}
-    right = program.cheapest
+    """Return each function by each of its routes, keyed by (name, route)."""
+    functions: dict[tuple[str, str], Function] = {}
+    cheapest = program.cheapest
 
-    def all_of_them(name: str, of: System, routes: Mapping[str, Any]) -> Function:
-        for route, way in routes.items():
-            found[name, route] = right(name, of, {route: way})
-        return found[name, next(iter(routes))]
+    def build_all_routes(name: str, of_system: System, routes: Mapping[str, Any]) -> Function:
+        for route, inputs in routes.items():
+            functions[name, route] = cheapest(name, of_system, {route: inputs})
+        return functions[name, next(iter(routes))]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(program, "cheapest", all_of_them)
-        make(made)
-    return found
+        patch.setattr(program, "cheapest", build_all_routes)
+        build(system)
+    return functions
 
 
 # --- states and what is asked there ---------------------------------------------------------------
@@ -93,79 +93,82 @@ def every_route(
 states = partial(links.states, count=2, seed=7, reach=1.2)
 
 
-class Asked:
-    """An independent answer at a state."""
+class ReferenceState:
+    """Values of an independent reference at a state."""
 
-    def __init__(self, answer: ReferenceModel, state: Mapping[str, float]) -> None:
-        made = self.made = answer.system
-        self.answer = answer
+    def __init__(self, reference: ReferenceModel, state: Mapping[str, float]) -> None:
+        system = self.system = reference.system
+        self.reference = reference
         self.q, self.qd, self.u = (
-            np.array([state[x.name] for x in xs]) for xs in (made.q, made.qd, made.u)
+            np.array([state[x.name] for x in xs]) for xs in (system.q, system.qd, system.u)
         )
         self.t = state["t"]
-        self.params = {p.name: state[p.name] for p in made.parameters}
+        self.params = {p.name: state[p.name] for p in system.parameters}
 
     def __getitem__(self, name: str) -> np.ndarray:
-        of = self.answer
+        source = self.reference
         if name == "acceleration":
-            return of.acceleration(self.q, self.qd, self.t, self.u, self.params)
-        found = of.evaluate(name, self.q, self.qd, self.t, self.u, self.params)
-        return np.atleast_1d(np.asarray(found))
+            return source.acceleration(self.q, self.qd, self.t, self.u, self.params)
+        result = source.evaluate(name, self.q, self.qd, self.t, self.u, self.params)
+        return np.atleast_1d(np.asarray(result))
 
 
-def value(function: Function, state: Mapping[str, float], made: System) -> np.ndarray:
-    """What a function gives; a matrix that it has by columns, whole."""
+def evaluate_whole(function: Function, state: Mapping[str, float], system: System) -> np.ndarray:
+    """Return the values of a function; a matrix given by columns is assembled."""
     if not function.name.endswith("_column"):
-        found, regular = evaluate(function, state)
+        result, regular = evaluate(function, state)
         assert regular, function.route
-        return np.array(found)
-    names = [c.name for c in made.coordinates]
+        return np.array(result)
+    names = [c.name for c in system.coordinates]
     columns = [
-        evaluate(function, {**state, **{f"{n}{ALONG}": float(n == one) for n in names}})
-        for one in names
+        evaluate(function, {**state, **{f"{n}{ALONG}": float(n == column_name) for n in names}})
+        for column_name in names
     ]
     return np.array([column for column, _ in columns]).T.ravel()
 
 
-def assert_every_route_agrees(made: System, answer: ReferenceModel, some: bool = True) -> None:
-    """All that the answer knows, by every route, within rounding; some: at one state at least.
+def assert_every_route_agrees(system: System, reference: ReferenceModel, some: bool = True) -> None:
+    """Compare all values of the reference with every route, within rounding.
 
-    Energies and forces are sums of some hundred terms that may cancel: 1e-12 of the largest that
-    belongs to the state. What a solution of D x = b may be off grows with D's condition.
+    Energies and forces are sums of some hundred terms that may cancel: 1e-12 of the largest value
+    of the state. The error of a solution of D x = b grows with the condition number of D. With
+    `some`, D must be positive definite at one state at least.
     """
-    routes = every_route(made)
+    routes = every_route(system)
     positive = 0
-    for state in states(made):
-        right = Asked(answer, state)
-        condition = np.linalg.cond(right["D"])
+    for state in states(system):
+        expected = ReferenceState(reference, state)
+        condition = np.linalg.cond(expected["D"])
         if not condition < WORST:
             continue
         positive += 1
-        size = 1 + max(np.max(np.abs(right[n])) for n in ("D", "bias", "tau", "energy"))
+        size = 1 + max(np.max(np.abs(expected[n])) for n in ("D", "bias", "tau", "energy"))
         for (name, route), function in routes.items():
-            theirs = right[VALUES.get(name.removesuffix("_column"), name)].ravel()
-            scale, rounding = size * (1 + np.max(np.abs(theirs))), 1e-13
+            expected_values = expected[VALUES.get(name.removesuffix("_column"), name)].ravel()
+            scale, rounding = size * (1 + np.max(np.abs(expected_values))), 1e-13
             if name == "acceleration":
-                scale, rounding = np.max(np.abs(theirs)) + 1, 40 * EPS * condition
+                scale, rounding = np.max(np.abs(expected_values)) + 1, 40 * EPS * condition
                 assert rounding < 1e-9
-            off = np.max(np.abs(value(function, state, made) - theirs))
-            assert off <= rounding * scale, f"{name} by {route} is off by {off:.1e} of {scale:.1e}"
+            error = np.max(np.abs(evaluate_whole(function, state, system) - expected_values))
+            assert error <= rounding * scale, (
+                f"{name} by {route} is off by {error:.1e} of {scale:.1e}"
+            )
     assert positive or not some
 
 
 # --- every tree of up to three joints -------------------------------------------------------------
 
 
-def look_at(text: str) -> None:
+def check_text(text: str) -> None:
     note(text)
-    made = made_of(text)
-    answer = TaylorReference(made)
+    system = system_from(text)
+    reference = TaylorReference(system)
     try:
-        assert_every_route_agrees(made, answer, some=False)
-    except EomcError as fault:  # rightly so where D is singular everywhere
-        assert "inertia" in str(fault)
-        for state in states(made):
-            assert not np.linalg.cond(Asked(answer, state)["D"]) < 1e12
+        assert_every_route_agrees(system, reference, some=False)
+    except EomcError as error:  # correct if D is singular everywhere
+        assert "inertia" in str(error)
+        for state in states(system):
+            assert not np.linalg.cond(ReferenceState(reference, state)["D"]) < 1e12
 
 
 SPACES = pytest.mark.parametrize("plane", [True, False], ids=["plane", "space"])
@@ -188,8 +191,10 @@ SPACE = ((-1, 0, 1), (-1, 0, 0), (-1, -1, -1))
 )
 @FEW
 @given(data=st.data())
-def test_every_tree_of_up_to_three_joints(shape: tuple[int, ...], plane: bool, data: Any) -> None:
-    look_at(data.draw(trees.trees(shape, plane)))
+def test_trees_of_up_to_three_joints_agree_with_reference(
+    shape: tuple[int, ...], plane: bool, data: Any
+) -> None:
+    check_text(data.draw(trees.trees(shape, plane)))
 
 
 @pytest.mark.slow
@@ -197,17 +202,19 @@ def test_every_tree_of_up_to_three_joints(shape: tuple[int, ...], plane: bool, d
 @SPACES
 @MANY
 @given(data=st.data())
-def test_many_trees_of_up_to_three_joints(shape: tuple[int, ...], plane: bool, data: Any) -> None:
-    look_at(data.draw(trees.trees(shape, plane)))
+def test_many_trees_of_up_to_three_joints_agree_with_reference(
+    shape: tuple[int, ...], plane: bool, data: Any
+) -> None:
+    check_text(data.draw(trees.trees(shape, plane)))
 
 
-def held(joint: str, number: int, **more: Any) -> str:
-    """A body on that joint, on one that turns; all inertias general."""
-    given = {"mass": "m", "center": [0.1, -0.2, "l/3"], "inertia": [0.05, "J", 0.04, 0.004, 0, 0]}
-    first = {"name": "b0", "joint": "revolute", "coordinates": "a", "axis": [1, 2, -2], **given}
+def two_bodies_with(joint: str, number: int, **more: Any) -> str:
+    """Return a body with general inertia on that joint, attached to a body on a revolute joint."""
+    inertia = {"mass": "m", "center": [0.1, -0.2, "l/3"], "inertia": [0.05, "J", 0.04, 0.004, 0, 0]}
+    first = {"name": "b0", "joint": "revolute", "coordinates": "a", "axis": [1, 2, -2], **inertia}
     place = {"parent": "b0", "offset": ["l", 0.1, 0], "rotation": [["y", 0.4], ["x", "alpha"]]}
     names = [f"q{k}" for k in range(number)]
-    last = {"name": "b1", "joint": joint, "coordinates": names, **place, **given, **more}
+    last = {"name": "b1", "joint": joint, "coordinates": names, **place, **inertia, **more}
     return trees.text([first, last], [0, 1, "-g"], trees.PARAMETERS)
 
 
@@ -221,31 +228,33 @@ AXES = {"cylindrical": [2, -1, 2], "universal": [[1, 0, 0], [0.6, 0, 0.8]]}
         "spherical",
     ),
 )
-def test_joints_with_several_coordinates(joint: str, number: int) -> None:
+def test_joints_with_several_coordinates_agree_with_reference(joint: str, number: int) -> None:
     more = {"axis": AXES[joint]} if joint in AXES else {}
-    made = made_of(held(joint, number, damping="c", armature=0.01, **more))
-    assert_every_route_agrees(made, TaylorReference(made))
+    system = system_from(two_bodies_with(joint, number, damping="c", armature=0.01, **more))
+    assert_every_route_agrees(system, TaylorReference(system))
 
 
 @pytest.mark.slow
-def test_lagrange_over_world_coordinates_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """That route is not tried where there are many of them, since it costs more."""
+def test_lagrange_in_world_coordinates_agrees_with_reference(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That route is not tried for many coordinates, since it costs more."""
     monkeypatch.setattr(lagrange, "MAX_LAGRANGE_DEFINITIONS", 1000)
     for joint in ("cylindrical", "universal"):
-        made = made_of(held(joint, 2, axis=AXES[joint], damping="c"))
-        assert lagrange.derive(made).lagrange
-        assert_every_route_agrees(made, TaylorReference(made))
+        system = system_from(two_bodies_with(joint, 2, axis=AXES[joint], damping="c"))
+        assert lagrange.derive(system).lagrange
+        assert_every_route_agrees(system, TaylorReference(system))
 
 
 @pytest.mark.slow
-def test_a_planar_joint_in_a_plane_scene() -> None:
+def test_planar_joint_in_a_planar_scene_agrees_with_reference() -> None:
     names = ["x", "y", "turn"]
     body = {"name": "b", "joint": "planar", "coordinates": names, "mass": "m",
             "center": ["l", 0.1], "inertia": "J", "rotation": 0.3}  # fmt: skip
     arm = {"name": "tail", "parent": "b", "joint": "revolute", "coordinates": "tail",
            "offset": [0.2, "l"], "mass": 0.5, "center": ["l", 0]}  # fmt: skip
-    made = made_of(trees.text([body, arm], [0, "-g"], trees.PARAMETERS))
-    assert_every_route_agrees(made, TaylorReference(made))
+    system = system_from(trees.text([body, arm], [0, "-g"], trees.PARAMETERS))
+    assert_every_route_agrees(system, TaylorReference(system))
 
 
 @pytest.mark.parametrize(
@@ -255,10 +264,10 @@ def test_a_planar_joint_in_a_plane_scene() -> None:
         "-alpha*a + 0.1",
     ),
 )
-def test_joints_that_move_together(wheel: str, slide: str) -> None:
-    made = made_of(trees.geared(wheel, slide))
-    assert [c.name for c in made.coordinates] == ["a", "b"]
-    assert_every_route_agrees(made, TaylorReference(made))
+def test_coupled_joints_agree_with_reference(wheel: str, slide: str) -> None:
+    system = system_from(trees.geared(wheel, slide))
+    assert [c.name for c in system.coordinates] == ["a", "b"]
+    assert_every_route_agrees(system, TaylorReference(system))
 
 
 @pytest.mark.slow
@@ -267,31 +276,31 @@ def test_joints_that_move_together(wheel: str, slide: str) -> None:
     [trees.chain(2), trees.arm(2, numbers=True, straight=True)],
     ids=["chain", "arm"],
 )  # fmt: skip
-def test_the_reference_written_out_says_the_same(text: str) -> None:
-    """Once against expressions in SymPy too, which share nothing with the jets but the system."""
-    made = made_of(text)
-    assert_every_route_agrees(made, symbolic.derive(made))
+def test_symbolic_reference_agrees_with_every_route(text: str) -> None:
+    """SymPy expressions share only the system with the Taylor series."""
+    system = system_from(text)
+    assert_every_route_agrees(system, symbolic.derive(system))
 
 
 @pytest.mark.parametrize(
     "joint, number", [("spherical", 3), pytest.param("free", 6, marks=pytest.mark.slow)]
 )
-def test_where_angles_are_singular_no_acceleration_is_given(joint: str, number: int) -> None:
-    made = made_of(held(joint, number))
+def test_singular_angles_give_no_acceleration(joint: str, number: int) -> None:
+    system = system_from(two_bodies_with(joint, number))
     pitch = f"q{number - 2}"
-    state = states(made, count=1)[0]
-    for (_, route), function in every_route(made, accelerations).items():
-        for off, regular in ((0.0, False), (1e-9, False), (1e-3, True)):
+    state = states(system, count=1)[0]
+    for (_, route), function in every_route(system, accelerations).items():
+        for error, regular in ((0.0, False), (1e-9, False), (1e-3, True)):
             try:
-                _, positive = evaluate(function, {**state, pitch: np.pi / 2 - off})
-            except ArithmeticError:  # a pivot that is zero, or no finite result
+                _, positive = evaluate(function, {**state, pitch: np.pi / 2 - error})
+            except ArithmeticError:  # a zero pivot, or no finite result
                 positive = False
-            assert positive is regular, (route, off)
+            assert positive is regular, (route, error)
 
 
 @pytest.mark.slow
-def test_a_compiled_module_refuses_where_angles_are_singular(modules: Any) -> None:
-    module = modules.unoptimised(held("spherical", 3))
+def test_compiled_module_refuses_singular_angles(modules: Any) -> None:
+    module = modules.unoptimised(two_bodies_with("spherical", 3))
     q = np.array([0.1, 0.2, np.pi / 2, 0.3])
     with pytest.raises(ArithmeticError, match=r"singular|definite"):
         module.acceleration(q, np.ones(4))
@@ -299,28 +308,28 @@ def test_a_compiled_module_refuses_where_angles_are_singular(modules: Any) -> No
     assert np.all(np.isfinite(module.acceleration(q, np.ones(4))))
 
 
-def test_a_joint_that_nothing_resists_is_refused_by_name() -> None:
-    """Two slides along one line, nothing that weighs between them."""
+def test_joint_without_inertia_is_refused_by_name() -> None:
+    """Two slides along one line with no mass between them."""
     bodies: list[dict[str, Any]] = [
         {"name": "b0", "joint": "prismatic", "coordinates": "first", "axis": [1, 0]},
         {"name": "b1", "parent": "b0", "joint": "prismatic", "coordinates": "second",
          "axis": [1, 0], "mass": 1.0},
     ]  # fmt: skip
-    made = made_of(trees.text(bodies, [0, "-g"], trees.PARAMETERS))
+    system = system_from(trees.text(bodies, [0, "-g"], trees.PARAMETERS))
     with pytest.raises(EomcError, match=r"nothing resists first, second .* 'b0' has no inertia"):
-        built(made)
+        build_program(system)
 
 
-@pytest.mark.parametrize("count", [3, 9])  # by Lagrange too, and by Newton and Euler alone
+@pytest.mark.parametrize("count", [3, 9])  # by Lagrange too; by Newton and Euler only
 @pytest.mark.parametrize(
-    ("joint", "axes", "together"),
+    ("joint", "axes", "dependent"),
     [
         ("revolute", [[0, 1, 0], [0, 1, 0]], "a0, a1"),
         ("prismatic", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], "a0, a1, a3"),
     ],
 )
-def test_joints_that_move_nothing_together_are_named(
-    joint: str, axes: list[list[float]], together: str, count: int
+def test_joints_that_together_move_no_mass_are_named(
+    joint: str, axes: list[list[float]], dependent: str, count: int
 ) -> None:
     """Massless bodies between joints, behind a chain of heavy links and at its end."""
     heavy = {"mass": "m", "center": [0.3, 0.1, 0], "inertia": [0.1, 0.2, 0.25]}
@@ -341,57 +350,66 @@ def test_joints_that_move_nothing_together_are_named(
             {"name": f"b{k}", "parent": parent, "joint": joint, "coordinates": f"a{k}",
              "axis": axis} | (heavy if k == len(axes) - 1 else {})
         )  # fmt: skip
-    made = made_of(trees.text(bodies, [0, 0, "-g"], trees.PARAMETERS))
-    with pytest.raises(EomcError, match=f"nothing resists {together} as they move together"):
-        built(made)
+    system = system_from(trees.text(bodies, [0, 0, "-g"], trees.PARAMETERS))
+    with pytest.raises(EomcError, match=f"nothing resists {dependent} as they move together"):
+        build_program(system)
 
 
-def test_a_coordinate_that_no_joint_has_is_refused_at_its_line() -> None:
+def test_coordinate_of_no_joint_is_refused_at_its_line() -> None:
     bodies = [{"name": "b0", "joint": "revolute", "coordinates": "turn", "mass": 1.0, "inertia": 1}]
     text = trees.text(bodies, [0, "-g"], trees.PARAMETERS)
     text = text.replace("[coordinates]\n", "[coordinates]\nidle = {}\n")
-    with pytest.raises(EomcError, match=r"coordinates\.idle: .*name it in a body's joint") as fault:
-        program.inertia(built(made_of(text)))
+    with pytest.raises(EomcError, match=r"coordinates\.idle: .*name it in a body's joint") as error:
+        program.inertia(build_program(system_from(text)))
     line = text.splitlines().index("idle = {}") + 1
-    assert f":{line}:1: error" in str(fault.value)
+    assert f":{line}:1: error" in str(error.value)
 
 
 # --- chains, by their closed form -----------------------------------------------------------------
 
 
-def hanging(n: int, m: float, l: float, g: float, q: np.ndarray, qd: np.ndarray) -> tuple[Any, Any]:  # noqa: E741
-    """D and bias of point masses m on rods l, in relative angles q; gravity along -y.
+def closed_form_of_chain(
+    n: int,
+    m: float,
+    l: float,  # noqa: E741
+    g: float,
+    q: np.ndarray,
+    qd: np.ndarray,
+) -> tuple[Any, Any]:
+    """Return D and the bias of point masses m on rods l, in relative angles q.
 
-    In angles phi to the x axis D_ij = m l^2 w_ij cos(phi_i - phi_j) with w_ij masses from the
-    later of i and j on, and bias_i = m l^2 sum_j w_ij sin(phi_i - phi_j) phi_j'^2
-    + m g l w_ii cos(phi_i); phi = L q with L of ones on and below the diagonal.
+    Gravity acts along -y. In angles phi to the x axis D_ij = m l^2 w_ij cos(phi_i - phi_j), where
+    w_ij counts the masses from the later of i and j on, and bias_i = m l^2 sum_j w_ij sin(phi_i -
+    phi_j) phi_j'^2 + m g l w_ii cos(phi_i); phi = L q, where L has ones on and below the diagonal.
     """
     L = np.tril(np.ones((n, n)))
     phi, rate = L @ q, L @ qd
     w = n - np.maximum.outer(np.arange(n), np.arange(n))
-    apart = np.subtract.outer(phi, phi)
-    D = m * l**2 * w * np.cos(apart)
-    bias = m * l**2 * (w * np.sin(apart)) @ rate**2 + m * g * l * np.diag(w) * np.cos(phi)
+    angle_differences = np.subtract.outer(phi, phi)
+    D = m * l**2 * w * np.cos(angle_differences)
+    bias = m * l**2 * (w * np.sin(angle_differences)) @ rate**2 + m * g * l * np.diag(w) * np.cos(
+        phi
+    )
     return L.T @ D @ L, L.T @ bias
 
 
 @pytest.mark.parametrize("n", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (20, 50))])
-def test_a_chain_is_its_closed_form(n: int) -> None:
+def test_chain_agrees_with_closed_form(n: int) -> None:
     text = trees.chain(n, points=True)
-    made, quick = made_of(text), built_from(text)
-    for state in states(made):
-        q, qd = (np.array([state[x.name] for x in xs]) for xs in (made.q, made.qd))
-        D, bias = hanging(n, state["m"], state["l"], state["g"], q, qd)
-        found = np.array(program.matrix(quick, "D", state))
-        np.testing.assert_allclose(found, D, rtol=0, atol=1e-13 * np.max(D))
+    system, functions = system_from(text), program_from(text)
+    for state in states(system):
+        q, qd = (np.array([state[x.name] for x in xs]) for xs in (system.q, system.qd))
+        D, bias = closed_form_of_chain(n, state["m"], state["l"], state["g"], q, qd)
+        matrix = np.array(program.matrix(functions, "D", state))
+        np.testing.assert_allclose(matrix, D, rtol=0, atol=1e-13 * np.max(D))
         np.testing.assert_allclose(
-            evaluate(quick["bias"], state)[0], bias, rtol=0, atol=1e-12 * np.max(np.abs(bias))
+            evaluate(functions["bias"], state)[0], bias, rtol=0, atol=1e-12 * np.max(np.abs(bias))
         )
         expected = np.linalg.solve(D, -bias)
-        found, regular = evaluate(quick["acceleration"], state)
+        matrix, regular = evaluate(functions["acceleration"], state)
         assert regular
-        off = np.max(np.abs(found - expected)) / np.max(np.abs(expected))
-        assert off <= min(1e-9, 4 * EPS * np.linalg.cond(D))
+        error = np.max(np.abs(matrix - expected)) / np.max(np.abs(expected))
+        assert error <= min(1e-9, 4 * EPS * np.linalg.cond(D))
 
 
 # --- what it costs --------------------------------------------------------------------------------
@@ -402,11 +420,11 @@ def flops(text: str) -> int:
 
 
 @pytest.mark.parametrize("arms", tiers([2, 6], 2))
-def test_what_is_zero_between_branches_is_not_computed(arms: int) -> None:
-    """Side by side the arms of a star cost what they cost alone."""
-    one, many = built_from(trees.star(1, 2)), built_from(trees.star(arms, 2))
+def test_zero_blocks_between_branches_are_not_computed(arms: int) -> None:
+    """The arms of a star cost as much together as they cost one by one."""
+    column_name, many = program_from(trees.star(1, 2)), program_from(trees.star(arms, 2))
     for name in ("acceleration", "D", "bias", "g"):
-        assert abs(many[name].cost.flops - arms * one[name].cost.flops) <= arms, name
+        assert abs(many[name].cost.flops - arms * column_name[name].cost.flops) <= arms, name
     n = 2 * arms
     D = np.array([o.coefficient != 0 for o in many["D"].outputs]).reshape(n, n)
     assert not np.any(D & ~np.kron(np.eye(arms, dtype=bool), np.ones((2, 2), bool)))
@@ -416,13 +434,13 @@ def test_what_is_zero_between_branches_is_not_computed(arms: int) -> None:
     "links, most",
     [(10, 1050), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((20, 2300), (50, 6000)))],
 )
-def test_a_plane_chain_costs_so_much_a_link(links: int, most: int) -> None:
+def test_flops_per_link_of_a_planar_chain(links: int, most: int) -> None:
     assert flops(trees.chain(links)) <= most
 
 
 @pytest.mark.slow
-def test_a_link_more_costs_the_same_wherever_it_hangs() -> None:
-    """The first and the last two are cheaper; between them every link is like the other."""
+def test_every_further_link_costs_the_same() -> None:
+    """The first and the last two links are cheaper; the links between them cost the same."""
     ten, twenty, fifty = (flops(trees.chain(n)) for n in (10, 20, 50))
     assert (fifty - twenty) / 30 == pytest.approx((twenty - ten) / 10, rel=0.02)
     assert fifty / 50 == pytest.approx(twenty / 20, rel=0.06)
@@ -434,8 +452,8 @@ def test_an_arm_of_seven_joints_costs_at_most_1650() -> None:
 
 
 @pytest.mark.slow
-def test_numbers_fold_away() -> None:
-    """Nothing is left to be prepared, and what is zero costs nothing."""
+def test_numeric_parameters_are_folded() -> None:
+    """Nothing remains to be precomputed, and zeros cost nothing."""
     numbers, parameters = (acceleration_of(trees.arm(3, numbers=x)) for x in (True, False))
     assert parameters.early and all("g" in a.value.names for a in numbers.early)
     assert numbers.cost.flops <= 1.01 * parameters.cost.flops
@@ -444,28 +462,28 @@ def test_numbers_fold_away() -> None:
 
 
 @pytest.mark.slow
-def test_grouping_inertias_saves_work_and_changes_no_motion(
+def test_grouped_inertias_save_flops_and_preserve_the_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = made_of(trees.arm(3))
-    grouped = every_route(made, accelerations)
+    system = system_from(trees.arm(3))
+    grouped = every_route(system, accelerations)
     monkeypatch.setattr(
         TreeDynamics, "_grouped", lambda r: [r._link_inertia(link) for link in r.links]
     )
-    plain = every_route(made, accelerations)
+    plain = every_route(system, accelerations)
     for route in ("composite", "articulated"):
-        one, other = (found["acceleration", route] for found in (grouped, plain))
-        assert one.cost.flops < other.cost.flops
-        for state in states(made):
-            (a, _), (b, _) = evaluate(one, state), evaluate(other, state)
+        column_name, other = (functions["acceleration", route] for functions in (grouped, plain))
+        assert column_name.cost.flops < other.cost.flops
+        for state in states(system):
+            (a, _), (b, _) = evaluate(column_name, state), evaluate(other, state)
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.max(np.abs(b)))
 
 
-def test_a_wrong_recursion_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = made_of(trees.arm(2))
-    answer = TaylorReference(made)
-    assert_every_route_agrees(made, answer)
+def test_comparison_detects_a_wrong_recursion(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = system_from(trees.arm(2))
+    reference = TaylorReference(system)
+    assert_every_route_agrees(system, reference)
     right = Vectors.cross
     monkeypatch.setattr(Vectors, "cross", lambda r, a, b: right(r, b, a))
     with pytest.raises(AssertionError, match="is off by"):
-        assert_every_route_agrees(made, answer)
+        assert_every_route_agrees(system, reference)

@@ -1,4 +1,4 @@
-"""Tapes: what is written is a normal form."""
+"""Test that expressions on a tape are stored in a normal form."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 x, a = Symbol("x", real=True), Symbol("a", real=True)
 
 
-def written(tape: Tape, atom: Expr) -> Expr:
-    """What stands for an atom, in leaves."""
+def expand(tape: Tape, atom: Expr) -> Expr:
+    """Expand an atom into an expression in the leaves of the tape."""
     while names := [s for s in atom.free_symbols if s not in tape.leaves]:
         atom = atom.xreplace({s: tape.rhs(s) for s in names})
     return atom
 
 
 @pytest.mark.parametrize(
-    "given, wanted",
+    "expression, expected",
     [
         (sinh(x) / cosh(x), tanh(x)),
         (a * sinh(x) ** 3 / cosh(x) ** 2, a * sinh(x) * tanh(x) ** 2),
@@ -28,31 +28,31 @@ def written(tape: Tape, atom: Expr) -> Expr:
         (sinh(x) / sqrt(cosh(x)), sinh(x) / sqrt(cosh(x))),
     ],
 )
-def test_a_sinh_over_its_cosh_is_a_tanh(given: Expr, wanted: Expr) -> None:
-    """Of large x both overflow."""
+def test_sinh_over_cosh_becomes_tanh(expression: Expr, expected: Expr) -> None:
+    """Both overflow for large x."""
     tape = Tape({x: Stage.POSITION, a: Stage.PARAMETER})
-    assert written(tape, tape.define(given)) == wanted
+    assert expand(tape, tape.define(expression)) == expected
 
 
-def test_the_slope_of_log_cosh_is_a_tanh() -> None:
+def test_derivative_of_log_cosh_is_tanh() -> None:
     tape = Tape({x: Stage.POSITION, a: Stage.PARAMETER})
     (slope,) = tape.gradient([(tape.define(a * log(cosh(x / 2))), x**0)], [x])
-    assert written(tape, slope) == a * tanh(x / 2) / 2
+    assert expand(tape, slope) == a * tanh(x / 2) / 2
 
 
-def test_sums_of_leaves_are_written_out_where_terms_cancel() -> None:
-    """Of q1 + (q2 - q1) far out rounding would be left; b1 + (b2 + b3) is no shorter."""
+def test_sums_of_leaves_are_expanded_where_terms_cancel() -> None:
+    """q1 + (q2 - q1) would leave rounding errors at large q; b1 + (b2 + b3) is no shorter."""
     b1, b2, b3 = (Symbol(f"b{k}", real=True) for k in (1, 2, 3))
     tape = Tape(dict.fromkeys((b1, b2, b3), Stage.POSITION))
-    apart, both = tape.define(b2 - b1), tape.define(b2 + b3)
-    assert tape.total([b1, apart]) == b2
-    assert tape.total([2 * b1, tape.scaled(Integer(2), apart)]) == 2 * b2
-    assert set(tape.rhs(tape.total([b1, both])).args) == {b1, both}
-    assert tape.define(3 + b1 + apart - b2) == 3
+    difference, total = tape.define(b2 - b1), tape.define(b2 + b3)
+    assert tape.total([b1, difference]) == b2
+    assert tape.total([2 * b1, tape.scaled(Integer(2), difference)]) == 2 * b2
+    assert set(tape.rhs(tape.total([b1, total])).args) == {b1, total}
+    assert tape.define(3 + b1 + difference - b2) == 3
 
 
-def test_derivatives_along_names_that_do_not_vary_are_not_needed() -> None:
-    """The slope of max(a, b) jumps, which does not matter where a and b are held constant."""
+def test_derivatives_along_constant_names_are_not_needed() -> None:
+    """The derivative of max(a, b) jumps, which is irrelevant where a and b are constant."""
     a, b, v = symbols("a b v", real=True)
     tape = Tape(dict.fromkeys((a, b), Stage.POSITION) | {v: Stage.VELOCITY})
     slope = tape.forward([tape.define(Max(a, b) * v**2)], {a: S.One})[0]
