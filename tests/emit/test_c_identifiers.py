@@ -1,4 +1,4 @@
-"""Names that a scene may use are renamed where C could not compile them.
+"""Names of a scene that C could not compile are renamed.
 
 They must collide neither with macros of headers nor with other generated names. The macros are
 those of the compiler that runs the tests, for the headers that the generated files, the binding of
@@ -33,17 +33,17 @@ from eomc.toolchain.files import write_files
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"
 OUTSIDE = "#include <math.h>\n#include <stdio.h>\n#include <stddef.h>\n"
-# what a program may include before the header of a model: C's own headers, and serial ports
+# headers that a program may include before the header of a model: C's own headers and serial ports
 HEADERS = """assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal
 stdalign stdarg stdatomic stdbool stddef stdint stdio stdlib stdnoreturn string tgmath time uchar
 wchar wctype termios""".split()
 
 
-def dumped(mode: str, text: str) -> set[str]:
+def list_macros(mode: str, text: str) -> set[str]:
     """Return the macros without arguments that a text defines."""
     command = [needs("cc"), *mode.split(), INCLUDE, "-dM", "-E", "-"]
-    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
-    return set(re.findall(r"^#define (\w+)(?!\S)", done.stdout, re.MULTILINE))
+    process = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    return set(re.findall(r"^#define (\w+)(?!\S)", process.stdout, re.MULTILINE))
 
 
 @cache
@@ -56,31 +56,33 @@ def macros() -> frozenset[str]:
     target.parent.mkdir(parents=True, exist_ok=True)
     ffi.emit_c_code(str(target))
     binding = target.read_text(encoding="utf-8")
-    found = {m for mode in MODES for m in dumped(mode, OUTSIDE)}
-    found |= dumped("-xc -std=c99", "".join(f"#include <{h}.h>\n" for h in HEADERS))
-    return frozenset(found | {m for mode in MODES[:1] for m in dumped(mode, binding)})
+    macros_of_modes = {m for mode in MODES for m in list_macros(mode, OUTSIDE)}
+    macros_of_modes |= list_macros("-xc -std=c99", "".join(f"#include <{h}.h>\n" for h in HEADERS))
+    return frozenset(
+        macros_of_modes | {m for mode in MODES[:1] for m in list_macros(mode, binding)}
+    )
 
 
-def test_the_compiler_lists_its_macros() -> None:
+def test_compiler_lists_its_macros() -> None:
     assert len(macros()) > 1000
     assert {"NAN", "EOF", "errno", "M_PI", "CHAR_BIT", "Py_None", "stdout", "I", "B0"} <= macros()
 
 
-def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
+def test_names_of_scenes_are_not_macros_in_c() -> None:
     accepted = {m for m in macros() if not names.fault(m)}
     assert len(accepted) > 1000
     used = {m: c_names.name_in_c(m, "scene") for m in accepted}
     assert {m for m, c in used.items() if c in macros()} == set()
-    # and what is made of names
-    made = ("sin_{}", "cos_{}", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
-    derived = {m.format(c, c) for m in made for c in used.values()}
+    # and the names derived from them
+    patterns = ("sin_{}", "cos_{}", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
+    derived = {m.format(c, c) for m in patterns for c in used.values()}
     coordinates = [Coordinate(c) for c in used.values()]
     derived |= {x.name for c in coordinates for x in (c.qd, c.qdd)}
     assert derived & macros() == set()
 
 
-def test_no_enumerator_is_a_macro() -> None:
-    """Each macro is cut at each underscore into the names of a scene and of a coordinate."""
+def test_enumerators_are_not_macros() -> None:
+    """Each macro is split at each underscore into the names of a scene and of a coordinate."""
     for macro in sorted(macros()):
         for cut in [m.start() for m in re.finditer("_", macro)]:
             name, coordinate = macro[:cut].lower(), macro[cut + 1 :].lower()
@@ -89,11 +91,11 @@ def test_no_enumerator_is_a_macro() -> None:
             assert c_names.may_be_enumerator_of_others(macro), macro
 
 
-def made(text: str) -> dict[str, str]:
+def program_from(text: str) -> dict[str, str]:
     return dict(eomc.sources(system.from_scene(scene.parse(text, "names.toml"))).files)
 
 
-def whole(name: str, real: str = "double") -> str:
+def scene_with_all_names(name: str, real: str = "double") -> str:
     """Return a scene with everything that adds C names: batches, derivatives, implicit methods."""
     return f"""eomc = 1
 name = "{name}"
@@ -124,24 +126,28 @@ def identifiers(text: str) -> set[str]:
     return set(re.findall(r"[A-Za-z_]\w*", text))
 
 
-def single(name: str) -> str:
+def scene_without_batches(name: str) -> str:
     """Return a scene without batches, with every implicit method."""
     return (
-        whole(name).replace('["rk4", "dp8"]', '["rk4", "gauss8", "gauss16"]')
+        scene_with_all_names(name).replace('["rk4", "dp8"]', '["rk4", "gauss8", "gauss16"]')
         .replace("batch = true\n", "")
     )  # fmt: skip
 
 
-def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
-    """A scene's name with which a generated name would be a macro is refused."""
-    behind = set()
-    for text in (whole("scene"), whole("scene", "float"), single("scene")):
-        for file, content in made(text).items():
+def test_generated_functions_and_macros_are_not_library_names() -> None:
+    """A scene whose name would make a generated name a macro is refused."""
+    suffixes = set()
+    for text in (
+        scene_with_all_names("scene"),
+        scene_with_all_names("scene", "float"),
+        scene_without_batches("scene"),
+    ):
+        for file, content in program_from(text).items():
             if file.endswith((".c", ".h")):
-                behind |= {i[5:] for i in identifiers(content) if i.lower().startswith("scene_")}
+                suffixes |= {i[5:] for i in identifiers(content) if i.lower().startswith("scene_")}
     coordinates = {f"_{c}" for c in ("X", "THETA", "PUSH")}
-    assert {"_params", "_C", "_OK", "_NQ", "_H"} <= behind
-    for end in behind - coordinates:
+    assert {"_params", "_C", "_OK", "_NQ", "_H"} <= suffixes
+    for end in suffixes - coordinates:
         for macro in macros():
             if macro.endswith(end) and macro != end:
                 assert names.module_fault(macro[: -len(end)]), macro
@@ -151,34 +157,34 @@ def write(folder: Path, files: dict[str, str]) -> None:
     write_files(files, folder)
 
 
-def compiled(folder: Path, name: str, *flags: str) -> None:
+def compile_forms(folder: Path, name: str, *flags: str) -> None:
     """Compile both forms; the optimised one also together with Python.h and as C++."""
     folder = folder / "fast"
     plain = [needs("cc"), "-std=c99", *flags, "-fsyntax-only", f"../{name}.c"]
-    done = subprocess.run(plain, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[:3000]
+    process = subprocess.run(plain, cwd=folder, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr[:3000]
     binding = f'#include <Python.h>\n#include "{name}.h"\n'
     (folder / "binding_.c").write_text(binding, encoding="utf-8")
     for mode, file in (("-std=gnu99", f"{name}.c"), ("-std=gnu99", "binding_.c"),
                        ("-xc++", "binding_.c")):  # fmt: skip
-        done = subprocess.run(
+        process = subprocess.run(
             [needs("cc"), *mode.split(), INCLUDE, *flags, "-fsyntax-only", file],
             cwd=folder, capture_output=True, text=True,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr[:3000]
+        assert process.returncode == 0, process.stderr[:3000]
 
 
 ROLES = ("coordinates", "parameters", "inputs", "definitions")
 
 
-def of_names(role: str, given: list[str], run: str) -> str:
+def scene_with_names(role: str, names_of_role: list[str], run: str) -> str:
     """Return a scene whose names all have one role; each is used in an angle and in a product."""
     tables = dict.fromkeys(ROLES, "")
     value = {"parameters": "1.5", "definitions": '"sin(zzz)*zzz"'}.get(role, "{}")
-    tables[role] = "".join(f"{n} = {value}\n" for n in given)
+    tables[role] = "".join(f"{n} = {value}\n" for n in names_of_role)
     tables["coordinates"] += "zzz = {}\n"
-    total = " + ".join(f"({n}*zzz + sin({n})*{n})" for n in given)
-    moved = [*given, "zzz"] if role == "coordinates" else ["zzz"]
+    total = " + ".join(f"({n}*zzz + sin({n})*{n})" for n in names_of_role)
+    moved = [*names_of_role, "zzz"] if role == "coordinates" else ["zzz"]
     kinetic = " + ".join(f"{n}_dot**2*(2 + cos({n}))" for n in moved)
     energy = f'kinetic = "{kinetic}"\npotential = "{"zzz**2" if role == "inputs" else total}"\n'
     forces = f'zzz = "{total}"\n' if role == "inputs" else ""
@@ -187,15 +193,22 @@ def of_names(role: str, given: list[str], run: str) -> str:
 
 
 @cache
-def ours() -> frozenset[str]:
+def generated_identifiers() -> frozenset[str]:
     """Return every identifier of generated text that a scene could use as a name."""
-    found: set[str] = set()
-    for text in (whole("scene"), whole("scene", "float"), single("scene")):
-        for file, content in made(text).items():
+    identifiers_of_files: set[str] = set()
+    for text in (
+        scene_with_all_names("scene"),
+        scene_with_all_names("scene", "float"),
+        scene_without_batches("scene"),
+    ):
+        for file, content in program_from(text).items():
             if file.endswith((".c", ".h")):
-                found |= identifiers(content)
-    gone = {"x", "theta", "zzz", "y", "m", "push"}
-    return frozenset(n for n in found if not names.fault(n) and not n.endswith("_dot")) - gone
+                identifiers_of_files |= identifiers(content)
+    own_names = {"x", "theta", "zzz", "y", "m", "push"}
+    return (
+        frozenset(n for n in identifiers_of_files if not names.fault(n) and not n.endswith("_dot"))
+        - own_names
+    )
 
 
 RUNS = {
@@ -208,15 +221,19 @@ RUNS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("role", ROLES)
-def test_names_of_our_own_do_not_collide(role: str, run: str, tmp_path: Path) -> None:
+def test_generated_names_as_names_of_a_scene_compile(role: str, run: str, tmp_path: Path) -> None:
     """They are coordinates, parameters, inputs and definitions; -Wshadow finds collisions."""
-    every = sorted(ours())
+    every = sorted(generated_identifiers())
     assert len(every) > 100
     step = 6 if role in ("coordinates", "inputs") else 30
     batches = range(0, len(every), step)
-    for first in random.Random(f"{role} {run}").sample(batches, 2):  # all would take an hour
-        write(tmp_path, made(of_names(role, every[first : first + step], RUNS[run])))
-        compiled(tmp_path, "scene", "-Werror=shadow")
+    for first in random.Random(f"{role} {run}").sample(
+        batches, 2
+    ):  # all of them would take an hour
+        write(
+            tmp_path, program_from(scene_with_names(role, every[first : first + step], RUNS[run]))
+        )
+        compile_forms(tmp_path, "scene", "-Werror=shadow")
 
 
 SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO stdin linux".split()
@@ -225,17 +242,17 @@ SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO s
 @pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
-    given = [n for n in SOME if not names.fault(n)]
-    assert len(given) >= 11
-    for names_given, run in ((given[:4], "batch"), (given[4:8], "implicit")):
-        files = made(of_names(role, names_given, RUNS[run]))
+    macro_names = [n for n in SOME if not names.fault(n)]
+    assert len(macro_names) >= 11
+    for macros_of_scene, run in ((macro_names[:4], "batch"), (macro_names[4:8], "implicit")):
+        files = program_from(scene_with_names(role, macros_of_scene, RUNS[run]))
         write(tmp_path, files)
-        compiled(tmp_path, "scene")
+        compile_forms(tmp_path, "scene")
     if role != "definitions":
-        assert f"{given[4]} is {given[4]}_" in files["fast/scene.h"]
+        assert f"{macro_names[4]} is {macro_names[4]}_" in files["fast/scene.h"]
 
 
-def test_a_parameter_named_I_compiles_with_complex_numbers(tmp_path: Path) -> None:
+def test_parameter_named_I_compiles_with_complex_numbers(tmp_path: Path) -> None:
     """`I` is the imaginary unit of <complex.h>, which <tgmath.h> includes."""
     text = """eomc = 1
 name = "scene"
@@ -246,7 +263,7 @@ I = 2.0
 [energy]
 kinetic = "I*theta_dot**2/2"
 """
-    write(tmp_path, made(text))
+    write(tmp_path, program_from(text))
     program = (
         "#include <tgmath.h>\n#include <scene.h>\nint main(void) { return scene_defaults.I_ != 2; }"
     )
@@ -275,17 +292,19 @@ inverse_dynamics = true
 
 
 def test_temporaries_get_names_that_are_valid_in_c() -> None:
-    made = program.build(lagrange.derive(scene_system("cartpole")))
-    for name, function in made.functions.items():
+    functions_of_scene = program.build(lagrange.derive(scene_system("cartpole")))
+    for name, function in functions_of_scene.functions.items():
         if not function.body:
             continue
         first = replace(function.body[0], name="NAN")
         odd = replace(function, body=(first, *function.body[1:]))
-        found, _ = c_names.rename_for_c(replace(made, functions={**made.functions, name: odd}))
-        assert found.functions[name].body[0].name == "NAN_", name
+        renamed, _ = c_names.rename_for_c(
+            replace(functions_of_scene, functions={**functions_of_scene.functions, name: odd})
+        )
+        assert renamed.functions[name].body[0].name == "NAN_", name
 
 
-def test_coordinates_may_be_called_as_the_arguments_of_constraints_are(tmp_path: Path) -> None:
+def test_coordinates_with_names_of_constraint_arguments_compile(tmp_path: Path) -> None:
     """`A` is the name of the Jacobian."""
     text = """eomc = 1
 name = "scene"
@@ -299,8 +318,8 @@ kinetic = "A_dot**2 + phi_dot**2 + lack_dot**2"
 rod = "A**2 + phi**2 + lack*A - 1"
 turn = "A*phi_dot - lack_dot"
 """
-    write(tmp_path, made(text))
-    compiled(tmp_path, "scene", "-Werror=shadow")
+    write(tmp_path, program_from(text))
+    compile_forms(tmp_path, "scene", "-Werror=shadow")
 
 
 MECHANISM = """eomc = 1
@@ -348,20 +367,20 @@ def code_of(text: str) -> dict[str, str]:
 
     Enumerators of events and constraints keep the full names of joints; here they are shortened.
     """
-    files = {f: c for f, c in made(text).items() if f.endswith((".c", ".h"))}
+    files = {f: c for f, c in program_from(text).items() if f.endswith((".c", ".h"))}
     ignored = r"/\*.*?\*/|\"[^\"\n]*\"|0x[0-9a-f]{8}u|\s+|(?<=EVENT_|RAINT_)(LEFT_ARM|ROBOT)_"
     return {f: re.sub(ignored, "", c, flags=re.DOTALL) for f, c in files.items()}
 
 
 @pytest.mark.parametrize("prefix", ["robot_", "left_arm_"])
-def test_a_prefix_that_all_coordinates_of_a_mechanism_share_is_left_out_in_c(prefix: str) -> None:
+def test_common_prefix_of_coordinates_is_removed_in_c(prefix: str) -> None:
     text = MECHANISM.replace("PREFIX_", prefix)
     assert code_of(text) == code_of(MECHANISM.replace("PREFIX_", ""))
-    header = made(text)["robot.h"]
+    header = program_from(text)["robot.h"]
     assert f"ROBOT_LIFT, /* {prefix}lift, rad, of the arm */" in header
     assert f"ROBOT_LIFT_TORQUE, /* {prefix}lift_torque */" in header
     assert f"double mass; /* {prefix}mass */" in header
-    assert f"{prefix}lift" in made(text)["__init__.py"]
+    assert f"{prefix}lift" in program_from(text)["__init__.py"]
 
 
 @pytest.mark.parametrize(
@@ -373,19 +392,22 @@ def test_a_prefix_that_all_coordinates_of_a_mechanism_share_is_left_out_in_c(pre
         ("above", "lift"),  # the name is in use
     ],
 )
-def test_a_prefix_stays_where_names_without_it_would_not_serve(old: str, new: str) -> None:
+def test_prefix_is_preserved_where_names_without_it_are_invalid(old: str, new: str) -> None:
     text = MECHANISM.replace(old, new).replace("PREFIX_", "arm_")
-    assert "ROBOT_ARM_LIFT," in made(text)["robot.h"]
+    assert "ROBOT_ARM_LIFT," in program_from(text)["robot.h"]
 
 
-def test_no_identifier_has_two_underscores_in_a_row() -> None:
-    """Such names are reserved in C++. Names of compilers, which begin with two, are left out."""
+def test_identifiers_have_no_consecutive_underscores() -> None:
+    """C++ reserves such names.
+
+    Names of compilers, which begin with two underscores, are excluded.
+    """
     names_of_macros = "small NAN I".split()
     texts = (MECHANISM.replace("PREFIX_", "robot_"),
-             of_names("coordinates", names_of_macros, RUNS["batch"]),
-             of_names("inputs", names_of_macros, RUNS["implicit"]))  # fmt: skip
+             scene_with_names("coordinates", names_of_macros, RUNS["batch"]),
+             scene_with_names("inputs", names_of_macros, RUNS["implicit"]))  # fmt: skip
     for text in texts:
-        for file, content in made(text).items():
+        for file, content in program_from(text).items():
             if file.endswith((".c", ".h")):
-                found = {i for i in identifiers(content) if "__" in i.lstrip("_")}
-                assert {i for i in found if not i.startswith("__")} == set(), file
+                reserved = {i for i in identifiers(content) if "__" in i.lstrip("_")}
+                assert {i for i in reserved if not i.startswith("__")} == set(), file

@@ -1,4 +1,4 @@
-"""Names of scenes do not collide with those of temporaries, such as w1."""
+"""Names of scenes do not collide with names of temporaries, such as w1."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 @pytest.mark.parametrize(
     "text", tiers([UNUSED, COORDINATES], COORDINATES), ids=["unused", "coordinates"]
 )
-def test_names_that_temporaries_have_too(
+def test_names_of_scenes_do_not_collide_with_temporaries(
     text: str, run: str, modules: Modules, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter that a function did not read once shared its name with a temporary.
@@ -62,6 +62,6 @@ def test_names_that_temporaries_have_too(
     The temporary then got the value of the parameter.
     """
     monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
-    made = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
-    report = check(made, modules.unoptimised(made), states=4)
+    system = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
+    report = check(system, modules.unoptimised(system), states=4)
     assert report.passed, report.table()

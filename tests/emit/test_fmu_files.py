@@ -1,4 +1,4 @@
-"""FMUs as text: units of measurement, dependencies, C and determinism. No importer is needed."""
+"""Test the text of FMUs without an importer: units of measurement, dependencies, C, determinism."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ potential = "MAX_FORCE*cos(theta) + energy*near**2 + t_1*near"
 """
 
 
-def made(text: str, version: int) -> Unit:
+def unit_from(text: str, version: int) -> Unit:
     return render.unit(derived_of(text), version)
 
 
-def made_anew(text: str, version: int) -> Unit:
+def derive_unit_again(text: str, version: int) -> Unit:
     return pipeline.unit(from_scene(parse(text, "test.toml")), version)
 
 
-def described(unit: Unit) -> ET.Element:
+def description_of(unit: Unit) -> ET.Element:
     return ET.fromstring(unit.files["modelDescription.xml"])
 
 
@@ -76,7 +76,7 @@ def described(unit: Unit) -> ET.Element:
         ("1", {}),
     ],
 )
-def test_units_mean_what_they_say(text: str, attributes: dict[str, str]) -> None:
+def test_units_of_measurement_have_si_exponents(text: str, attributes: dict[str, str]) -> None:
     meaning = variables.parse_unit(text)
     assert meaning is not None and dict(meaning.attributes) == attributes
 
@@ -86,54 +86,54 @@ def test_units_mean_what_they_say(text: str, attributes: dict[str, str]) -> None
     ["", " ", "furlong", "m/", "/m", "(m", "m)", "m^", "m^x", "m^99", "2 m", "m**2**2", "<b>", "°C",
      "m" + "/s" * 30, "((((", "^", "kkg", "k", "m^1.5"],
 )  # fmt: skip
-def test_other_texts_mean_nothing(text: str) -> None:
+def test_unknown_units_have_no_si_exponents(text: str) -> None:
     assert variables.parse_unit(text) is None
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_same_scene_same_text(version: int) -> None:
-    first, second = made(BALL, version), made_anew(BALL, version)
+def test_same_scene_gives_the_same_text(version: int) -> None:
+    first, second = unit_from(BALL, version), derive_unit_again(BALL, version)
     assert first == second
-    other = made_anew(BALL.replace("g = { value = 9.81", "g = { value = 9.82"), version)
+    other = derive_unit_again(BALL.replace("g = { value = 9.81", "g = { value = 9.82"), version)
     key = {2: "guid", 3: "instantiationToken"}[version]
-    assert described(first).get(key) != described(other).get(key)
-    assert f'"{described(first).get(key)}"' in first.files["sources/fmi/scene.h"]
+    assert description_of(first).get(key) != description_of(other).get(key)
+    assert f'"{description_of(first).get(key)}"' in first.files["sources/fmi/scene.h"]
 
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_texts_are_escaped_and_names_are_those_of_the_scene(version: int) -> None:
-    unit = made(ODD, version)
-    root = described(unit)
+    unit = unit_from(ODD, version)
+    root = description_of(unit)
     assert root.get("description") == "Quotes \" ' and ]]> & <b> --> here"
-    found = {v.get("name"): v for v in root.iter() if v.get("valueReference") and v.get("name")}
-    assert found["theta"].get("description") == "ends a comment: */ --> ' & é"
-    assert {"near", "near_dot", "der(near)", "MAX_FORCE", "energy", "energy.total"} <= {*found}
-    # that unit means nothing to FMI, and so it is left out
-    whole = unit.files["modelDescription.xml"]
-    assert "more" not in whole and 'name="kg m^2/s^2"' in whole
+    result = {v.get("name"): v for v in root.iter() if v.get("valueReference") and v.get("name")}
+    assert result["theta"].get("description") == "ends a comment: */ --> ' & é"
+    assert {"near", "near_dot", "der(near)", "MAX_FORCE", "energy", "energy.total"} <= {*result}
+    # FMI does not define that unit, so it is omitted
+    model = unit.files["modelDescription.xml"]
+    assert "more" not in model and 'name="kg m^2/s^2"' in model
 
 
 def test_dependencies_are_those_of_the_equations() -> None:
-    root = described(made(BALL, 3))
+    root = description_of(unit_from(BALL, 3))
     name = {v.get("valueReference"): v.get("name") for v in root.find("ModelVariables") or ()}
     structure = root.find("ModelStructure")
     assert structure is not None
-    found = {
+    result = {
         (e.tag, name[e.get("valueReference")]): {
             name[r] for r in str(e.get("dependencies")).split()
         }
         for e in structure
     }
-    assert found["Output", "height"] == {"x", "y"}
+    assert result["Output", "height"] == {"x", "y"}
     # the wind may follow its signal, which reads the time
-    assert found["Output", "ax"] == {"x_dot", "wind", "t"}
-    assert found["ContinuousStateDerivative", "der(y)"] == {"y_dot"}
-    assert found["ContinuousStateDerivative", "der(y_dot)"] == set()
-    assert found["InitialUnknown", "der(y_dot)"] == {"g"}
-    assert found["InitialUnknown", "ax"] == {
+    assert result["Output", "ax"] == {"x_dot", "wind", "t"}
+    assert result["ContinuousStateDerivative", "der(y)"] == {"y_dot"}
+    assert result["ContinuousStateDerivative", "der(y_dot)"] == set()
+    assert result["InitialUnknown", "der(y_dot)"] == {"g"}
+    assert result["InitialUnknown", "ax"] == {
         "x_dot", "wind", "t", "m", "inputs.follow_signals"
     }  # fmt: skip
-    assert found["EventIndicator", "indicator.wall"] == {"x", "wind", "t"}
+    assert result["EventIndicator", "indicator.wall"] == {"x", "wind", "t"}
 
 
 @pytest.mark.parametrize(
@@ -143,9 +143,9 @@ def test_dependencies_are_those_of_the_equations() -> None:
 def test_c_files_are_strict_and_have_no_static_variables(
     version: int, text: str, tmp_path: Path
 ) -> None:
-    unit = made(text, version)
+    unit = unit_from(text, version)
     write_files(unit.files, tmp_path)
-    # the standard's own headers declare functions without prototypes
+    # the headers of the standard declare functions without prototypes
     flags = """-std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Wshadow -Werror
     -O2 -fno-pic""".split()
     compiled(
@@ -159,8 +159,8 @@ def test_c_files_are_strict_and_have_no_static_variables(
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_units_that_are_linked_statically_have_a_prefix(version: int, tmp_path: Path) -> None:
-    unit = made(BALL, version)
+def test_statically_linked_units_have_a_prefix(version: int, tmp_path: Path) -> None:
+    unit = unit_from(BALL, version)
     write_files(unit.files, tmp_path)
     command = [needs("gcc"), f"-DFMI{version}_FUNCTION_PREFIX=ball_", "-c", f"fmi/fmi{version}.c",
                "-o", "unit.o"]  # fmt: skip
@@ -173,14 +173,14 @@ def test_the_licence_of_the_standard_is_included() -> None:
     text = resources.text("csrc", "fmi/LICENSE.txt")
     assert "2-Clause BSD" in text and "Modelica Association" in text
     for version in (2, 3):
-        assert made(FLOAT, version).files["documentation/licenses/fmi-headers.txt"] == text
+        assert unit_from(FLOAT, version).files["documentation/licenses/fmi-headers.txt"] == text
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_numeric_limits_are_min_and_max_and_starts_of_parameters_depend_on_them(
+def test_numeric_limits_become_min_and_max(
     version: int,
 ) -> None:
-    root = described(made(RIG, version))
+    root = description_of(unit_from(RIG, version))
     variables = {v.get("name"): v for v in root.find("ModelVariables") or ()}
 
     def attributes(name: str) -> dict[str, str]:
@@ -188,7 +188,7 @@ def test_numeric_limits_are_min_and_max_and_starts_of_parameters_depend_on_them(
         return {**v.attrib, **{k: x for inner in v for k, x in inner.attrib.items()}}
 
     force, pull, push = (attributes(name) for name in ("force", "pull", "push"))
-    # the signal starts at 8 N; what acts is the limit
+    # the signal starts at 8 N; the applied value is the limit
     assert [float(force[key]) for key in ("min", "max", "start")] == [-1.0, 1.5, 1.5]
     assert not {"min", "max"} & {*pull} and "max" not in push and float(push["min"]) == 0
     assert attributes("x")["initial"] == attributes("x_dot")["initial"] == "approx"
@@ -203,24 +203,24 @@ def test_numeric_limits_are_min_and_max_and_starts_of_parameters_depend_on_them(
     assert initial["x"] == {"x0", "w"} and initial["x_dot"] == {"w"}
 
 
-def test_constraints_are_for_co_simulation_alone() -> None:
+def test_constraints_are_exported_for_co_simulation_only() -> None:
     """An importer that integrates the model itself would drift off the constraints."""
     text = FLOAT.replace("[run]", '[constraints]\ndrive = "phi - phi**2/4 - t"\n[run]')
     text = text.replace("start = 0.5", "start = 0.5, guess = true")
     for version in (2, 3):
-        described = made(text, version).files["modelDescription.xml"]
-        assert "<ModelExchange" not in described and "<CoSimulation" in described
+        description_of = unit_from(text, version).files["modelDescription.xml"]
+        assert "<ModelExchange" not in description_of and "<CoSimulation" in description_of
 
 
-def test_other_versions_are_refused() -> None:
+def test_unknown_fmi_versions_are_refused() -> None:
     with pytest.raises(Exception, match=r"fmi: .* version of FMI, 2 or 3, here 1"):
-        made_anew(BALL, 1)
+        derive_unit_again(BALL, 1)
 
 
-def filled(text: str, version: int) -> Unit:
+def unit_with_text(text: str, version: int) -> Unit:
     """Return an FMU whose scene has a text wherever a text is allowed."""
-    whole = derived()
-    return render.unit(replace(whole, system=with_texts(whole.system, text)), version)
+    model = derived()
+    return render.unit(replace(model, system=with_texts(model.system, text)), version)
 
 
 def without_digests(unit: Unit) -> dict[str, str]:
@@ -233,30 +233,32 @@ def without_digests(unit: Unit) -> dict[str, str]:
 
 
 @cache
-def plain(version: int) -> dict[str, str]:
-    return without_digests(filled("plain", version))
+def unit_with_plain_text(version: int) -> dict[str, str]:
+    return without_digests(unit_with_text("plain", version))
 
 
 @cache
 def plain_tokens(version: int, names: tuple[str, ...], folder: Path) -> str:
-    return tokens({name: plain(version)[name] for name in names}, folder)
+    return tokens({name: unit_with_plain_text(version)[name] for name in names}, folder)
 
 
-@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
+@pytest.mark.parametrize("payload", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
 @pytest.mark.parametrize("version", [2, 3])
-def test_free_texts_stay_texts(
-    given: str, version: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+def test_free_texts_do_not_change_c_files(
+    payload: str, version: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """Descriptions are read back unchanged, whatever they contain, and no C file contains them."""
-    unit = filled(given, version)
+    unit = unit_with_text(payload, version)
     for name, text in unit.files.items():
         assert not RAW.search(text.replace("\t", "")), name
-    root = described(unit)
+    root = description_of(unit)
     words = {e.get("description") for e in root.iter() if e.get("description")}
-    assert {texts.line(given), root.get("description")} <= {*words, *map(texts.line, words)}
-    found = without_digests(unit)
-    assert found.keys() == plain(version).keys()
-    changed = {name: text for name, text in found.items() if text != plain(version)[name]}
+    assert {texts.line(payload), root.get("description")} <= {*words, *map(texts.line, words)}
+    result = without_digests(unit)
+    assert result.keys() == unit_with_plain_text(version).keys()
+    changed = {
+        name: text for name, text in result.items() if text != unit_with_plain_text(version)[name]
+    }
     assert {"fmi/scene.h", "fields.h", "fields.c"} <= changed.keys()
     folder = tmp_path_factory.getbasetemp() / f"plain{version}"
     folder.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Rotated sines, compensated sums, and runs in several calls."""
+"""Test rotated sines, compensated sums, and runs in several calls."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 
 
-def odd() -> program.Program:
+def scene_with_odd_angles() -> program.Program:
     return program.build(lagrange.derive(odd_system()))
 
 
-def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def textbook_state(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the state after one textbook step of RK4 with the accelerations of the module."""
     q, v = module.start
     a = module.acceleration
@@ -40,24 +40,24 @@ def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.nd
     return q, v
 
 
-def test_angles_that_are_linear_in_coordinates_are_found() -> None:
-    made = odd()
-    angles, rest = separate_angles(made["acceleration"], ["a", "b"])
-    found = {(frozenset(angle.terms), angle.offset) for angle in angles}
+def test_angles_linear_in_coordinates_are_detected() -> None:
+    system = scene_with_odd_angles()
+    angles, rest = separate_angles(system["acceleration"], ["a", "b"])
+    result = {(frozenset(angle.terms), angle.offset) for angle in angles}
     half = Rational(1, 2)
     one, two = S.One, S(2)
     differences = [frozenset({(one, "a"), (-one, "b")}), frozenset({(-one, "a"), (one, "b")})]
-    assert (frozenset({(two, "a")}), S.Zero) in found
-    assert (frozenset({(one, "b")}), half) in found
-    assert any((d, S.Zero) in found for d in differences)
-    assert len(found) == 3  # a + phase and a*b are computed where they are needed
+    assert (frozenset({(two, "a")}), S.Zero) in result
+    assert (frozenset({(one, "b")}), half) in result
+    assert any((d, S.Zero) in result for d in differences)
+    assert len(result) == 3  # a + phase and a*b are computed where they are needed
     assert {name for a in angles for name in (a.sine, a.cosine)} & rest.uses
     names = {a.name for a in rest.body}
     assert not names & {name for a in angles for name in (a.sine, a.cosine)}
 
 
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.3), 0.02))
-def test_steps_short_and_long_are_those_of_the_textbook(h: float, modules: Modules) -> None:
+def test_short_and_long_steps_agree_with_textbook(h: float, modules: Modules) -> None:
     """Angles change by about 1e-6, 1e-4 and, above the limit of rotations, 1e-1."""
     links = range(1, 7)
     coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
@@ -69,27 +69,29 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, modules: Modul
     built = [modules.unoptimised(text) for text in (ODD, many, both)]
     for module in (*built, modules("cartpole")):
         run = module.simulate(h=h, steps=20)
-        for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+        for result, expected in zip(
+            (run.q[-1], run.qd[-1]), textbook_state(module, h, 20), strict=True
+        ):
+            np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_steps_leave_their_predictions_and_come_back(cartpole: ModuleType) -> None:
-    """A falling pole turns by h^2 a/8 from the predicted angles; up to 2^-12.5 predictions hold."""
+def test_steps_leave_and_reenter_the_range_of_predictions(cartpole: ModuleType) -> None:
+    """The angle of a falling pole is off by h^2 a/8; predictions are valid up to 2^-12.5."""
     h, steps = 0.016, 800
     run = cartpole.simulate(h=h, steps=steps)
     turns = h**2 / 8 * np.abs(cartpole.acceleration(run.q, run.qd)[:, 1])
     assert turns.max() > 1.2 * 2.0**-12.5 and turns.min() < 0.5 * 2.0**-12.5
-    for found, expected in zip((run.q[-1], run.qd[-1]), stepped(cartpole, h, steps), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+    for result, expected in zip(
+        (run.q[-1], run.qd[-1]), textbook_state(cartpole, h, steps), strict=True
+    ):
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(
     "signal", tiers(("2*sin(3*t)", "2*cos(t)*a - a_dot", "0.7"), "2*cos(t)*a - a_dot")
 )
-def test_signals_and_held_inputs_reach_steps_near_predictions(
-    signal: str, modules: Modules
-) -> None:
-    """Signals of time, of the state and constant ones; and inputs that are constant over a step."""
+def test_signals_and_constant_inputs_enter_predicted_steps(signal: str, modules: Modules) -> None:
+    """Signals of time and of the state, constant signals, and inputs held over a step."""
     scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')
     text = scene.replace('name = "odd"', 'name = "pushed"') + '[forces]\nb = "u"\n'
     module = modules.unoptimised(text)
@@ -112,18 +114,18 @@ def test_signals_and_held_inputs_reach_steps_near_predictions(
 
     for u in (None, np.random.default_rng(2).standard_normal((steps, 1))):
         run = module.simulate(h=h, steps=steps, u=u)
-        for found, expected in zip((run.q[-1], run.qd[-1]), textbook(u), strict=True):
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+        for result, expected in zip((run.q[-1], run.qd[-1]), textbook(u), strict=True):
+            np.testing.assert_allclose(result, expected, rtol=0, atol=1e-13)
 
 
-def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
+def test_large_angle_is_passed_to_libm(modules: Modules) -> None:
     """After two million turns the motion is the same, up to the rounding error of the angle."""
     module = modules("simple_pendulum")
     q, qd = module.start
-    there = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=200)
-    here = module.simulate(q, qd, h=0.01, steps=200)
-    apart = there.q[-1] - 2e6 * 2 * np.pi - here.q[-1]
-    assert np.abs(apart).max() < 1e-7
+    far_run = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=200)
+    near_run = module.simulate(q, qd, h=0.01, steps=200)
+    difference = far_run.q[-1] - 2e6 * 2 * np.pi - near_run.q[-1]
+    assert np.abs(difference).max() < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -160,17 +162,17 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
             h=h, steps=steps, every=steps, params={"k": 4.0, "m": 1.0}, method=method
         )
         off = [abs(mpmath.mpf(float(a)) - b) for a, b in zip(run.x[-1], exact, strict=True)]
-    assert max(off) < (5e-15 if FMA or method != "rk4" else 2e-13)  # for what h/6 lacks
+    assert max(off) < (5e-15 if FMA or method != "rk4" else 2e-13)  # the error of h/6
 
 
 @pytest.mark.parametrize(
     ("h", "name"),
     tiers([(0.005, "cartpole"), (0.016, "cartpole"), (0.004, "double_pendulum")], 0.016),
 )
-def test_a_run_in_several_calls_is_the_same_to_the_last_bit(
+def test_run_in_several_calls_is_bitwise_the_same(
     name: str, h: float, tmp_path: Path, modules: Modules
 ) -> None:
-    """This holds if the workspace is kept. Without it, compensated sums restart."""
+    """The workspace must persist between calls. Without it, compensated sums restart."""
     write_files(fast_files(modules(name)), tmp_path)
     main = r"""
         #include "NAME.h"
@@ -200,8 +202,8 @@ def test_a_run_in_several_calls_is_the_same_to_the_last_bit(
         [needs("gcc"), "-std=c99", "-O1", f"-DH={h}", "cut.c", f"{name}.c", "-o", "cut", "-lm"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
-    done = subprocess.run(["./cut"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    whole, cut, forgotten = done.stdout.splitlines()
+    process = subprocess.run(["./cut"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    whole, cut, forgotten = process.stdout.splitlines()
     assert whole == cut
     assert whole != forgotten
     near = [np.array(line.split(), float) for line in (whole, forgotten)]
@@ -227,12 +229,12 @@ static void METHOD_by_hand(void)
 """
 
 
-def test_a_workspace_of_another_state_is_ignored(tmp_path: Path, modules: Modules) -> None:
-    """A state that is changed between two calls continues as without a workspace."""
+def test_workspace_of_another_state_is_ignored(tmp_path: Path, modules: Modules) -> None:
+    """A state that changes between two calls is integrated as without a workspace."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", f"[run]\nmethod = {list(METHODS_OF_MEMORY)}\n")
-    made = system.from_scene(scene.parse(text, "cartpole.toml"))
-    for file, written in fast_files(modules.unoptimised(made)).items():
+    cartpole = system.from_scene(scene.parse(text, "cartpole.toml"))
+    for file, written in fast_files(modules.unoptimised(cartpole)).items():
         (tmp_path / file).write_text(written, encoding="utf-8")
     functions = "".join(BY_HAND.replace("METHOD", m) for m in METHODS_OF_MEMORY)
     calls = " ".join(f"{m}_by_hand();" for m in METHODS_OF_MEMORY)
@@ -242,8 +244,10 @@ def test_a_workspace_of_another_state_is_ignored(tmp_path: Path, modules: Module
         ["cc", "-std=c99", "-O0", "hand.c", "cartpole.c", "-o", "hand", "-lm"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
-    done = subprocess.run(["./hand"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    lines = done.stdout.splitlines()
+    process = subprocess.run(["./hand"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    lines = process.stdout.splitlines()
     assert len(lines) == 2 * len(METHODS_OF_MEMORY)
-    for method, without, kept in zip(METHODS_OF_MEMORY, lines[::2], lines[1::2], strict=True):
-        assert kept == without, method
+    for method, without, with_workspace in zip(
+        METHODS_OF_MEMORY, lines[::2], lines[1::2], strict=True
+    ):
+        assert with_workspace == without, method

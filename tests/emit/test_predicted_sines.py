@@ -1,4 +1,4 @@
-"""Sines of rotated and of predicted angles, compiled with and without FMA, against 40 digits."""
+"""Compare sines of rotated and of predicted angles with 40 digits, with and without FMA."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from eomc.toolchain.files import write_files
 
 
 @cache
-def fast(name: str) -> tuple[Accelerations, dict[str, str]]:
-    """Return the optimised C of the cart-pole or of the odd scene."""
+def optimised_c(name: str) -> tuple[Accelerations, dict[str, str]]:
+    """Return the optimised C of the cart-pole or of the scene with odd angles."""
     own = odd_system() if name == "odd" else scene_system(name)
-    made = program.build(lagrange.derive(own))
-    return Accelerations(Target(made, DOUBLE)), fast_files(Modules().unoptimised(own))
+    derivation = program.build(lagrange.derive(own))
+    return Accelerations(Target(derivation, DOUBLE)), fast_files(Modules().unoptimised(own))
 
 
-def made_with(
+def run_main(
     main: str, name: str, rows: Iterable[Sequence[float]], flags: Sequence[str], folder: Path
 ) -> list[list[float]]:
     """Return the numbers that a main() prints for each row of its input.
 
     It is compiled together with the optimised C of a scene.
     """
-    write_files(fast(name)[1], folder)
+    write_files(optimised_c(name)[1], folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     main = "#include <stdio.h>\n" + main.replace("eomc_", f"{name}_")
     main = main.replace("EOMC_", f"{name.upper()}_")
@@ -45,22 +45,23 @@ def made_with(
     command = [needs("gcc"), *flags, "near.c", "-o", "near", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     lines = "\n".join(" ".join(repr(float(x)) for x in row) for row in rows)
-    done = subprocess.run(
+    process = subprocess.run(
         ["./near"], cwd=folder, input=lines, capture_output=True, text=True, check=True
     )
-    return [[float(x) for x in line.split()] for line in done.stdout.splitlines()]
+    return [[float(x) for x in line.split()] for line in process.stdout.splitlines()]
 
 
-# FMA in one of them
+# with FMA in one of them
 BUILDS = {"narrow": ("-std=c99", "-O2"), "native": ("-std=gnu99", "-O3", "-march=native")}
 UNIT = 2.0**-53
 
 
-def worst_of(found: Iterable[tuple[float, float, mpmath.mpf]]) -> float:
+def largest_error(rows_of_sines: Iterable[tuple[float, float, mpmath.mpf]]) -> float:
     """Return the largest error of sines and cosines at exact angles, in units of rounding of 1."""
     with mpmath.workdps(40):
         return max(
-            float(max(abs(s - mpmath.sin(x)), abs(c - mpmath.cos(x)))) / UNIT for s, c, x in found
+            float(max(abs(s - mpmath.sin(x)), abs(c - mpmath.cos(x)))) / UNIT
+            for s, c, x in rows_of_sines
         )
 
 
@@ -110,18 +111,18 @@ def test_rotated_sines_are_accurate(build: str, tmp_path: Path) -> None:
     beyond += [(0.0, d, 0.0) for d in (more, -more, nan)]
     beyond += [(0.0, 0.0, d) for d in (more, -more, 1e300, nan)]
     rows += [(0.5, *row) for row in beyond]
-    found = made_with(main, "cartpole", rows, BUILDS[build], tmp_path)
-    assert [row[-2:] for row in found] == (
+    results = run_main(main, "cartpole", rows, BUILDS[build], tmp_path)
+    assert [row[-2:] for row in results] == (
         [[0, 0]] * 600 + [[1, 0]] * 4 + [[0, 1]] * (len(beyond) - 4)
     )
     known: dict[str, list[tuple[float, float, mpmath.mpf]]] = {}
     with mpmath.workdps(40):
-        for (x0, back, near, far), row in zip(rows[:600], found, strict=False):
+        for (x0, back, near, far), row in zip(rows[:600], results, strict=False):
             mid, d = mpmath.mpf(x0 + back), mpmath.mpf(back)
             places = {"begin": mid - d, "mid": mid, "end": mid + d, "on": mid + near}
             for k, (place, at) in enumerate((places | {"further": mid + d + far}).items()):
                 known.setdefault(place, []).append((row[2 * k], row[2 * k + 1], at))
-    worst = {place: worst_of(rows) for place, rows in known.items()}
+    worst = {place: largest_error(rows) for place, rows in known.items()}
     assert 0.5 < worst["mid"] < 1.4  # 1.6 units of the last place, of numbers up to 1
     assert all(0.5 < worst[place] < 1.4 + 1 for place in ("begin", "end", "on"))
     assert 0.5 < worst["further"] < 1.4 + 2
@@ -158,7 +159,7 @@ def test_sines_near_predictions_are_accurate(name: str, build: str, tmp_path: Pa
         return 0;
     }
     """
-    accelerations, _ = fast(name)
+    accelerations, _ = optimised_c(name)
     names, angles = accelerations.target.names, accelerations.angles
     assert len(angles) == (1 if name == "cartpole" else 3)
     random, count = np.random.default_rng(9), 600
@@ -173,21 +174,26 @@ def test_sines_near_predictions_are_accurate(name: str, build: str, tmp_path: Pa
     nan = float("nan")
     odd_rows = [(0.1, 0.1, nan, nan, 0, 0, 0.1, 0.1, 0.0), (0.1, 0.1, 0, 0, 0, 0, 0.1, 0.1, nan)]
     main = main.replace("ANGLES", str(len(angles)))
-    found = np.array(made_with(main, name, [*rows, *odd_rows], BUILDS[build], tmp_path))
-    assert np.isnan(found[count:, [2, 3]]).all()  # what is no number stays none
-    assert np.isnan(found[-1, [4 * len(angles), -1]]).all()
-    found = found[:count].reshape(count, 2, 4 * len(angles) + 1)
-    near, far = found[:, :, :-1].reshape(count, 2, len(angles), 4), found[:, :, -1]
+    results = np.array(run_main(main, name, [*rows, *odd_rows], BUILDS[build], tmp_path))
+    assert np.isnan(results[count:, [2, 3]]).all()  # NaN remains NaN
+    assert np.isnan(results[-1, [4 * len(angles), -1]]).all()
+    results = results[:count].reshape(count, 2, 4 * len(angles) + 1)
+    near, far = results[:, :, :-1].reshape(count, 2, len(angles), 4), results[:, :, -1]
     distances = near[..., 1]
     np.testing.assert_array_equal(distances[:, 0, 0], d)
     np.testing.assert_allclose(far, (distances**2 / 2).sum(axis=2), rtol=1e-8)
     for k, angle in enumerate(angles):
 
-        def along(vector: np.ndarray, angle: Angle = angle) -> np.ndarray:
+        def project_angle(vector: np.ndarray, angle: Angle = angle) -> np.ndarray:
             return sum(float(w) * vector[:, names.index(n)] for w, n in angle.terms)
 
         for part, t in enumerate((mid, end)):
-            x = along(q) + float(angle.offset) + along(v) * t + along(a) * t**2 / 2
+            x = (
+                project_angle(q)
+                + float(angle.offset)
+                + project_angle(v) * t
+                + project_angle(a) * t**2 / 2
+            )
             size = np.abs(q).max(axis=1) + 3
             assert (np.abs(near[:, part, k, 0] - x) <= 8 * UNIT * size).all()
     with mpmath.workdps(40):
@@ -195,12 +201,12 @@ def test_sines_near_predictions_are_accurate(name: str, build: str, tmp_path: Pa
             (s, c, mpmath.mpf(x) + mpmath.mpf(by)) for x, by, s, c in near.reshape(-1, 4).tolist()
         ]
     fma = build == "native" and FMA
-    assert 0.5 < worst_of(known) < (2 if fma else 2.4)
+    assert 0.5 < largest_error(known) < (2 if fma else 2.4)
 
 
 @pytest.mark.parametrize("build", tiers(BUILDS, "native"))
-def test_steps_end_where_predictions_do(build: str, tmp_path: Path) -> None:
-    """The sum of four squared distances may be 2^-24; an angle of 2^20 needs all of that.
+def test_steps_fail_beyond_the_range_of_predictions(build: str, tmp_path: Path) -> None:
+    """The sum of four squared distances may be 2^-24, which an angle of 2^20 needs entirely.
 
     A step that fails leaves the state unchanged; other steps have the sines of their end.
     """
@@ -237,10 +243,10 @@ def test_steps_end_where_predictions_do(build: str, tmp_path: Path) -> None:
     far += [(float(x), 0.0) for x in ("nan", "inf", "-inf")] + [(0.3, float("nan"))]
     rows = [(x, shift, h, 1) for x, shift in (*close, *far)]
     rows += [(x, 0.0, 0.005, 40) for x in np.linspace(-3, 3, 50)]
-    found = made_with(main, "cartpole", rows, BUILDS[build], tmp_path)
-    assert [row[:2] for row in found[: len(close)]] == [[1, 0]] * len(close)
-    assert [row[:2] for row in found[len(close) : len(close) + len(far)]] == [[0, 1]] * len(far)
-    on = found[len(close) + len(far) :]
+    results = run_main(main, "cartpole", rows, BUILDS[build], tmp_path)
+    assert [row[:2] for row in results[: len(close)]] == [[1, 0]] * len(close)
+    assert [row[:2] for row in results[len(close) : len(close) + len(far)]] == [[0, 1]] * len(far)
+    on = results[len(close) + len(far) :]
     assert [row[0] for row in on] == [40] * 50
     with mpmath.workdps(40):
-        assert worst_of((s, c, mpmath.mpf(x)) for *_, x, s, c in on) < 8  # q, too, is rounded
+        assert largest_error((s, c, mpmath.mpf(x)) for *_, x, s, c in on) < 8  # q is rounded, too

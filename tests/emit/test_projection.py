@@ -1,4 +1,4 @@
-"""`project` finds the nearest positions, and closes loops by the smallest rotation."""
+"""`project` finds the nearest positions and closes loops by the smallest rotation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from eomc.model.loops import find_wrong_rotations
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 
-# a ball that rolls: K is singular along the quaternion, which its length fixes
+# a rolling ball: K is singular along the quaternion, whose length a constraint fixes
 ROLLING = """eomc = 1
 name = "rolling_ball"
 [coordinates]
@@ -34,7 +34,7 @@ unit = "(qw**2 + qx**2 + qy**2 + qz**2 - 1)/2"
 roll_x = "x_dot - 0.05*wy"
 roll_y = "y_dot + 0.05*wx"
 """
-# s has no inertia, and no row of positions
+# s has no inertia and no position constraint
 COUNTED = """eomc = 1
 name = "counted_turns"
 [coordinates]
@@ -54,56 +54,56 @@ def rolling(modules: Modules) -> ModuleType:
     return modules.unoptimised(ROLLING)
 
 
-@pytest.mark.parametrize("held", [(), ("qx",), ("qw",), ("qy", "x")])
+@pytest.mark.parametrize("fixed_names", [(), ("qx",), ("qw",), ("qy", "x")])
 def test_velocity_constraints_do_not_move_positions(
-    rolling: ModuleType, held: tuple[str, ...]
+    rolling: ModuleType, fixed_names: tuple[str, ...]
 ) -> None:
     q = np.array([0.3, 0.0, 0.98, 0.1, -0.1, 0.1])
-    found = rolling.project(q, np.zeros(6), fixed=list(held))[0]
-    free = [k for k in range(2, 6) if rolling.coordinates[k] not in held]
-    still = [k for k in range(6) if k not in free]
-    np.testing.assert_array_equal(found[still], q[still])
-    # of one length, the nearest has the direction of the free components
-    rest = 1 - sum(q[k] ** 2 for k in still[2:])
+    result = rolling.project(q, np.zeros(6), fixed=list(fixed_names))[0]
+    free = [k for k in range(2, 6) if rolling.coordinates[k] not in fixed_names]
+    fixed_indices = [k for k in range(6) if k not in free]
+    np.testing.assert_array_equal(result[fixed_indices], q[fixed_indices])
+    # among vectors of one length, the nearest has the direction of the free components
+    rest = 1 - sum(q[k] ** 2 for k in fixed_indices[2:])
     nearest = q[free] * np.sqrt(rest / np.sum(q[free] ** 2))
-    np.testing.assert_allclose(found[free], nearest, atol=1e-12)
+    np.testing.assert_allclose(result[free], nearest, atol=1e-12)
 
 
-def test_velocity_constraints_do_not_move_an_assembled_start() -> None:
-    made = assembled(from_scene(parse(ROLLING)))
-    q = np.array([c.start for c in made.coordinates])
+def test_velocity_constraints_do_not_move_an_assembled_initial_state() -> None:
+    system = assembled(from_scene(parse(ROLLING)))
+    q = np.array([c.start for c in system.coordinates])
     np.testing.assert_array_equal(q[[0, 1, 3, 5]], [0.3, 0, 0.1, 0])
     np.testing.assert_allclose(q[[2, 4]], np.array([1, 0.2]) * np.sqrt(0.99 / 1.04), atol=1e-12)
 
 
-def test_a_massless_coordinate_in_velocity_constraints_only_stays(modules: Modules) -> None:
+def test_massless_coordinate_in_velocity_constraints_only_is_unchanged(modules: Modules) -> None:
     counted = modules.unoptimised(COUNTED)
-    for held in ([], ["y"]):
-        q = counted.project([1.1, 0.2, 0.5], np.zeros(3), fixed=held)[0]
+    for fixed_names in ([], ["y"]):
+        q = counted.project([1.1, 0.2, 0.5], np.zeros(3), fixed=fixed_names)[0]
         assert q[2] == 0.5
         assert q[0] ** 2 + q[1] ** 2 == pytest.approx(1, abs=1e-14)
-        assert q[1] == 0.2 if held else q[1] / q[0] == pytest.approx(0.2 / 1.1)
+        assert q[1] == 0.2 if fixed_names else q[1] / q[0] == pytest.approx(0.2 / 1.1)
 
 
-@pytest.mark.parametrize("held", [(), ("q2",)])
-def test_the_change_is_the_least_in_the_metric_of_the_mass_matrix(
-    modules: Modules, held: tuple[str, ...]
+@pytest.mark.parametrize("fixed_names", [(), ("q2",)])
+def test_change_is_minimal_in_the_metric_of_the_mass_matrix(
+    modules: Modules, fixed_names: tuple[str, ...]
 ) -> None:
     """Newton's method, used before, missed the nearest position by up to 1e-3 of the distance."""
     four_bar = modules("four_bar")
-    free = [k for k, name in enumerate(four_bar.coordinates) if name not in held]
+    free = [k for k, name in enumerate(four_bar.coordinates) if name not in fixed_names]
     random = np.random.default_rng(3)
     for _ in range(10):
         q = four_bar.start[0] + 0.05 * random.normal(size=four_bar.nq)
-        found = four_bar.project(q, 0 * q, fixed=list(held))[0]
-        assert np.max(np.abs(four_bar.constraints(found, 0 * q))) < 1e-14
-        force = (four_bar.D(found) @ (found - q))[free]
-        A = four_bar.constraint_jacobian(found)[:, free]
+        result = four_bar.project(q, 0 * q, fixed=list(fixed_names))[0]
+        assert np.max(np.abs(four_bar.constraints(result, 0 * q))) < 1e-14
+        force = (four_bar.D(result) @ (result - q))[free]
+        A = four_bar.constraint_jacobian(result)[:, free]
         left = force - A.T @ np.linalg.lstsq(A.T, force, rcond=None)[0]
         assert np.max(np.abs(left)) < 1e-9 * np.max(np.abs(force))
 
 
-LOOSE = """eomc = 1
+FREE_BODIES = """eomc = 1
 name = "loose_bodies"
 gravity = [0, 0, -9.81]
 [coordinates]
@@ -159,18 +159,18 @@ rotation = 2.5
 """
 
 
-@pytest.mark.parametrize("text", [WELDED, pytest.param(LOOSE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("text", [WELDED, pytest.param(FREE_BODIES, marks=pytest.mark.slow)])
 def test_loops_are_closed_by_the_smallest_rotation(modules: Modules, text: str) -> None:
-    """Loops that were off by more than a quarter turn once were closed half a turn off."""
-    loose = modules.unoptimised(text)
+    """Loops with an error of more than a quarter turn were once closed half a turn off."""
+    module = modules.unoptimised(text)
     wrong = find_wrong_rotations(from_scene(parse(text)))
     random = np.random.default_rng(7)
-    starts = random.uniform(-np.pi, np.pi, (100, loose.nq))
-    if text is WELDED:  # exactly a quarter, and half a turn off
+    starts = random.uniform(-np.pi, np.pi, (100, module.nq))
+    if text is WELDED:  # exactly a quarter turn and half a turn off
         starts[:2] = [[0, 0, 2.5 - np.pi / 2], [0, 0, 2.5 - np.pi]]
     for q in starts:
-        found = loose.project(q, 0 * q)[0]
-        assert wrong(found.tolist(), 0.0, {}) == []
-        assert np.max(np.abs(loose.constraints(found, 0 * q))) < 1e-11
-        run = loose.simulate(q0=q, duration=0.002, h=0.001)
+        result = module.project(q, 0 * q)[0]
+        assert wrong(result.tolist(), 0.0, {}) == []
+        assert np.max(np.abs(module.constraints(result, 0 * q))) < 1e-11
+        run = module.simulate(q0=q, duration=0.002, h=0.001)
         assert wrong(run.q[0].tolist(), 0.0, {}) == []

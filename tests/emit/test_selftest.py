@@ -1,4 +1,4 @@
-"""The self-test in C: every function and method is tested, and seeded faults are found."""
+"""The self-test in C covers every function and method, and detects seeded faults."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from eomc.toolchain.files import write_files
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 def test_rounding_errors_of_multiples_of_half_pi(real: type) -> None:
-    """Powers of two lose nothing, other multiples up to half a unit in the last place of n pi/2."""
+    """Powers of two are exact; other multiples err by at most half an ulp of n pi/2."""
     double, half_pi = real is np.float64, real(math.pi / 2)
     for n in (1, 2, 64, 4096):
         assert _rounding_error(n * math.pi / 2 + 0.3, double) == 0
-    found = []
+    relative_errors = []
     for n in range(1000, 1100):
         product = real(n) * half_pi
-        lost = abs(Fraction(float(product)) - n * Fraction(float(half_pi)))
-        assert _rounding_error(n * math.pi / 2 - 0.3, double) == float(lost)
-        found.append(lost / Fraction(float(np.spacing(product))))
-    assert 0.4 < max(found) <= 0.5
+        error = abs(Fraction(float(product)) - n * Fraction(float(half_pi)))
+        assert _rounding_error(n * math.pi / 2 - 0.3, double) == float(error)
+        relative_errors.append(error / Fraction(float(np.spacing(product))))
+    assert 0.4 < max(relative_errors) <= 0.5
 
 
 BALL = """eomc = 1
@@ -85,8 +85,8 @@ def outcome(folder: Path, form: str, *flags: str) -> tuple[int, str]:
     at = "." if form == "plain" else "fast"
     files = ["selftest.c", f"{at}/ball.c", "-lm", "-o", "selftest"]
     compiled(needs("cc"), "-std=gnu99", *flags, f"-I{at}", *files, cwd=folder)
-    done = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
-    return done.returncode, done.stdout
+    process = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
+    return process.returncode, process.stdout
 
 
 def write(folder: Path, real: str = "double") -> None:
@@ -101,7 +101,7 @@ gauss16_derivative euler_step euler_run euler_derivative""".split()
 
 
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
-def test_every_function_of_the_header_has_cases(real: str) -> None:
+def test_every_function_of_the_header_has_test_cases(real: str) -> None:
     """There are several for each function; runs cross events in both directions."""
     rows = re.findall(r'^    \{ "(\w+)", test_(\w+),', sources(real)["selftest.c"], re.M)
     counts = {name: sum(row[0] == name for row in rows) for name in EVERY}
@@ -119,13 +119,13 @@ def test_every_function_of_the_header_has_cases(real: str) -> None:
         ("plain", "double", "-O0"),
     ),
 )  # fmt: skip
-def test_it_passes(form: str, real: str, flags: str, tmp_path: Path) -> None:
+def test_selftest_passes(form: str, real: str, flags: str, tmp_path: Path) -> None:
     write(tmp_path, real)
     status, words = outcome(tmp_path, form, *flags.split())
     assert status == 0 and re.fullmatch(r"ball: right in \d+ cases\n", words), words
 
 
-# of each a function of the C, a pattern in it and what stands in its place
+# for each fault a function of the C, a pattern in it and its replacement
 FAULTS = {
     "a stage of rk4": ("rk4_step", r"h/2", "h/3"),
     "a weight of rk4": ("rk4_step", r"2\*\(a2", "3*(a2"),
@@ -163,7 +163,7 @@ def seeded(name: str, source: str) -> str:
 @pytest.mark.parametrize(
     "name", tiers([*FAULTS, *TABLES], "a stage of rk4", "a jump", "a direction")
 )
-def test_a_fault_in_the_c_is_found(name: str, tmp_path: Path) -> None:
+def test_selftest_detects_a_seeded_fault(name: str, tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "ball.c").write_text(seeded(name, sources("double")["ball.c"]), encoding="utf-8")
     status, words = outcome(tmp_path, "plain", "-O0")

@@ -1,4 +1,4 @@
-"""Views have exactly the variables of their templates; the modules that fill them contain no C."""
+"""Views have exactly the variables of their templates; modules that fill them contain no C."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from eomc.program import program
 EMIT = Path(render.__file__).parent
 MODULES = sorted(p.relative_to(EMIT).as_posix() for p in EMIT.rglob("*.py"))
 INCLUDED = {
-    "c/evaluations.c",  # by the sources of both forms
+    "c/evaluations.c",  # included by the sources of both forms
     *(f"c/adaptive_{part}.c" for part in ("measures", "newton", "stages", "corners")),
 }
-# modules that hold C
+# modules that contain C
 MAY = ("c_function.py", "c_expression.py")
 
 
@@ -52,20 +52,20 @@ def variables_of(template: str) -> set[str]:
     """Return the variables that a template and the templates that it includes use."""
     source = resources.text("templates", f"{template}.jinja")
     tree = render.environment().parse(source)
-    found = jinja2.meta.find_undeclared_variables(tree)
+    variables = jinja2.meta.find_undeclared_variables(tree)
     for name in jinja2.meta.find_referenced_templates(tree):
         assert name is not None
-        found |= variables_of(name.removesuffix(".jinja"))
-    return found
+        variables |= variables_of(name.removesuffix(".jinja"))
+    return variables
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda v: str(v.TEMPLATE))
-def test_a_view_has_the_variables_of_its_template(view: Any) -> None:
+def test_view_has_the_variables_of_its_template(view: Any) -> None:
     assert variables_of(view.TEMPLATE) == {field.name for field in dataclasses.fields(view)}
     assert view.__dataclass_params__.frozen
 
 
-def test_every_template_of_code_has_a_view() -> None:
+def test_every_code_template_has_a_view() -> None:
     root = resources.folder("templates")
     there = [p for part in ("c", "python", "fmu") for p in (root / part).rglob("*.jinja")]
     names = {p.relative_to(root).as_posix().removesuffix(".jinja") for p in there}
@@ -74,7 +74,7 @@ def test_every_template_of_code_has_a_view() -> None:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_no_c_syntax_in_python(module: str) -> None:
+def test_python_modules_contain_no_c_syntax(module: str) -> None:
     """Only two modules contain semicolons, arrows, braces and const in texts."""
     if module in MAY:
         return
@@ -97,23 +97,26 @@ def test_no_c_syntax_in_python(module: str) -> None:
     "name",
     tiers(["cartpole", "cartpole_driven", "chain", "suspension"], "cartpole", "cartpole_driven"),
 )
-def test_public_functions_are_those_of_the_header(name: str) -> None:
+def test_public_functions_agree_with_the_header(name: str) -> None:
     """The header declares each of them once, with these arguments."""
-    made = program.build(lagrange.derive(eomc.read(SCENES / f"{name}.toml")))
-    public, methods = Public(Target(made, DOUBLE)), made.system.run.methods
+    functions_of_scene = program.build(lagrange.derive(eomc.read(SCENES / f"{name}.toml")))
+    public, methods = (
+        Public(Target(functions_of_scene, DOUBLE)),
+        functions_of_scene.system.run.methods,
+    )
     expected = [*public.evaluations(), public.acceleration]
     for method in methods:
         expected += [public.step(method), public.run(method)]
-        expected += [public.batch(method)] if made.system.run.batch else []
-    header = render.render(made, "_x").files[f"fast/{name}.h"]
+        expected += [public.batch(method)] if functions_of_scene.system.run.batch else []
+    header = render.render(functions_of_scene, "_x").files[f"fast/{name}.h"]
     bare = re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
     declared = re.findall(r"^\w[\w *]*\b\w+\([^;{]*\);", bare, re.MULTILINE)
-    told = [re.sub(r"\s+", " ", text).removesuffix(";") for text in declared]
-    assert [f.prototype for f in expected] == [t.replace("( ", "(") for t in told]
+    prototypes = [re.sub(r"\s+", " ", text).removesuffix(";") for text in declared]
+    assert [f.prototype for f in expected] == [t.replace("( ", "(") for t in prototypes]
 
 
-def test_constants_are_computed_where_there_are_any() -> None:
-    made = System.make("free", ["x"], "x_dot**2/2", "x**2/2")
-    assert "compute_constants" not in eomc.sources(made).files["fast/free.c"]
-    made = System.make("free", ["x"], "m*x_dot**2/2", "x**2/2", parameters={"m": 1.0})
-    assert "free_compute_constants(" in eomc.sources(made).files["fast/free.c"]
+def test_constants_are_computed_only_where_needed() -> None:
+    system = System.make("free", ["x"], "x_dot**2/2", "x**2/2")
+    assert "compute_constants" not in eomc.sources(system).files["fast/free.c"]
+    system = System.make("free", ["x"], "m*x_dot**2/2", "x**2/2", parameters={"m": 1.0})
+    assert "free_compute_constants(" in eomc.sources(system).files["fast/free.c"]

@@ -1,4 +1,4 @@
-"""Constraints as a System has them: what is of positions, what of rates, what is held."""
+"""Constraints of a System: holonomic and nonholonomic rows, fixed and free initial values."""
 
 import pytest
 import sympy
@@ -44,7 +44,7 @@ second = { formula = "a - b", unit = "rad" }
 """
 
 
-def test_holonomic_rows_stand_first_in_their_order():
+def test_holonomic_constraints_come_first_in_their_order():
     system = from_scene(parse(SCENE + ROWS))
     assert [(c.name, c.holonomic) for c in system.constraints] == [
         ("first", True), ("second", True), ("third1", True), ("third2", True), ("blade", False),
@@ -56,44 +56,44 @@ def test_holonomic_rows_stand_first_in_their_order():
     assert not system.warnings
 
 
-def test_what_is_given_is_held_and_guesses_are_not():
-    held = {
+def test_stated_initial_values_are_fixed_and_guesses_are_free():
+    fixed = {
         c.name: (c.start_fixed, c.rate_fixed) for c in from_scene(parse(SCENE + ROWS)).coordinates
     }
-    assert held == {
+    assert fixed == {
         "a": (True, True), "b": (False, False), "c": (False, False), "d": (True, False),
         "e1": (False, False), "e2": (False, False),
     }  # fmt: skip
 
 
-def test_without_constraints_everything_is_held():
+def test_all_initial_values_are_fixed_without_constraints():
     assert all(c.start_fixed and c.rate_fixed for c in from_scene(parse(SCENE)).coordinates)
 
 
-def test_dependence_follows_definitions():
+def test_velocity_degree_follows_definitions():
     x, y = Coordinate("x"), Coordinate("y")
     p, v = symbol("p"), symbol("v")
-    of = VelocityDegree([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).degree
+    degree_of = VelocityDegree([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).degree
 
-    def found(e):
-        rates = of(e)
+    def degree_and_moves(e):
+        rates = degree_of(e)
         return rates.degree, rates.moves, rates.exact
 
     m = symbol("m")
-    assert found(m * t) == (0, 1, False)
-    assert found(p**2) == (0, 2, False)
-    assert found(v) == (1, 2, False)
-    assert found(v * m - x.qd) == (1, 2, False)
-    assert found(m * dot(p) + sympy.sin(t) - y.qd / 3) == (1, 2, True)
-    assert found(m * dot(p) + p) == (1, 2, False)
-    assert found(t * x.qd) == (1, 2, False)
+    assert degree_and_moves(m * t) == (0, 1, False)
+    assert degree_and_moves(p**2) == (0, 2, False)
+    assert degree_and_moves(v) == (1, 2, False)
+    assert degree_and_moves(v * m - x.qd) == (1, 2, False)
+    assert degree_and_moves(m * dot(p) + sympy.sin(t) - y.qd / 3) == (1, 2, True)
+    assert degree_and_moves(m * dot(p) + p) == (1, 2, False)
+    assert degree_and_moves(t * x.qd) == (1, 2, False)
     for e in (v**2, v * x.qd, sympy.sin(x.qd), 1 / x.qd, sympy.Abs(v), 2**v, sympy.sqrt(v)):
-        assert of(e).degree == 2
+        assert degree_of(e).degree == 2
 
 
-def make(**more):
+def make_pendulum(**options):
     x, y, u = sympy.symbols("x y u")
-    given = {
+    arguments = {
         "coordinates": {x: 0.6, y: (-0.8, 1.0)},
         "kinetic": "(x_dot**2 + y_dot**2)/2",
         "parameters": {"l": 1.0},
@@ -101,11 +101,11 @@ def make(**more):
         "definitions": {"s": "x + u", "r": "x**2 + y**2"},
         "constraints": {"rod": "r - l**2"},
     }
-    return System.make("pendulum", **{**given, **more})
+    return System.make("pendulum", **{**arguments, **options})
 
 
-def test_constraints_in_python():
-    system = make(units={"rod": "m^2"})
+def test_constraints_defined_in_python():
+    system = make_pendulum(units={"rod": "m^2"})
     (rod,) = system.constraints
     assert rod.formula == symbol("r") - symbol("l") ** 2
     assert (rod.name, rod.unit, rod.holonomic) == ("rod", "m^2", True)
@@ -115,18 +115,18 @@ def test_constraints_in_python():
     ]
 
 
-def test_guesses_in_python():
+def test_guesses_defined_in_python():
     x, y = sympy.symbols("x y")
-    system = make(coordinates={x: None, y: -0.8}, guess=[y])
+    system = make_pendulum(coordinates={x: None, y: -0.8}, guess=[y])
     assert [(c.start, c.start_fixed) for c in system.coordinates] == [(0.0, False), (-0.8, False)]
-    system = make(coordinates={x: (None, 2.0), y: -0.8}, guess=["x"])
+    system = make_pendulum(coordinates={x: (None, 2.0), y: -0.8}, guess=["x"])
     assert [(c.rate, c.rate_fixed) for c in system.coordinates] == [(2.0, False), (0.0, False)]
-    free = make(coordinates=[x, y], constraints=None)
+    free = make_pendulum(coordinates=[x, y], constraints=None)
     assert all(c.start_fixed and c.rate_fixed for c in free.coordinates)
     assert not free.constraints
 
 
-def test_dynamicsymbols_in_rows():
+def test_dynamicsymbols_in_constraints():
     x, psi = dynamicsymbols("x psi")
     length, time = sympy.Symbol("l"), dynamicsymbols._t
     system = System.make(
@@ -139,14 +139,14 @@ def test_dynamicsymbols_in_rows():
     assert not system.warnings
 
 
-def test_a_rate_of_a_position_is_doubted_in_python():
-    (warning,) = make(constraints={"roll": "x_dot - l*y_dot"}).warnings
+def test_velocity_form_of_a_position_constraint_is_warned_of():
+    (warning,) = make_pendulum(constraints={"roll": "x_dot - l*y_dot"}).warnings
     assert warning.severity == "warning"
     assert "write the position itself, -l*y + x, less its value at the start" in warning.message
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("options", "message"),
     [
         ({"constraints": ["x"]}, "constraints: give a dict"),
         ({"constraints": {3: "x"}}, "3 is not a name"),
@@ -169,7 +169,7 @@ def test_a_rate_of_a_position_is_doubted_in_python():
         ({"coordinates": {"x": (1, 2, 3), "y": 0}}, "give a start, or a pair"),
     ],
 )  # fmt: skip
-def test_faults_in_python(more, said):
+def test_invalid_constraints_in_python_are_refused(options, message):
     with pytest.raises(EomcError) as fault:
-        make(**more)
-    assert said in str(fault.value)
+        make_pendulum(**options)
+    assert message in str(fault.value)

@@ -1,6 +1,6 @@
-"""Small texts that would take gigabytes or hours: refused in words, or built in seconds.
+"""Small texts that would take gigabytes or hours are refused with a message or built in seconds.
 
-Each in a process of its own, with bounds on its CPU seconds and memory that a slow machine keeps.
+Each runs in its own process, with bounds on CPU time and memory that hold on a slow machine.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import pytest
 
-SECONDS = 20  # of CPU; the slowest takes three
+SECONDS = 20  # of CPU time; the slowest takes three
 MEGABYTES = 1500  # of address space
 
 WORK = """
@@ -35,14 +35,14 @@ except EomcError as fault:
 """ % (SECONDS, SECONDS + 2, MEGABYTES, MEGABYTES)  # noqa: UP031 - braces are few this way
 
 
-def outcome(text: str, built: bool = False) -> str:
-    """What is reported of a scene; "ok" where it is sound. Fails beyond the bounds."""
-    done = subprocess.run(
-        [sys.executable, "-c", WORK, "built" if built else "read"],
+def outcome(text: str, build: bool = False) -> str:
+    """Return the error for a scene, or "ok"; fail beyond the bounds."""
+    process = subprocess.run(
+        [sys.executable, "-c", WORK, "built" if build else "read"],
         input=text.encode(), capture_output=True,
     )  # fmt: skip
-    assert done.returncode == 0, (done.returncode, done.stderr.decode()[-500:])
-    return done.stdout.decode().rstrip("\n")
+    assert process.returncode == 0, (process.returncode, process.stderr.decode()[-500:])
+    return process.stdout.decode().rstrip("\n")
 
 
 BASE = """eomc = 1
@@ -59,10 +59,10 @@ potential = "x**2/2 + a0"
 """
 
 
-def chain(first: str, each: str, count: int) -> str:
-    """Definitions a0 = first, a1 = each of a0, ...: `a` stands for the one before."""
+def chain(first: str, formula: str, count: int) -> str:
+    """Write definitions a0 = first, a1 = each of a0, ...: `a` is the previous one."""
     lines = [f'a0 = "{first}"']
-    lines += [f'a{k} = "{each.replace("@", f"a{k - 1}")}"' for k in range(1, count + 1)]
+    lines += [f'a{k} = "{formula.replace("@", f"a{k - 1}")}"' for k in range(1, count + 1)]
     text = BASE.replace('a0 = "x"', "\n".join(lines))
     return text.replace("x**2/2 + a0", f"x**2/2 + a{count}")
 
@@ -82,8 +82,8 @@ NESTED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NESTED)
 def test_nested_definitions_take_seconds(name: str) -> None:
-    first, each = NESTED[name]
-    assert outcome(chain(first, each, 30), built=True) == "ok"
+    first, formula = NESTED[name]
+    assert outcome(chain(first, formula, 30), built=True) == "ok"
 
 
 @pytest.mark.slow
@@ -100,15 +100,15 @@ NUMBERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NUMBERS)
-def test_exact_numbers_are_bounded_and_the_definition_is_named(name: str) -> None:
-    first, each, key, words = NUMBERS[name]
-    reported = outcome(chain(first, each, 30))
+def test_huge_exact_numbers_are_refused_with_the_definition(name: str) -> None:
+    first, formula, key, words = NUMBERS[name]
+    reported = outcome(chain(first, formula, 30))
     assert reported.startswith("growth.toml:") and reported.count("error") == 1
     assert f"error: {key}: " in reported and words in reported
 
 
 @pytest.mark.slow
-def test_exponents_by_name_are_bounded() -> None:
+def test_symbolic_exponents_are_bounded() -> None:
     text = BASE.replace('a0 = "x"', 'c = "10**9"\nk = "1.0000000001"\na0 = "x*k**c"')
     assert "error: definitions.a0: 'x*k**c' makes exact numbers of more" in outcome(text)
 
@@ -176,14 +176,14 @@ HOSTILE: dict[str, tuple[str, str]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_texts_are_refused_in_words(name: str) -> None:
+def test_hostile_texts_are_refused_with_a_message(name: str) -> None:
     text, words = HOSTILE[name]
     reported = outcome(text)
     assert reported.startswith("growth.toml") and words in reported
     assert len(reported) < 30_000
 
 
-def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
+def test_dots_in_a_string_are_not_a_key() -> None:
     from eomc.scene.read import parse
 
     note = "see " + "a.b.c." * 20 + "d"
@@ -193,15 +193,15 @@ def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["build", "list"])
-def test_the_command_reads_no_more_than_a_scene(command: str, tmp_path) -> None:
-    """It looks for the name of a scene before it reads the whole: that has the same bounds."""
+def test_command_bounds_the_size_of_scenes(command: str, tmp_path) -> None:
+    """It looks up the name of a scene before it reads the file, within the same bounds."""
     (tmp_path / "large.toml").write_text(HOSTILE["100 megabytes"][0], encoding="utf-8")
     (tmp_path / "dots.toml").write_text(HOSTILE["dots"][0], encoding="utf-8")
     code = WORK.partition("from eomc")[0] + "from eomc.cli.main import main; main()"
     files = ["."] if command == "list" else ["large.toml", "dots.toml"]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code, command, *files], cwd=tmp_path, capture_output=True, text=True
     )
-    assert done.returncode == (0 if command == "list" else 2), done.stderr[-500:]
-    assert "Traceback" not in done.stderr
-    assert json.dumps(done.stdout)
+    assert process.returncode == (0 if command == "list" else 2), process.stderr[-500:]
+    assert "Traceback" not in process.stderr
+    assert json.dumps(process.stdout)

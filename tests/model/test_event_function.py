@@ -1,4 +1,4 @@
-"""Events whose formulas jump over zero are refused: they would never happen."""
+"""Events whose formulas jump over zero are refused, because they could not be detected."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ when = "{}"
 """
 
 
-def refusal(when: str) -> str:
+def refusal_of(when: str) -> str:
     with pytest.raises(SceneError) as fault:
         from_scene(parse(BALL.format(when)))
     return str(fault.value)
@@ -43,17 +43,17 @@ def refusal(when: str) -> str:
         ("y_dot <= m*t + 1", 'write "y_dot - (m*t + 1)"'),
     ],
 )
-def test_what_it_should_watch_is_told(when: str, remedy: str) -> None:
-    text = refusal(when)
+def test_refused_event_suggests_a_continuous_formula(when: str, remedy: str) -> None:
+    text = refusal_of(when)
     assert "event.1.when" in text and remedy in text
 
 
-def test_what_jumps_and_moves_may_be_watched() -> None:
+def test_discontinuous_formulas_that_cross_zero_are_accepted() -> None:
     assert from_scene(parse(BALL.format("y*sign(y_dot) - 0.1"))).events
     assert from_scene(parse(BALL.format("y + heaviside(y - 0.5)"))).events
 
 
-def test_of_sympy_too() -> None:
+def test_events_defined_in_sympy_are_checked() -> None:
     y, v = sympy.symbols("y y_dot")
     with pytest.raises(SceneError, match="jumps over zero"):
         System.make("ball", {y: 1.0}, v**2 / 2, events={"impact": sympy.sign(y)})

@@ -1,4 +1,4 @@
-"""Forces at points of bodies: Jacobians by hand, both frames, and what the check says of them."""
+"""Forces at points of bodies: Jacobians by hand, both frames, and the check's results."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ torque = ["F*t/10", 0.3, "b"]
 force = [1, 2, 3]
 frame = "body"
 """
-# a table, and the force (world), the torque and the point (body) that it means
+# a table, and the force (world), the torque and the point (body) that it describes
 A, B, F, M = (symbol(name) for name in "abFM")
 C, S = sympy.cos(A + B), sympy.sin(A + B)
 CASES = {
@@ -105,43 +105,43 @@ def build(text: str) -> Any:
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_the_generalized_force_is_that_of_the_jacobian(what: str) -> None:
+def test_generalized_force_agrees_with_the_jacobian(what: str) -> None:
     table, force, torque, (x, y) = CASES[what]
     at = {"a": 0.3, "b": -0.8, "a_dot": 0.4, "b_dot": 0.9, "F": 1.3, "M": 0.7, "t": 0.2}
-    found, _ = interpret.evaluate(build(f'{ARM}[[force]]\nbody = "lower"\n{table}\n')["tau"], at)
+    result, _ = interpret.evaluate(build(f'{ARM}[[force]]\nbody = "lower"\n{table}\n')["tau"], at)
     point = (0.8 * sympy.cos(A) + C * x - S * y, 0.8 * sympy.sin(A) + S * x + C * y)
     for k, q in enumerate((A, B)):
         exact = sum(f * p.diff(q) for f, p in zip(force, point, strict=True)) + torque
         numbers = {symbol(name): value for name, value in at.items()}
-        assert found[k] == pytest.approx(float(sympy.sympify(exact).subs(numbers)), rel=1e-13)
+        assert result[k] == pytest.approx(float(sympy.sympify(exact).subs(numbers)), rel=1e-13)
 
 
-def test_forces_on_what_does_not_move_cost_nothing() -> None:
+def test_forces_on_fixed_bodies_cost_nothing() -> None:
     fixed = '[[body]]\nname = "base"\njoint = "fixed"\nmass = 1\n'
     pushed = f'{ARM}{fixed}[[force]]\nbody = "base"\nforce = ["F", 1]\n'
     assert "tau" not in build(pushed) and "tau" not in build(ARM)
 
 
-def test_in_space_they_are_those_of_both_oracles() -> None:
+def test_spatial_forces_agree_with_both_references() -> None:
     system = from_scene(parse(SPACE, "space.toml"))
     rng = np.random.default_rng(1)
-    made = build(SPACE)
+    functions = build(SPACE)
     jets = symbolic.reference_for(system)
     for _ in range(3):
         q, qd, u = rng.normal(size=4), rng.normal(size=4), rng.normal(size=1)
         names = [x.name for x in (*system.q, *system.qd, *system.u)]
         at = dict(zip(names, [*q, *qd, *u], strict=True)) | {"t": 0.4}
-        found, _ = interpret.evaluate(made["tau"], at)
-        assert found == pytest.approx(jets.evaluate("tau", q, qd, 0.4, u), rel=1e-12)
+        result, _ = interpret.evaluate(functions["tau"], at)
+        assert result == pytest.approx(jets.evaluate("tau", q, qd, 0.4, u), rel=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [ARM, SPACE])
-def test_the_check_agrees_by_virtual_work_of_point_masses(tmp_path: Path, text: str) -> None:
+def test_check_agrees_by_virtual_work_of_point_masses(tmp_path: Path, text: str) -> None:
     if "[[force]]" not in text:
         for what in ("world", "body", "torque"):
             text += f'[[force]]\nbody = "lower"\n{CASES[what][0]}\n'
-    made = from_scene(parse(text, "test.toml"))
-    report = check(made, eomc.load(made, tmp_path))
+    system = from_scene(parse(text, "test.toml"))
+    report = check(system, eomc.load(system, tmp_path))
     assert report.passed, report.table()
     assert any(row.name == "power of forces of bodies" and row.judged for row in report.results)

@@ -1,4 +1,4 @@
-"""Generalized potentials: the forces of magnetic fields, with energies that do not contain them."""
+"""Generalized potentials: forces of magnetic fields, with energies that do not contain them."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ inverse_dynamics = true
 
 
 def charge(potential: str) -> System:
-    """A charge with m = 1, e = 2, B = 3."""
+    """Return a charge with m = 1, e = 2, B = 3."""
     return System.make(
         "made_charge", {"x": (0, 1), "y": (0, 0.5)}, "m*(x_dot**2 + y_dot**2)/2", potential,
         parameters={"m": 1, "e": 2, "B": 3},
     )  # fmt: skip
 
 
-def test_a_charge_moves_on_the_circle_of_the_lorentz_force(modules: Modules) -> None:
+def test_charge_moves_on_the_circle_of_the_lorentz_force(modules: Modules) -> None:
     module = modules.unoptimised(charge("e*B*(y*x_dot - x*y_dot)/2"))
     assert module.acceleration([0.3, 0.2], [1.0, 0.5]) == pytest.approx([3.0, -6.0])
     run = module.simulate(h=0.001, duration=1.0)
@@ -62,7 +62,7 @@ def test_a_charge_moves_on_the_circle_of_the_lorentz_force(modules: Modules) -> 
     )
 
 
-def test_a_scene_counts_no_energy_in_the_linear_part(modules: Modules) -> None:
+def test_linear_part_of_the_potential_has_no_energy(modules: Modules) -> None:
     module = modules.unoptimised(from_scene(parse(CHARGE)))
     q, qd = [0.3, 0.2], [1.0, 0.5]
     assert module.acceleration(q, qd) == pytest.approx([3.0 - 0.15, -6.0])
@@ -75,28 +75,28 @@ def test_a_scene_counts_no_energy_in_the_linear_part(modules: Modules) -> None:
     assert forces == pytest.approx([-3.0 + 0.15, 6.0])
 
 
-def test_the_equations_have_the_whole_lorentz_force() -> None:
-    found = eomc.equations(charge("e*B*(y*x_dot - x*y_dot)/2"))
+def test_equations_contain_the_full_lorentz_force() -> None:
+    result = eomc.equations(charge("e*B*(y*x_dot - x*y_dot)/2"))
     names = ("m", "e", "B", "x", "y", "x_dot", "y_dot", "x_ddot", "y_ddot")
-    m, e, B, x, y, x_dot, y_dot, x_ddot, y_ddot = (found.symbols[name] for name in names)
-    rows = [sympy.expand(row.lhs - row.rhs) for row in found.scalar]
+    m, e, B, x, y, x_dot, y_dot, x_ddot, y_ddot = (result.symbols[name] for name in names)
+    rows = [sympy.expand(row.lhs - row.rhs) for row in result.scalar]
     assert rows == [m * x_ddot - e * B * y_dot, m * y_ddot + e * B * x_dot]
-    assert sympy.expand(found.kinetic - found.L - e * B * (y * x_dot - x * y_dot) / 2) == 0
-    assert found.potential == 0
-    assert "L, Lagrangian K - P - U" in str(found)
+    assert sympy.expand(result.kinetic - result.L - e * B * (y * x_dot - x * y_dot) / 2) == 0
+    assert result.potential == 0
+    assert "L, Lagrangian K - P - U" in str(result)
 
 
 @pytest.mark.parametrize("path", ["-e*B*x*y_dot", "e*B*y*x_dot + x*y_dot + y*x_dot"])
-def test_gauges_differ_by_a_total_derivative_alone(path: str) -> None:
-    def motion(potential: str) -> sympy.Matrix:
-        found = symbolic.derive(charge(potential))
-        return sympy.expand(sympy.Matrix(found.bias))
+def test_gauge_transformation_preserves_the_motion(path: str) -> None:
+    def acceleration_of(potential: str) -> sympy.Matrix:
+        result = symbolic.derive(charge(potential))
+        return sympy.expand(sympy.Matrix(result.bias))
 
-    assert motion(path) == motion("e*B*(y*x_dot - x*y_dot)/2")
+    assert acceleration_of(path) == acceleration_of("e*B*(y*x_dot - x*y_dot)/2")
 
 
-def test_both_references_and_the_derivation_agree_where_a_field_changes() -> None:
-    """Explicit time, dot(...) of a moving point, a term that is linear in K too."""
+def test_references_and_derivation_agree_for_a_varying_field() -> None:
+    """With explicit time, dot(...) of a moving point, and a term that is linear in K as well."""
     text = CHARGE.replace("B*y/2", "B*y/2*(1 + sin(t))").replace('place = "x"', 'place = "x*t"')
     text = text.replace('_dot**2)/2"', '_dot**2)/2 + k*x_dot"')
     system = from_scene(parse(text))
@@ -104,11 +104,11 @@ def test_both_references_and_the_derivation_agree_where_a_field_changes() -> Non
     state = {"q": [0.3, 0.4], "qd": [0.7, -0.2], "t": 0.3}
     for name in ("D", "C", "g", "bias", "kinetic", "potential", "energy", "jacobi", "power"):
         assert plain.evaluate(name, **state) == pytest.approx(jets.evaluate(name, **state)), name
-    made = program.build(lagrange.derive(system))
-    assert "jacobi" in made.functions  # the potential depends on time
+    functions = program.build(lagrange.derive(system))
+    assert "jacobi" in functions.functions  # the potential depends on time
 
 
-def test_a_method_for_forces_of_positions_is_refused() -> None:
+def test_method_for_position_dependent_forces_is_refused() -> None:
     with pytest.raises(SceneError, match="verlet"):
         eomc.sources(from_scene(parse(CHARGE.replace("[run]", '[run]\nmethod = "verlet"'))))
 
@@ -116,7 +116,7 @@ def test_a_method_for_forces_of_positions_is_refused() -> None:
 @pytest.mark.parametrize(
     "definition", ["x*y_dot", "x_dot**2 - x_dot**2 + 3*y_dot", "sin(y)*dot(c) + 1"]
 )
-def test_a_potential_is_split_through_its_definitions(definition: str) -> None:
+def test_potential_is_split_through_its_definitions(definition: str) -> None:
     known = {"x": x, "y": y, "x_dot": x_dot, "y_dot": y_dot, "c": symbol("c"), "dot": dot}
     body = sympy.sympify(definition, known)
     d, c = symbol("d"), symbol("c")
@@ -131,24 +131,24 @@ def test_a_potential_is_split_through_its_definitions(definition: str) -> None:
 @pytest.mark.parametrize(
     "text", ["x_dot**2", "x_dot*y_dot", "Abs(x_dot)", "sin(x_dot*y)", "dot(c)**2"]
 )
-def test_what_is_not_linear_in_the_velocities_is_refused(text: str) -> None:
+def test_potential_not_linear_in_velocities_is_refused(text: str) -> None:
     c = symbol("c")
     names = {"x": x, "y": y, "x_dot": x_dot, "y_dot": y_dot, "c": c, "dot": dot}
     with pytest.raises(NotLinearError, match="linear terms only"):
         split_potential(sympy.sympify(text, names), [(c, x * y)], VELOCITIES)
 
 
-def test_a_system_and_a_scene_refuse_it_in_the_same_words() -> None:
-    with pytest.raises(EomcError, match=r"System\.make: potential: .* linear terms only") as made:
+def test_systems_and_scenes_refuse_with_the_same_message() -> None:
+    with pytest.raises(EomcError, match=r"System\.make: potential: .* linear terms only") as error:
         charge("x_dot**2")
     with pytest.raises(SceneError) as read:
         from_scene(parse(CHARGE.replace("k*x**2/2", "k*x_dot**2/2")))
     (problem,) = read.value.problems
     assert problem.key == "energy.potential"
-    assert str(made.value).endswith(problem.message)
+    assert str(error.value).endswith(problem.message)
 
 
-def test_a_lagrangian_is_given_as_two_energies() -> None:
+def test_lagrangian_is_passed_as_two_energies() -> None:
     with pytest.raises(EomcError, match="kinetic=K and potential=P"):
         System.make("a", ["x"])
     text = 'eomc = 1\nname = "a"\n[coordinates]\nx = {}\n[energy]\nlagrangian = "x_dot**2"\n'

@@ -1,4 +1,4 @@
-"""Loops: rows, and reactions by virtual work, against differences of the rows themselves."""
+"""Compare rows of loops, and reactions by virtual work, with differences of the rows."""
 
 from functools import cache
 
@@ -45,7 +45,7 @@ CASES = [
     for world in ("", "first", "second")
     if closing.rows(plane) and kind != "gear"
 ]
-# all kinds in space, between two bodies; one in the plane, one on either side of the world
+# all kinds in space, between two bodies; one in the plane, one with the world at either end
 QUICK = [
     pytest.param(*case, marks=() if case[1:] == (False, "") or case[0] == "weld" else SLOW)
     for case in CASES
@@ -53,7 +53,7 @@ QUICK = [
 
 
 def text(kind, plane, world):
-    """Two free bodies, or one and the world, and a loop between them."""
+    """Write two free bodies, or one and the world, and a loop between them."""
     names = ["one", "other"]
     letters = ("x", "y", "a") if plane else ("x", "y", "z", "a", "b", "c")
     known = [f"{name}_q{letter}" for name in names for letter in letters]
@@ -81,8 +81,8 @@ def text(kind, plane, world):
     return out, bodies, points
 
 
-class Two:
-    """The scene's rows, reaction and branches in numbers."""
+class TwoBodies:
+    """Evaluate the scene's rows, reaction and branches numerically."""
 
     def __init__(self, kind, plane, world):
         written, self.bodies, self.points = text(kind, plane, world)
@@ -99,21 +99,21 @@ class Two:
             self.points = [[x, y, 0.0] for x, y, _ in self.points]
 
     def numeric(self, expressions, more=()):
-        """A function of the coordinates."""
+        """Compile expressions into a function of the coordinates."""
         expressions = list(expressions)
         for name, e in reversed(needed_definitions(self.system.definitions, expressions)):
             expressions = [sympy.sympify(x).xreplace({name: e}) for x in expressions]
         return sympy.lambdify([*self.system.q, *more], expressions)
 
-    def place(self, end, q):
-        """The joint's point on a body, and the body's rotation."""
+    def frame_of(self, end, q):
+        """Return the joint's point on a body and the body's rotation."""
         at, R = (np.zeros(3), np.eye(3))
         if self.bodies[end] != "world":
             at, R = self.kinematics.poses(q)[self.bodies[end]]
         return at + R @ self.points[end], R
 
     def jacobian(self, q):
-        """Of the rows, by central differences."""
+        """Return the Jacobian of the rows by central differences."""
         columns = []
         for k in range(len(q)):
             step = STEP * np.eye(len(q))[k]
@@ -121,27 +121,27 @@ class Two:
         return np.array(columns).T
 
     def twist(self, end, at, q):
-        """Of the place that is `at` on a body, over the coordinates: velocities, turning rates."""
-        point, R = self.place(end, q)
+        """Return the velocity Jacobian and the angular one of the point `at` on a body."""
+        point, R = self.frame_of(end, q)
         inside = R.T @ (at - point)
         v, omega = np.zeros((2, 3, len(q)))
         for k in range(len(q)):
             step = STEP * np.eye(len(q))[k]
-            (p1, R1), (p0, R0) = self.place(end, q + step), self.place(end, q - step)
+            (p1, R1), (p0, R0) = self.frame_of(end, q + step), self.frame_of(end, q - step)
             v[:, k] = (p1 + R1 @ inside - p0 - R0 @ inside) / 2 / STEP
             skew = (R1 @ R0.T - R0 @ R1.T) / 4 / STEP
             omega[:, k] = skew[2, 1], skew[0, 2], skew[1, 0]
         return v, omega
 
     def loads(self, q, multipliers):
-        """The reaction: a force and a moment, three entries each."""
+        """Return the reaction: a force and a moment, three entries each."""
         values = np.array(self.values(*q, *multipliers), float)
         if self.plane:
             return np.array([values[0], values[1], 0]), np.array([0, 0, values[2]])
         return values[:3], values[3:]
 
-    def closed(self, seed):
-        """A position where the loop is closed on its branch, by Gauss and Newton's method."""
+    def close_loop(self, seed):
+        """Return a position where the loop is closed on its branch, by the Gauss-Newton method."""
         for start in np.random.default_rng(seed).uniform(-1.5, 1.5, (50, len(self.system.q))):
             q = start
             for _ in range(30):
@@ -153,68 +153,71 @@ class Two:
 
 @cache
 def two_bodies(kind, plane, world):
-    return Two(kind, plane, world)
+    return TwoBodies(kind, plane, world)
 
 
 @pytest.mark.parametrize(("kind", "plane", "world"), QUICK)
-def test_reactions_do_the_work_of_the_rows(kind, plane, world):
-    two = two_bodies(kind, plane, world)
+def test_reactions_do_the_virtual_work_of_the_rows(kind, plane, world):
+    bodies = two_bodies(kind, plane, world)
     random = np.random.default_rng(1)
-    multipliers = random.normal(size=len(two.multipliers))
-    for q, ends in ((random.uniform(-1, 1, len(two.system.q)), (1,)), (two.closed(2), (0, 1))):
-        force, moment = two.loads(q, multipliers)
-        work = multipliers @ two.jacobian(q)
-        at = two.place(1, q)[0]
+    multipliers = random.normal(size=len(bodies.multipliers))
+    for q, ends in (
+        (random.uniform(-1, 1, len(bodies.system.q)), (1,)),
+        (bodies.close_loop(2), (0, 1)),
+    ):
+        force, moment = bodies.loads(q, multipliers)
+        work = multipliers @ bodies.jacobian(q)
+        at = bodies.frame_of(1, q)[0]
         for end in ends:
-            v, omega = two.twist(end, at, q)
+            v, omega = bodies.twist(end, at, q)
             moved = np.abs(v).max(axis=0) + np.abs(omega).max(axis=0) > 1e-6
             sign = 1 if end else -1
             np.testing.assert_allclose(
                 sign * (force @ v + moment @ omega)[moved], work[moved], atol=1e-8
             )
-            assert moved.any() == (two.bodies[end] != "world")
+            assert moved.any() == (bodies.bodies[end] != "world")
 
 
 @pytest.mark.parametrize(("kind", "plane", "world"), QUICK)
-def test_rows_are_regular_where_the_loop_is_closed(kind, plane, world):
-    two = two_bodies(kind, plane, world)
-    q = two.closed(3)
-    values = np.linalg.svd(two.jacobian(q), compute_uv=False)
+def test_rows_are_regular_at_a_closed_position(kind, plane, world):
+    bodies = two_bodies(kind, plane, world)
+    q = bodies.close_loop(3)
+    values = np.linalg.svd(bodies.jacobian(q), compute_uv=False)
     assert len(values) == len(CLOSINGS[kind].rows(plane))
-    assert values[-1] > 1e-4 * values[0]  # a slide may be far from its points
-    assert [b for b in two.branches(*q) if abs(b - 1) > 1e-12] == []
+    assert values[-1] > 1e-4 * values[0]  # a prismatic joint may be far from its points
+    assert [b for b in bodies.branches(*q) if abs(b - 1) > 1e-12] == []
 
 
 @pytest.mark.parametrize("kind", ["weld", "prismatic", "revolute", "cylindrical"])
-def test_rows_of_axes_are_small_rotations_about_the_named_axes(kind):
-    two = Two(kind, False, "first")
-    q = two.closed(4)
-    _, omega = two.twist(1, two.place(1, q)[0], q)
-    names = [row.name.removeprefix("pin_") for row in two.system.constraints]
-    slopes = dict(zip(names, two.jacobian(q), strict=True))
+def test_axis_rows_are_small_rotations_about_the_axes(kind):
+    bodies = TwoBodies(kind, False, "first")
+    q = bodies.close_loop(4)
+    _, omega = bodies.twist(1, bodies.frame_of(1, q)[0], q)
+    names = [row.name.removeprefix("pin_") for row in bodies.system.constraints]
+    slopes = dict(zip(names, bodies.jacobian(q), strict=True))
     if kind in ("weld", "prismatic"):
-        R = two.place(1, q)[1]  # the first frame, rotated, is the second
+        R = bodies.frame_of(1, q)[1]  # rotates the first frame into the second
         axes = {f"r{letter}": R[:, k] for k, letter in enumerate("xyz")}
     else:
-        loop = two.scene.assembly.loops[0]
+        loop = bodies.scene.assembly.loops[0]
         u, v, _ = (np.array(e, float) for e in perpendicular_axes(loop.axes[0], False))
         axes = {"ru": u, "rv": v}
     for name, axis in axes.items():
         np.testing.assert_allclose(slopes[name], axis @ omega, atol=1e-8)
 
 
-def test_a_wrong_sign_would_be_seen():
-    """The test of work itself: a reaction with its moment turned round fails it."""
-    two = Two("weld", True, "")
-    q = two.closed(5)
-    force, moment = two.loads(q, [0.3, 0.4, 0.5])
-    v, omega = two.twist(1, two.place(1, q)[0], q)
-    work = np.array([0.3, 0.4, 0.5]) @ two.jacobian(q)
+def test_comparison_detects_a_wrong_sign():
+    """A reaction with its moment reversed must fail the comparison of work."""
+    bodies = TwoBodies("weld", True, "")
+    q = bodies.close_loop(5)
+    force, moment = bodies.loads(q, [0.3, 0.4, 0.5])
+    v, omega = bodies.twist(1, bodies.frame_of(1, q)[0], q)
+    work = np.array([0.3, 0.4, 0.5]) @ bodies.jacobian(q)
     moved = np.abs(omega).max(axis=0) > 1e-6
     assert np.abs((force @ v - moment @ omega - work)[moved]).max() > 0.1
 
 
-def test_a_gear():
+def test_gear_couples_two_angles():
     scene = parse(
         """
 eomc = 1
@@ -303,14 +306,14 @@ def slider(joint, space):
     )
 
 
-def test_points_close_a_loop_without_points_of_its_own():
+def test_loop_without_points_uses_those_of_the_bodies():
     system = from_scene(parse(slider('joint = "point-on-line"\naxis = [1, 0]', False)))
     (row,) = system.constraints
     assert row.name == "pin"
     assert str(row.formula) == "end_joint_y - h"
 
 
-def test_a_row_that_no_motion_changes_is_left_out_and_told():
+def test_constant_row_is_dropped_with_a_warning():
     system = from_scene(parse(slider('joint = "spherical"', True)))
     assert [row.name for row in system.constraints] == ["pin_x", "pin_y"]
     (warning,) = system.warnings
@@ -319,7 +322,7 @@ def test_a_row_that_no_motion_changes_is_left_out_and_told():
     assert str(reaction.values) == "(pin_x_lambda_, pin_y_lambda_, 0, 0, 0, 0)"
 
 
-def test_hinges_in_a_plane_mechanism_of_space_keep_two_rows():
+def test_hinges_of_a_planar_mechanism_in_space_have_two_rows():
     system = from_scene(parse(slider('joint = "revolute"', True)))
     assert [row.name for row in system.constraints] == ["pin_x", "pin_y"]
     assert "left out: pin_z, pin_ru, pin_rv; what they would carry" in system.warnings[0].message

@@ -1,4 +1,4 @@
-"""The picture of a system made in Python: drawn, checked and worded as [picture] of a scene."""
+"""The picture of a system defined in Python is drawn and checked as the [picture] of a scene."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ T = np.array([0.0, 0.5])
 Q = np.array([[0.1, 0.2], [-0.4, 1.3]])
 
 
-def made(picture: Any) -> eomc.System:
-    """The crane of the scene."""
+def crane_with(picture: Any) -> eomc.System:
+    """Return the crane of the scene."""
     return eomc.System.make(
         "crane", ["x", "theta"], "m*x_dot**2/2 + m*(dot(x_p)**2 + dot(y_p)**2)/2", "9.81*m*y_p",
         parameters={"m": 2.0, "l": 1.5}, definitions={"x_p": "x - l*sin(theta)",
@@ -65,20 +65,20 @@ def made(picture: Any) -> eomc.System:
     )  # fmt: skip
 
 
-def same(one: Any, other: Any) -> None:
+def are_equal(one: Any, other: Any) -> None:
     assert (one.marks, one.paths, one.axes) == (other.marks, other.paths, other.axes)
     assert one.unit == other.unit and np.allclose(one.points, other.points, atol=1e-15)
 
 
-def test_it_is_drawn_as_that_of_a_scene() -> None:
+def test_python_picture_is_drawn_as_that_of_a_scene() -> None:
     scene = from_scene(parse(SCENE + PICTURE))
-    system = made(tomllib.loads(PICTURE)["picture"])
-    same(draw_mechanism(system, T, Q), draw_mechanism(scene, T, Q))
+    system = crane_with(tomllib.loads(PICTURE)["picture"])
+    are_equal(draw_mechanism(system, T, Q), draw_mechanism(scene, T, Q))
     longer = draw_mechanism(system.with_parameters({"l": 3.0}), T, Q)
-    same(longer, draw_mechanism(scene.with_parameters({"l": 3.0}), T, Q))
+    are_equal(longer, draw_mechanism(scene.with_parameters({"l": 3.0}), T, Q))
 
 
-def test_expressions_stand_as_formulas_do() -> None:
+def test_expressions_are_written_as_formulas() -> None:
     q, theta = dynamicsymbols("x theta")
     m, l, g = sympy.symbols("m l g", positive=True)  # noqa: E741 - the scene's name
     at = sympy.Matrix([q - l * sympy.sin(theta), l * sympy.cos(theta)])
@@ -98,7 +98,9 @@ def test_expressions_stand_as_formulas_do() -> None:
             "axes": "xz",
         },
     )  # fmt: skip
-    same(draw_mechanism(system, T, Q), draw_mechanism(from_scene(parse(SCENE + PICTURE)), T, Q))
+    are_equal(
+        draw_mechanism(system, T, Q), draw_mechanism(from_scene(parse(SCENE + PICTURE)), T, Q)
+    )
 
 
 @pytest.mark.parametrize(
@@ -121,17 +123,19 @@ def test_expressions_stand_as_formulas_do() -> None:
         'dots = [["x", 0]]\naxes = "zx"',
     ],
 )
-def test_faults_are_told_as_those_of_a_scene(picture: str) -> None:
+def test_invalid_picture_gives_the_message_of_a_scene(picture: str) -> None:
     with pytest.raises(SceneError) as of_scene:
         parse(SCENE + "[picture]\n" + picture)
     with pytest.raises(SceneError, match=r"System\.make: error: picture") as of_python:
-        made(tomllib.loads(picture))
-    told = [
+        crane_with(tomllib.loads(picture))
+    messages = [
         (p.key, message_in_python(p.message))
         for p in of_scene.value.problems
         if p.severity == "error"
     ]
-    assert told == [(p.key, p.message) for p in of_python.value.problems if p.severity == "error"]
+    assert messages == [
+        (p.key, p.message) for p in of_python.value.problems if p.severity == "error"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -147,16 +151,16 @@ def test_faults_are_told_as_those_of_a_scene(picture: str) -> None:
         ({"dots": [[True, False]]}, "a formula in quotes, here True"),
     ],
 )
-def test_advice_is_in_the_words_of_python(picture: Any, advice: str) -> None:
-    with pytest.raises(SceneError) as told:
-        made(picture)
-    (problem,) = told.value.problems[:1]
+def test_advice_uses_the_terms_of_python(picture: Any, advice: str) -> None:
+    with pytest.raises(SceneError) as error:
+        crane_with(picture)
+    (problem,) = error.value.problems[:1]
     assert advice in problem.message
     assert not re.search(r"\w = |table|\[picture|{ | }", problem.message), problem.message
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"),
+    ("picture", "message"),
     [
         ([1], r"picture: give a dict, such as .*\[1\]"),
         ({"dots": [[sympy.Symbol("zz"), 0]]}, "picture: zz not declared"),
@@ -167,19 +171,19 @@ def test_advice_is_in_the_words_of_python(picture: Any, advice: str) -> None:
         ({"dots": [[sympy.Symbol("x_dot"), 0]]}, "picture.dots: a picture can't depend on velo"),
     ],
 )
-def test_faults_of_python_are_told(picture: Any, said: str) -> None:
-    with pytest.raises(EomcError, match=said):
-        made(picture)
+def test_invalid_python_pictures_are_refused(picture: Any, message: str) -> None:
+    with pytest.raises(EomcError, match=message):
+        crane_with(picture)
 
 
-def test_a_module_is_built_anew_where_its_picture_changes() -> None:
-    bare, one, other = (made(p) for p in (None, {"dots": [["x", 0]]}, {"dots": [["x", 1]]}))
+def test_module_is_rebuilt_when_its_picture_changes() -> None:
+    bare, one, other = (crane_with(p) for p in (None, {"dots": [["x", 0]]}, {"dots": [["x", 1]]}))
     assert len({bare.digest, one.digest, other.digest}) == 3
-    assert made({"dots": [["x", 0]]}).digest == one.digest
+    assert crane_with({"dots": [["x", 0]]}).digest == one.digest
 
 
 @pytest.mark.parametrize("name", sorted({*formulas.FUNCTIONS} - {"dot"}))
-def test_every_function_is_written_as_formulas_have_it(name: str) -> None:
+def test_every_function_is_written_in_formula_syntax(name: str) -> None:
     fewest, _ = formulas.FUNCTIONS[name]
     known = {"x": 0.3, "y": 0.7}
     written = f"{name}(x, y)" if fewest == 2 else f"{name}(x)"
@@ -191,6 +195,8 @@ def test_every_function_is_written_as_formulas_have_it(name: str) -> None:
     assert np.isclose(value, direct + np.e - 1 / 7 + 0.1, rtol=1e-14)
 
 
-def test_its_runs_move_in_pages(modules: Modules) -> None:
-    drawn = modules.unoptimised(made({"lines": [[["x", 0], ["x_p", "y_p"]]], "paths": [["x", 0]]}))
+def test_runs_are_animated_in_pages(modules: Modules) -> None:
+    drawn = modules.unoptimised(
+        crane_with({"lines": [[["x", 0], ["x_p", "y_p"]]], "paths": [["x", 0]]})
+    )
     assert 'class="stage"' in drawn.simulate(steps=20).animate().page

@@ -1,4 +1,4 @@
-"""Systems made in Python: plain symbols and dynamicsymbols give what a scene gives."""
+"""Systems defined in Python by plain symbols or dynamicsymbols equal those of scenes."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def cartpole_by_symbols() -> System:
 
 
 @pytest.mark.parametrize("make", [cartpole_by_dynamicsymbols, cartpole_by_symbols])
-def test_it_moves_as_the_scene_does(make: object, modules: Modules) -> None:
+def test_python_cartpole_moves_as_the_scene(make: object, modules: Modules) -> None:
     assert callable(make)
-    made = modules.unoptimised(make()).simulate(h=0.005, duration=10.0)
+    run = modules.unoptimised(make()).simulate(h=0.005, duration=10.0)
     scene = modules("cartpole").simulate(h=0.005, duration=10.0)
-    assert np.max(np.abs(made.q - scene.q)) < 1e-12
+    assert np.max(np.abs(run.q - scene.q)) < 1e-12
 
 
-def test_inputs_forces_dissipation_and_units(modules: Modules) -> None:
+def test_inputs_forces_dissipation_and_units_are_accepted(modules: Modules) -> None:
     theta = dynamicsymbols("theta")
     m, b, torque = sympy.symbols("m b torque")
     system = System.make(
@@ -66,7 +66,7 @@ def test_inputs_forces_dissipation_and_units(modules: Modules) -> None:
     assert wheel.acceleration([0.0], [2.0], u=[3.0]) == pytest.approx([(3.0 - 0.6) / 2])
 
 
-def test_names_that_c_cannot_bear_are_mapped_and_reported() -> None:
+def test_names_invalid_in_c_are_mapped_and_reported() -> None:
     theta = dynamicsymbols(r"\theta_{1}")
     double = sympy.Symbol("lambda")
     system = System.make("mapped", [theta], double * theta.diff() ** 2 / 2, parameters={double: 1})
@@ -75,7 +75,7 @@ def test_names_that_c_cannot_bear_are_mapped_and_reported() -> None:
     assert r"\theta_{1} is theta_1" in header and "lambda is lambda_1" in header
 
 
-def test_the_same_system_is_not_built_twice(tmp_path: Path, quickly_compiled: None) -> None:
+def test_same_system_is_built_once(tmp_path: Path, quickly_compiled: None) -> None:
     assert eomc.load(cartpole_by_symbols(), tmp_path) is eomc.load(cartpole_by_symbols(), tmp_path)
 
 
@@ -83,7 +83,7 @@ x, x_dot, u = sympy.symbols("x x_dot u")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "said"),
+    ("arguments", "options", "message"),
     [
         (("a", [x], sympy.Symbol("M") * x_dot**2), {}, "M not declared"),
         (("a", [], x_dot**2), {}, "at least one coordinate"),
@@ -183,15 +183,15 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         ),
     ],
 )
-def test_what_is_wrong_is_said(
-    arguments: tuple[object, ...], options: dict[str, object], said: str
+def test_invalid_arguments_are_refused_with_a_message(
+    arguments: tuple[object, ...], options: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(EomcError, match=said):
+    with pytest.raises(EomcError, match=message):
         System.make(*arguments, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("method", "did you mean 'methods'"),
         ("V", "did you mean 'potential'"),
@@ -200,14 +200,14 @@ def test_what_is_wrong_is_said(
         ("gravity", "it has name, coordinates, kinetic, potential, parameters, .*, friction$"),
     ],
 )
-def test_an_argument_that_is_not_there_is_told_with_what_is_meant(name: str, said: str) -> None:
-    with pytest.raises(TypeError, match=f"^System.make has no argument '{name}'.*{said}"):
+def test_unknown_argument_suggests_the_right_one(name: str, message: str) -> None:
+    with pytest.raises(TypeError, match=f"^System.make has no argument '{name}'.*{message}"):
         System.make("a", [x], x_dot**2, **{name: 1})  # type: ignore[arg-type]
 
 
-def test_names_and_formulas_as_text() -> None:
-    """The same system as from symbols, and both may be mixed."""
-    made = System.make(
+def test_names_and_formulas_are_accepted_as_text() -> None:
+    """Text gives the same system as symbols, and both may be mixed."""
+    system = System.make(
         "texts", {"x": ("pi/2", 0.1), "theta": 0}, "m*x_dot**2/2 + m*dot(y)**2/2", "m*g*y + m*z",
         parameters={"m": "1/2", "g": 9.81, "l": 2},
         definitions={"y": "l*cos(theta)", "z": "abs(x)"},
@@ -222,7 +222,7 @@ def test_names_and_formulas_as_text() -> None:
         definitions={y: l * sympy.cos(theta), z: sympy.Abs(x)}, inputs={F: sympy.sin(2 * t)},
         forces={x: F - sympy.Max(x, 0)}, units={x: "m"}, dissipation=x_dot**2,
     )  # fmt: skip
-    assert made == same and made.digest == same.digest
+    assert system == same and system.digest == same.digest
     mixed = System.make("m", ["x"], x_dot**2 / 2, x * m, parameters={"m": 1}, forces={x: "-x"})
     assert mixed == System.make("m", [x], x_dot**2 / 2, "x*m", parameters={m: 1}, forces={"x": -x})
     q = dynamicsymbols("x")
@@ -239,11 +239,11 @@ def value(expr: sympy.Expr, at: float) -> float:
     "function",
     [sympy.sec, sympy.csc, sympy.cot, sympy.sech, sympy.csch, sympy.coth, sympy.asec, sympy.acsc],
 )
-def test_functions_are_written_in_those_there_are(function: Any) -> None:
-    made = System.make("a", [x], x_dot**2 / 2, function(2 * x + 1)).potential
-    assert not made.has(function)
+def test_functions_are_rewritten_in_supported_ones(function: Any) -> None:
+    potential = System.make("a", [x], x_dot**2 / 2, function(2 * x + 1)).potential
+    assert not potential.has(function)
     for at in (-1.7, 0.3, 2.0):
-        assert value(made, at) == pytest.approx(float(function(2 * at + 1)), rel=1e-14)
+        assert value(potential, at) == pytest.approx(float(function(2 * at + 1)), rel=1e-14)
 
 
 PIECES = {
@@ -258,16 +258,18 @@ PIECES = {
 
 
 @pytest.mark.parametrize("pieces", PIECES.values(), ids=list(PIECES))
-def test_pieces_that_meet_are_sums_of_max(pieces: Any) -> None:
-    given = sympy.Piecewise(*pieces)
-    made = System.make("a", [x], x_dot**2 / 2, given).potential
-    assert not made.has(sympy.Piecewise, sympy.Heaviside)
+def test_continuous_piecewise_becomes_sums_of_max(pieces: Any) -> None:
+    piecewise = sympy.Piecewise(*pieces)
+    potential = System.make("a", [x], x_dot**2 / 2, piecewise).potential
+    assert not potential.has(sympy.Piecewise, sympy.Heaviside)
     for at in (-3.0, -1.0, -0.4, 0.0, 0.3, 0.5, 0.7, 1.0, 2.5):
-        assert value(made, at) == pytest.approx(float(given.subs(x, at)), rel=1e-14, abs=1e-14)
+        assert value(potential, at) == pytest.approx(
+            float(piecewise.subs(x, at)), rel=1e-14, abs=1e-14
+        )
 
 
 @pytest.mark.parametrize(
-    ("pieces", "said"),
+    ("pieces", "message"),
     [
         (
             ((1, x > 0), (0, True)),
@@ -281,8 +283,8 @@ def test_pieces_that_meet_are_sums_of_max(pieces: Any) -> None:
         (((x, x > 1), (u * x, u > 0), (0, True)), "can't be seen not to"),
     ],
 )
-def test_pieces_that_jump_are_refused(pieces: Any, said: str) -> None:
-    with pytest.raises(EomcError, match=f"force on x: .*{said}"):
+def test_discontinuous_piecewise_is_refused(pieces: Any, message: str) -> None:
+    with pytest.raises(EomcError, match=f"force on x: .*{message}"):
         System.make("a", [x], x_dot**2 / 2, inputs=[u], forces={x: sympy.Piecewise(*pieces)})
 
 
@@ -298,16 +300,18 @@ BETWEEN = {
 
 
 @pytest.mark.parametrize("pieces", BETWEEN.values(), ids=list(BETWEEN))
-def test_pieces_between_thresholds_of_known_order(pieces: Any) -> None:
-    """-a < a is known where a is a positive symbol."""
-    given = sympy.Piecewise(*pieces)
-    made = System.make("a", [x], x_dot**2 / 2, given, parameters={a: 0.5, b: 0.25, k: 3}).potential
-    assert not made.has(sympy.Piecewise, sympy.Heaviside)
+def test_piecewise_with_thresholds_of_known_order(pieces: Any) -> None:
+    """-a < a holds for a positive symbol a."""
+    piecewise = sympy.Piecewise(*pieces)
+    potential = System.make(
+        "a", [x], x_dot**2 / 2, piecewise, parameters={a: 0.5, b: 0.25, k: 3}
+    ).potential
+    assert not potential.has(sympy.Piecewise, sympy.Heaviside)
     for at in (-3.0, -0.5, -0.4, 0.0, 0.1, 0.25, 0.5, 0.7, 1.0, 2.5, 3.1, 3.5, 8.0):
         values = {"x": at, "a": 0.5, "b": 0.25, "k": 3.0}
-        right = float(given.subs({a: 0.5, b: 0.25, k: 3.0}).subs(x, at))
-        found = float(made.subs({s: values[s.name] for s in made.free_symbols}))
-        assert found == pytest.approx(right, rel=1e-14, abs=1e-14)
+        right = float(piecewise.subs({a: 0.5, b: 0.25, k: 3.0}).subs(x, at))
+        result = float(potential.subs({s: values[s.name] for s in potential.free_symbols}))
+        assert result == pytest.approx(right, rel=1e-14, abs=1e-14)
 
 
 def test_thresholds_of_unknown_order_are_refused_with_the_remedy() -> None:
@@ -319,22 +323,22 @@ def test_thresholds_of_unknown_order_are_refused_with_the_remedy() -> None:
         System.make("a", [x], x_dot**2 / 2, a * x, parameters={a: -1})
 
 
-def test_a_derivative_that_waits_is_done() -> None:
+def test_unevaluated_derivative_is_evaluated() -> None:
     q, t = dynamicsymbols("x"), dynamicsymbols._t
-    made = System.make("a", [q], sympy.Derivative(q**2, t) ** 2)
-    at = made.coordinates[0]
-    assert made.kinetic == (2 * at.q * at.qd) ** 2
+    system = System.make("a", [q], sympy.Derivative(q**2, t) ** 2)
+    at = system.coordinates[0]
+    assert system.kinetic == (2 * at.q * at.qd) ** 2
 
 
 @pytest.mark.parametrize("inside", [x_dot, dot(x), u * x])
-def test_rates_that_nobody_knows_are_refused(inside: sympy.Expr) -> None:
+def test_unknown_derivatives_are_refused(inside: sympy.Expr) -> None:
     system = System.make("a", [x], x_dot**2 / 2, inputs=[u], forces={x: dot(inside)})
     with pytest.raises(EomcError, match=r"rate|accelerations"):
         eomc.sources(system)
 
 
 @pytest.mark.parametrize("jump", [sympy.sign(x), sympy.Heaviside(x)])
-def test_jumps_in_energies_are_refused_and_the_energy_is_named(jump: sympy.Expr) -> None:
+def test_discontinuous_energy_is_refused_by_name(jump: sympy.Expr) -> None:
     with pytest.raises(EomcError, match=r"potential: (sign|Heaviside)\(...\) jumps"):
         System.make("a", [x], x_dot**2 / 2, x * jump)
     y = sympy.Symbol("y")
@@ -343,13 +347,13 @@ def test_jumps_in_energies_are_refused_and_the_energy_is_named(jump: sympy.Expr)
     assert System.make("a", [x], x_dot**2 / 2, forces={x: jump}).forces[0] != 0
 
 
-def test_jumps_of_parameters_are_numbers() -> None:
+def test_discontinuous_functions_of_parameters_are_accepted() -> None:
     a = sympy.Symbol("a")
-    made = System.make("s", [x], x_dot**2 / 2, sympy.sign(a) * x**2, parameters={a: 1})
-    assert made.potential.has(sympy.sign)
+    system = System.make("s", [x], x_dot**2 / 2, sympy.sign(a) * x**2, parameters={a: 1})
+    assert system.potential.has(sympy.sign)
 
 
-def test_steps_and_matrices_are_refused() -> None:
+def test_step_functions_and_matrices_are_refused() -> None:
     with pytest.raises(EomcError, match="h: must be greater than zero, here -1"):
         System.make("a", [x], x_dot**2 / 2, h=-1)
     with pytest.raises(EomcError, match="kinetic: give one expression, not a matrix of 1 by 1"):
@@ -364,13 +368,13 @@ def test_steps_and_matrices_are_refused() -> None:
         ("parameters.m", {"parameters": {sympy.Symbol("m"): 1e39}}),
     ],
 )
-def test_numbers_that_no_float_can_be(key: str, more: dict[str, Any]) -> None:
+def test_numbers_beyond_single_precision_are_refused(key: str, more: dict[str, Any]) -> None:
     assert System.make("a", [x], x_dot**2 / 2, **more)
     with pytest.raises(EomcError, match=f"{key}: .* a float can be"):
         System.make("a", [x], x_dot**2 / 2, real="float", **more)
 
 
-def test_a_scene_of_floats_says_where_a_number_is_too_large() -> None:
+def test_too_large_number_in_a_float_scene_is_located() -> None:
     text = """eomc = 1
 name = "a"
 [coordinates]
@@ -387,25 +391,25 @@ h = 1e-60
 
 
 @pytest.mark.parametrize("more", [sympy.Abs(x_dot) ** 3, sympy.sqrt(x_dot**2)])
-def test_a_kinetic_energy_that_is_not_quadratic_is_named(more: sympy.Expr) -> None:
+def test_kinetic_energy_not_quadratic_is_named(more: sympy.Expr) -> None:
     system = System.make("a", [x], x_dot**2 / 2 + more)
     with pytest.raises(EomcError, match=r"error: kinetic: .* (quadratic|jumps)"):
         eomc.sources(system)
 
 
-def test_a_method_may_be_named_alone() -> None:
+def test_method_may_be_set_without_other_options() -> None:
     assert System.make("a", [x], x_dot**2 / 2, methods="dp8").run.methods == ("dp8",)
     assert System.make("a", {x: [0.1, 0.2]}, x_dot**2 / 2).coordinates[0].rate == 0.2
 
 
-@pytest.mark.parametrize("given", [3, None, {}, b"scene.toml", ["scene.toml"]])
-def test_what_is_no_scene_is_refused(given: object) -> None:
+@pytest.mark.parametrize("argument", [3, None, {}, b"scene.toml", ["scene.toml"]])
+def test_argument_that_is_no_scene_is_refused(argument: object) -> None:
     for function in (eomc.load, eomc.build, eomc.read):
         with pytest.raises(EomcError, match="give the path of a scene"):
-            function(given)  # type: ignore[operator]
+            function(argument)  # type: ignore[operator]
 
 
-def test_texts_and_paths_for_something_else_are_refused() -> None:
+def test_unsuitable_texts_and_paths_are_refused() -> None:
     with pytest.raises(EomcError, match="not its text"):
         eomc.load((SCENES / "cartpole.toml").read_text(encoding="utf-8"))
     with pytest.raises(EomcError, match="root: give the path of a folder, here 3"):
@@ -417,48 +421,48 @@ def test_texts_and_paths_for_something_else_are_refused() -> None:
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0])
-def test_a_mass_that_is_not_positive_is_named(value: float) -> None:
+def test_mass_that_is_not_positive_is_named(value: float) -> None:
     m = sympy.Symbol("m")
     system = System.make("a", [x], m * x_dot**2 / 2, x**2, parameters={m: value})
     with pytest.raises(EomcError, match=rf"'x' has no inertia, at m = {value:g}: masses"):
         eomc.sources(system)
 
 
-def test_a_scene_named_without_its_folder_is_suggested(
+def test_scene_without_its_folder_is_suggested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "crane.toml").write_text("", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    for given in ("crane", "crane.toml", "scenes/crane"):
+    for name in ("crane", "crane.toml", "scenes/crane"):
         with pytest.raises(EomcError, match=r"did you mean 'scenes/crane\.toml'\?"):
-            eomc.read(given)
+            eomc.read(name)
 
 
-def test_what_is_left_out() -> None:
-    made = System.make("free", ["x"], "x_dot**2/2")
-    assert (made.potential, made.dissipation, made.forces) == (0, 0, (0,))
-    assert (made.inputs, made.outputs, made.constraints, made.events) == ((), (), (), ())
-    assert (made.run.h, made.run.duration, made.run.methods) == (0.001, 10.0, ("rk4",))
-    assert (made.run.real, made.run.batch, made.run.tolerance) == ("double", False, None)
-    assert not made.run.linearize and not made.run.discretize
-    (x,) = made.coordinates
+def test_omitted_arguments_have_defaults() -> None:
+    system = System.make("free", ["x"], "x_dot**2/2")
+    assert (system.potential, system.dissipation, system.forces) == (0, 0, (0,))
+    assert (system.inputs, system.outputs, system.constraints, system.events) == ((), (), (), ())
+    assert (system.run.h, system.run.duration, system.run.methods) == (0.001, 10.0, ("rk4",))
+    assert (system.run.real, system.run.batch, system.run.tolerance) == ("double", False, None)
+    assert not system.run.linearize and not system.run.discretize
+    (x,) = system.coordinates
     assert (x.start, x.rate) == (0, 0)
 
 
-def test_accelerations_are_read_by_what_may_name_them() -> None:
-    def made(**asked: Any) -> System:
-        return System.make("free", ["x"], "x_dot**2/2", **asked)
+def test_accelerations_are_available_to_outputs_and_events() -> None:
+    def make(**options: Any) -> System:
+        return System.make("free", ["x"], "x_dot**2/2", **options)
 
-    assert not made().reads_qdd
-    assert made(outputs={"a": "x"}).reads_qdd
-    assert made(events={"low": "x"}, tolerance=1e-6).reads_qdd
+    assert not make().reads_qdd
+    assert make(outputs={"a": "x"}).reads_qdd
+    assert make(events={"low": "x"}, tolerance=1e-6).reads_qdd
 
 
-def test_a_step_is_a_number_of_full_precision() -> None:
-    def made(h: float) -> System:
+def test_step_size_is_in_the_normal_range_of_the_type() -> None:
+    def make(h: float) -> System:
         return System.make("free", ["x"], "x_dot**2/2", real="float", h=h)
 
-    assert made(2.0**-126).run.h == 2.0**-126
+    assert make(2.0**-126).run.h == 2.0**-126
     with pytest.raises(EomcError, match="less than a float can be"):
-        made(2.0**-126.5)
+        make(2.0**-126.5)

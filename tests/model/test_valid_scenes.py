@@ -1,4 +1,4 @@
-"""Valid scenes build and are right; what has no meaning is refused at its line, with a remedy."""
+"""Valid scenes build with correct results; others are refused at their line, with a remedy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def text(
     potential: str = "x**2/2",
     run: str = "",
 ) -> str:
-    """A scene of one mass on a spring, but for what is given."""
+    """Write a scene of one mass on a spring with the given parts replaced."""
     return f"""eomc = 1
 name = "{name}"
 [coordinates]
@@ -43,7 +43,7 @@ duration = 0.2
 """
 
 
-def made(scene_text: str) -> System:
+def system_from(scene_text: str) -> System:
     return from_scene(parse(scene_text, "valid.toml"))
 
 
@@ -80,7 +80,7 @@ VALID = {
                  "sinf_dot**2/2", "cos(sinf)*cosf", "real = 'float'"),
     "own": text("own", "own_D = { start = 1 }", "own_params = 1", "own_sincos = 'sin(own_D)*own_D'",
                 "own_D_dot**2/2", "cos(own_D)*own_sincos*own_params"),
-    # three angles of time and three of the state in one function, each three side by side
+    # three angles of time and three of the state in one function, grouped by three
     "three_and_three": text(
         "three_and_three",
         "x = { start = 0.3 }\ny = { start = 0.2 }\nz = { start = 0.1 }",
@@ -92,8 +92,8 @@ VALID = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VALID)
-def test_valid_scenes_build_and_have_the_values_of_the_reference(name: str) -> None:
-    built = made(VALID[name])
+def test_valid_scenes_agree_with_the_reference(name: str) -> None:
+    built = system_from(VALID[name])
     rows = check(built, eomc.load(built, BUILDS), states=4).results
     values = [row for row in rows if row.name in ("D", "C", "g", "bias", "acceleration")]
     assert len(values) >= 4
@@ -101,8 +101,8 @@ def test_valid_scenes_build_and_have_the_values_of_the_reference(name: str) -> N
 
 
 @pytest.mark.slow
-def test_python_keeps_the_names_of_the_author() -> None:
-    module = eomc.load(made(VALID["macros"]), BUILDS)
+def test_python_module_uses_the_names_of_the_scene() -> None:
+    module = eomc.load(system_from(VALID["macros"]), BUILDS)
     assert list(module.coordinates) == ["NAN", "errno"]
     assert dict(module.defaults) == {"M_PI": 1.5, "EOF": 0.5}
     one, other = (module.acceleration([0.3, 0.2], [0, 0], params=p) for p in ({}, {"EOF": 0.7}))
@@ -111,7 +111,7 @@ def test_python_keeps_the_names_of_the_author() -> None:
     assert "Names that C can't bear: NAN is NAN_, errno is errno_" in header
 
 
-LONG = "o = '(1234567/1234568)**64'\np = 'o**8'\n"  # of 7168 digits
+LONG = "o = '(1234567/1234568)**64'\np = 'o**8'\n"  # with 7168 digits
 
 
 @pytest.mark.parametrize(
@@ -141,34 +141,34 @@ LONG = "o = '(1234567/1234568)**64'\np = 'o**8'\n"  # of 7168 digits
         ),
     ],
 )
-def test_what_has_no_meaning_is_refused_at_its_line(
+def test_meaningless_scene_is_refused_at_its_line(
     change: dict[str, str], key: str, words: str
 ) -> None:
     with pytest.raises(SceneError) as reported:
-        made(text("refused", **change))
+        system_from(text("refused", **change))
     (problem,) = reported.value.problems
     assert problem.key == key and words in problem.message and problem.line > 0
 
 
-def test_a_number_beyond_doubles_is_refused_in_words() -> None:
+def test_number_beyond_doubles_is_refused_with_a_message() -> None:
     with pytest.raises(EomcError, match=r"a number of 2.0E\+580, more than a double can be"):
-        eomc.sources(made(text("beyond", potential="(1e290*x)**2")))
+        eomc.sources(system_from(text("beyond", potential="(1e290*x)**2")))
 
 
 @pytest.mark.parametrize(
     "name", ["main", "Main", "selftest", "binding", "UINT64", "INT8", "sig", "Py_nb", "numpy",
              "math", "sys", "cffi", "eomc", "test", "r"],
 )  # fmt: skip
-def test_scenes_that_would_hide_files_or_modules_are_refused(name: str) -> None:
+def test_names_that_shadow_files_or_modules_are_refused(name: str) -> None:
     with pytest.raises(SceneError) as reported:
-        made(text(name))
+        system_from(text(name))
     (problem,) = reported.value.problems
     assert problem.key == "name" and f"use {name}_scene" in problem.message and problem.line == 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["runtime", "batch", "estimate", "scene", "build", "uint64"])
-def test_scenes_called_like_parts_of_a_build_build(name: str) -> None:
-    module = eomc.load(made(text(name, run="batch = true")), BUILDS)
+def test_scenes_named_like_parts_of_a_build_are_built(name: str) -> None:
+    module = eomc.load(system_from(text(name, run="batch = true")), BUILDS)
     assert module.acceleration([0.5], [0.0])[0] == pytest.approx(-0.4)
     assert module.simulate_batch([[0.5]], [[0.0]], steps=2).q.shape[0] == 1
