@@ -163,7 +163,7 @@ def test_without_eomc_a_run_says_what_to_do(modules, monkeypatch):
     from importlib import import_module
 
     run = modules("cartpole").simulate(duration=0.1)
-    shown = import_module(type(run).__module__.replace(".trajectory", ".plugins"))
+    shown = import_module(type(run).__module__.replace(".trajectory", ".package"))
 
     def missing(name):
         raise ModuleNotFoundError(name, name="eomc")
@@ -190,7 +190,7 @@ def batch():
     runs = batches.module("cartpole").simulate_batch(
         steps=400, params={"l": np.linspace(1.0, 3.0, 10)}
     )
-    runs.q[9, 200:], runs.qd[9, 200:], runs._codes[9] = np.nan, np.nan, 1
+    runs.q[9, 200:], runs.qd[9, 200:], runs.status_codes[9] = np.nan, np.nan, 1
     return runs
 
 

@@ -215,7 +215,7 @@ def test_what_is_built_and_unchanged_needs_no_compiler(
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
     scene.write_text(TEXT, encoding="utf-8")
-    (built.folder / "_runtime" / "slices.py").write_text("", encoding="utf-8")  # no longer whole
+    (built.folder / "_runtime" / "status.py").write_text("", encoding="utf-8")  # no longer whole
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
 

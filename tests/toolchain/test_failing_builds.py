@@ -107,8 +107,8 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
 ) -> None:  # fmt: skip
     """Header, C, Python's files and library, at whichever of them it fails."""
     folder, move, moved = root / "simple_pendulum", os.replace, list[str]()
-    (folder / "_runtime" / "slices.py").write_text("of another version", encoding="utf-8")
-    (folder / "_runtime" / "laws.py").unlink()  # which that had not yet
+    (folder / "_runtime" / "status.py").write_text("of another version", encoding="utf-8")
+    (folder / "_runtime" / "inputs.py").unlink()  # which that had not yet
     before, last = contents(folder), ""
 
     def failing(old: Path, new: Path) -> None:

@@ -599,7 +599,7 @@ def measure_growth(
         with np.errstate(all="ignore"):
             products.append(((np.array(ends[1:]) - ends[0]).T / DIFFERENCE_STEP) @ products[-1])
     x, t = reference.halves[0][::stride], reference.t[::stride]
-    D = mean_mass_matrix(module, x[:, :n], t)
+    D = mean_mass_matrix(model_of(module), x[:, :n], t)
     moved = np.moveaxis(np.array(products), 2, 0) * scale  # by one scale of each at the start
     root = norm_root(D, [*moved], duration)
     start = np.diag(scale)

@@ -72,7 +72,7 @@ def own_model() -> Any:
 
 def model_of(package: ModuleType) -> Any:
     """Return the `Model` of a built package; None if the module is not a built package."""
-    return vars(package).get("_model")
+    return getattr(package, "_model", None)
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
