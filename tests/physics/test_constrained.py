@@ -1,7 +1,7 @@
-"""Compiled scenes with constraints against trusted answers (data/constrained.json).
+"""Compiled scenes with constraints against reference solutions (data/constrained.json).
 
-An independent RK4 that put each step back onto the rows made the errors `projected`: ours are to be
-no more than half as large again, twice where rows depend on each other on the way.
+`projected` are the errors of an independent RK4 that projects each step onto the constraints. Ours
+may be at most half as large again, or twice as large where constraints become dependent on the way.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ ALIKE = 1.5  # times the error of the independent RK4
 
 @cache
 def module(name: str) -> ModuleType:
-    """A case from its guess, with rk4 and dp8."""
-    made = constrained.system(name, "guess", redundant=False)
-    run = replace(made.run, methods=("rk4", "dp8"))
-    made = replace(made, name=f"case_{name.lower()}", run=run, digest=f"constrained {name}")
-    return eomc.load(assembled(made), BUILT)
+    """Load a case from its guessed initial values, with rk4 and dp8."""
+    system = constrained.system(name, "guess", redundant=False)
+    run = replace(system.run, methods=("rk4", "dp8"))
+    system = replace(system, name=f"case_{name.lower()}", run=run, digest=f"constrained {name}")
+    return eomc.load(assembled(system), BUILT)
 
 
 def simulate(name: str, **how: Any) -> Any:
     with warnings.catch_warnings(
         action="ignore", category=RuntimeWarning
-    ):  # singular steps are looked at below
+    ):  # other tests below check singular steps
         return module(name).simulate(**how)
 
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
-def test_rk4_is_as_good_as_an_independent_one(name: str) -> None:
+def test_error_of_rk4_is_that_of_an_independent_rk4(name: str) -> None:
     case = constrained.cases()[name]
     for measured in case["rk4_measured"]:
         steps = measured["steps"]
@@ -58,7 +58,7 @@ def test_rk4_is_as_good_as_an_independent_one(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
-def test_rows_and_rates_hold_at_every_output(name: str) -> None:
+def test_constraints_are_satisfied_at_every_output(name: str) -> None:
     measured = constrained.cases()[name]["rk4_measured"][-1]
     run = simulate(name, h=measured["h"], steps=measured["steps"], every=5)
     own = module(name)
@@ -70,60 +70,64 @@ def test_rows_and_rates_hold_at_every_output(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, *QUICK))
-def test_accelerations_and_multipliers_at_trusted_states(name: str) -> None:
-    """A^T lambda where rows are redundant: other rows may bear what these do."""
+def test_accelerations_and_multipliers_at_reference_states(name: str) -> None:
+    """Compare A^T lambda where constraints are redundant, because the multipliers are not
+    unique.
+    """
     own = module(name)
     q, qd, a, multipliers = constrained.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
     t = float(constrained.cases()[name]["t_end"])
     off = np.max(np.abs(own.acceleration(q, qd, t) - a)) / np.max(np.abs(a))
     assert off < 1e-10
     A = own.constraint_jacobian(q, t=t)
-    found, expected = own.multipliers(q, qd, t), multipliers
+    computed, expected = own.multipliers(q, qd, t), multipliers
     if constrained.cases()[name]["redundant"]:
-        found, expected = found @ A, expected @ A
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(expected)))
+        computed, expected = computed @ A, expected @ A
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-10 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
-def test_dp8_comes_down_to_eleven_digits(name: str) -> None:
-    """In steps of a quarter of the finest of RK4."""
+def test_dp8_reaches_eleven_digits(name: str) -> None:
+    """The step size is a quarter of the smallest one of RK4."""
     measured = constrained.cases()[name]["rk4_measured"][-1]
     steps = 4 * measured["steps"]
     how = {"h": measured["h"] / 4, "steps": steps, "every": steps, "method": "dp8"}
     run = simulate(name, **how)
     moved = simulate(name, **how, q0=module(name).start[0] * (1 + 2.0**-52))
-    floor = np.max(np.abs(moved.q[-1] - run.q[-1]))  # what a rounding of the start makes
+    floor = np.max(np.abs(moved.q[-1] - run.q[-1]))  # effect of rounding the initial state
     assert constrained.error_of(name, run.q[-1]) <= 1e-11 + 30 * floor
 
 
 @pytest.mark.slow
-def test_steps_that_end_where_a_four_bar_lies_flat() -> None:
-    """Thirty step sizes: right behind the singular position, and told."""
+def test_steps_that_end_near_the_singular_position_of_a_four_bar() -> None:
+    """Thirty step sizes end just behind the singular position; singular steps are reported."""
     name = "iftomm_A02_four_bar_N1"
     fine = simulate(name, h=1e-4, steps=7200)
     y = fine.q[:, 1]
     k = int(np.argmax(y < 0))
     flat = float(fine.t[k - 1] + 1e-4 * y[k - 1] / (y[k - 1] - y[k]))
     assert flat == pytest.approx(0.7085, abs=1e-3)
-    energy, told = [], 0
+    energy, reported = [], 0
     for steps in range(20, 50):
         h = flat / steps
         run = simulate(name, h=h, steps=int(3 / h))
         assert run.status == "ok"
         energy.append(np.ptp(run.energy) / h**4)
-        told += run.singular_steps > 0
+        reported += run.singular_steps > 0
     assert max(energy) < 2.5e3 * 1.5
-    print("told", told)
+    print("told", reported)
 
 
 @pytest.mark.parametrize(
     ("method", "counts", "most"),
     tiers([("dp8", [529, *range(660, 671), 515], 1e-6), ("rk4", [1036, 1109, 1113, 1125], 2e-5)]),
 )
-def test_stages_near_a_flat_position_do_no_harm(
+def test_stages_near_a_singular_position_keep_the_run_accurate(
     method: str, counts: list[int], most: float
 ) -> None:
-    """Step sizes of which some lost the run where rows were left out too far from where it is."""
+    """Runs with some of these step sizes failed when constraints were dropped too far from the
+    state.
+    """
     name = "iftomm_A02_four_bar_N2"
     for steps in counts:
         run = simulate(name, h=10 / steps, steps=steps, every=steps, method=method)
@@ -131,8 +135,8 @@ def test_stages_near_a_flat_position_do_no_harm(
 
 
 @pytest.mark.parametrize("h", tiers([0.05, 0.04, 0.02, 0.01]))
-def test_bricard_s_cube_turns_for_ten_seconds(h: float) -> None:
-    """Its fifth row depends on the others on the manifold, and on none off it."""
+def test_bricard_linkage_turns_for_ten_seconds(h: float) -> None:
+    """Its fifth constraint depends on the others on the manifold only."""
     run = simulate("bricard_cube", h=h, duration=10.0)
     assert run.status == "ok" and run.singular_steps == 0
     limit = {0.05: 2.9e-2, 0.04: 1.3e-2, 0.02: 8.2e-4, 0.01: 5.2e-5}[h]

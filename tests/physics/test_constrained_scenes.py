@@ -1,4 +1,4 @@
-"""Shipped scenes with constraints, beside trusted states of the same systems."""
+"""Shipped scenes with constraints against reference states of the same systems."""
 
 import json
 from collections.abc import Callable
@@ -17,12 +17,14 @@ CASES = {
 
 
 def crank(q: np.ndarray) -> np.ndarray:
-    """The case's three angles and three places, of the scene's two angles and one way."""
+    """Return the three angles and three positions of the case from the scene's two angles and
+    position.
+    """
     phi, psi, s = q
     return np.array([phi, phi + psi, s])
 
 
-# scene, case, what of the case the scene has, and h; errors are those of the case's own RK4
+# Scene, case, the case's quantities that the scene has, and h; errors are those of the case's RK4.
 SHIPPED: list[tuple[str, str, Callable, list[int], float]] = [
     ("pendulum_xy", "pendulum_over_the_top", np.asarray, [0, 1], 0.005),
     ("slider_crank", "slider_crank_bodies", crank, [2, 5, 6], 0.005),
@@ -32,7 +34,7 @@ SHIPPED: list[tuple[str, str, Callable, list[int], float]] = [
 
 
 @pytest.mark.parametrize(("name", "case", "of", "which", "h"), tiers(SHIPPED, "pendulum_xy"))
-def test_runs_end_where_they_should(name, case, of, which, h, modules):
+def test_runs_end_at_the_reference_state(name, case, of, which, h, modules):
     module = modules.unoptimised(eomc.read(SCENES / f"{name}.toml"))
     known = CASES[case]
     start = np.array([float(x) for x in known["q0"]])[which]
@@ -41,18 +43,19 @@ def test_runs_end_where_they_should(name, case, of, which, h, modules):
     end = np.array([float(x) for x in known["q_ref"]])[which]
     (measured,) = [m["projected"] for m in known["rk4_measured"] if m["h"] == h]
     error = np.abs(of(run.q[-1]) - end).max() / max(1.0, np.abs(end).max())
-    others = of is crank  # coordinates, so that steps err otherwise
+    others = of is crank  # other coordinates have other discretization errors
     assert error <= (2 if others else 1.5) * measured["err_q"]
 
 
 @pytest.mark.slow
-def test_the_reaction_of_a_pin_in_the_plane_is_its_multipliers(modules):
+def test_reaction_of_a_planar_pin_equals_its_multipliers(modules):
     module = modules.unoptimised(eomc.read(SCENES / "slider_crank.toml"))
     run = module.simulate(duration=0.5)
     assert run.reactions["pin"].shape == (len(run.t), 3)
     rows = np.array([run.multipliers["pin_x"], run.multipliers["pin_y"]]).T
     assert np.allclose(run.reactions["pin"][:, :2], rows, rtol=1e-14)
     assert not run.reactions["pin"][:, 2].any()
-    # what the pin does to the slider is its mass times its acceleration, along the slide
+    # The force of the pin on the slider is the slider's mass times its acceleration along the
+    # slide.
     a = np.array([module.acceleration(q, v) for q, v in zip(run.q, run.qd, strict=True)])
     assert np.allclose(run.reactions["pin"][:, 0], 2.0 * a[:, 2], rtol=1e-9, atol=1e-9)

@@ -1,10 +1,11 @@
-"""Long runs and a nearly singular D: how errors grow there, and what is left of sixteen digits.
+"""Long runs and a nearly singular D: how errors grow, and how many of sixteen digits remain.
 
-Long runs are looked at where the exact motion is back at its start: a coordinate that passes zero
-there with the velocity v is q = v lag, the time by which the run is early. A method that loses or
-gains energy at a constant rate changes the frequency with it, and its lag grows as t^2; Gauss and
-Legendre's methods keep the energy up to a bounded error, as symplectic and as symmetric methods
-do, and their lag grows as t (Hairer, Lubich & Wanner, Geometric Numerical Integration, ch. IX-XI).
+Long runs are compared where the exact motion is back at its initial state. A coordinate that passes
+zero there with velocity v has the value v lag, where lag is the time by which the run is early. A
+method that loses or gains energy at a constant rate changes the frequency with it, and its lag
+grows as t^2. Gauss-Legendre methods keep the energy up to a bounded error, as symplectic and
+symmetric methods do, and their lag grows as t (Hairer, Lubich & Wanner, Geometric Numerical
+Integration, ch. IX-XI).
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ def of_scene(name: str, *methods: str) -> ModuleType:
 
 
 def lags_of_orbits(method: str, parts: int) -> tuple[np.ndarray, np.ndarray]:
-    """(lag, relative energy error) of an orbit with e = 0.5 after 50, 100, ... 500 turns."""
+    """Return (lag, relative energy error) of an orbit with e = 0.5 after 50, 100, ... 500
+    revolutions.
+    """
     module = of_scene("kepler_orbit", "rk4", "dp8", "gauss4", "gauss6")
     v = math.sqrt(3)  # (1 + e)/(1 - e), at periapsis
     run = module.simulate(
@@ -67,33 +70,33 @@ def lags_of_orbits(method: str, parts: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def assert_linear(lag: np.ndarray) -> None:
-    """Its tenths are all alike, to a hundredth; the last is far above rounding."""
+    """Require equal increments within a hundredth, and a final lag far above rounding."""
     each = lag / np.arange(1, 11)
     assert abs(lag[-1]) > 1e-7
     np.testing.assert_allclose(each, each[-1], rtol=0.01)
 
 
 def assert_quadratic(lag: np.ndarray) -> None:
-    """Twice as long, almost four times as late; a part that grows as t is left at the start."""
+    """Twice the time must give almost four times the lag; a part linear in t remains initially."""
     assert 3.7 < lag[9] / lag[4] < 4.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "parts"), [("gauss4", 256), ("gauss6", 128)])
-def test_500_orbits_get_late_linearly(method: str, parts: int) -> None:
-    """And the energy at periapsis does not leave 1e-11, where rk4 and dp8 lose 1e-6 and 1e-9."""
+def test_lag_of_500_orbits_grows_linearly(method: str, parts: int) -> None:
+    """The energy error at periapsis stays below 1e-11; that of rk4 and dp8 is 1e-6 and 1e-9."""
     lag, energy = lags_of_orbits(method, parts)
     assert_linear(lag)
     assert np.max(np.abs(energy)) < 1e-11
 
 
 @pytest.mark.slow
-def test_500_narrow_orbits_keep_their_energy_while_periapsis_is_resolved() -> None:
-    """e = 0.9: the planet turns by 43.6 rad/s at periapsis, so by h = 0.01 in steps of 0.44 rad.
+def test_energy_of_500_eccentric_orbits_is_bounded_while_periapsis_is_resolved() -> None:
+    """e = 0.9: the planet turns by 43.6 rad/s at periapsis, by 0.44 rad in a step of h = 0.01.
 
-    gauss4's energy error comes back to the same value then, 5e-4 at most. With h = 0.02 it is not
-    bounded: each passage leaves another error of a hundredth, as in an independent implementation
-    solved to rounding. What a symplectic method keeps, it keeps up to exp(-const/(h omega)).
+    The energy error of gauss4 returns to the same value then and is at most 5e-4. With h = 0.02 it
+    is not bounded: each passage adds an error of a hundredth, as in an independent implementation
+    that is solved to rounding. A symplectic method conserves energy up to exp(-const/(h omega)).
     """
     module = of_scene("kepler_orbit", "rk4", "dp8", "gauss4", "gauss6")
     worst = {}
@@ -109,7 +112,7 @@ def test_500_narrow_orbits_keep_their_energy_while_periapsis_is_resolved() -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "parts"), [("rk4", 512), ("dp8", 128)])
-def test_500_orbits_get_late_as_time_squared_where_energy_drifts(method: str, parts: int) -> None:
+def test_lag_of_500_orbits_grows_quadratically_if_energy_drifts(method: str, parts: int) -> None:
     lag, energy = lags_of_orbits(method, parts)
     assert_quadratic(lag)
     np.testing.assert_allclose(energy / np.arange(1, 11), energy[-1] / 10, rtol=0.02)
@@ -133,11 +136,11 @@ def test_500_orbits_in_polar_coordinates() -> None:
 
 
 @pytest.mark.slow
-def test_100_000_periods_of_a_pendulum() -> None:
-    """Swinging to 79.4 degrees; its period is 4 K(k) sqrt(l/g), k = sin(79.4 deg/2).
+def test_lag_of_a_pendulum_after_100_000_periods() -> None:
+    """The amplitude is 79.4 degrees; the period is 4 K(k) sqrt(l/g), k = sin(79.4 deg/2).
 
-    gauss6 with 32 steps a period: 1e-9 s late each time, and so 1e-4 s in 63 hours. dp8 is
-    1e-13 early the first time, and later by the square of their number.
+    gauss6 with 32 steps a period loses 1e-9 s each period, thus 1e-4 s in 63 hours. The lag of dp8
+    is 1e-13 s in the first period and grows as the square of their number.
     """
     module = of_scene("simple_pendulum", "gauss6", "dp8")
     v, w = 4.0, mpmath.sqrt(mpmath.mpf(module.defaults["g"]) / module.defaults["l"])
@@ -158,8 +161,8 @@ def test_100_000_periods_of_a_pendulum() -> None:
 
 
 @pytest.mark.slow
-def test_rk4_loses_energy_by_its_law(modules: Modules) -> None:
-    """1e5 periods of x = cos t with h = 1/20: E falls as exp(-h^5 t/72), to 0.9973."""
+def test_rk4_loses_energy_at_the_theoretical_rate(modules: Modules) -> None:
+    """1e5 periods of x = cos t with h = 1/20: E decays as exp(-h^5 t/72), to 0.9973."""
     h = 0.05
     steps = round(1e5 * 2 * math.pi / h)
     run = modules("mass_spring").simulate(h=h, steps=steps, every=steps // 10)
@@ -182,7 +185,9 @@ def double_pendulum(m1: str, m2: str, duration: float) -> str:
 
 
 def exact_acceleration(p: dict[str, float], q: np.ndarray, qd: np.ndarray) -> list[mpmath.mpf]:
-    """Of the double pendulum in absolute angles, by hand and with fifty digits."""
+    """Return accelerations of the double pendulum in absolute angles, derived by hand, with 50
+    digits.
+    """
     with mpmath.workdps(50):
         m1, m2, l1, l2, g = (mpmath.mpf(p[name]) for name in ("m1", "m2", "l1", "l2", "g"))
         (a, b), (va, vb) = map(mpmath.mpf, q), map(mpmath.mpf, qd)
@@ -200,8 +205,8 @@ def exact_acceleration(p: dict[str, float], q: np.ndarray, qd: np.ndarray) -> li
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("m1", "m2"), [("1e-05", "1.0"), ("1e-09", "1.0"), ("1.0", "1e-09")])
-def test_accelerations_lose_what_the_condition_of_D_takes(m1: str, m2: str) -> None:
-    """Errors below 64 eps cond(D), its diagonal scaled to 1: up to 4e9 with the links in line."""
+def test_error_of_accelerations_is_bounded_by_the_condition_of_D(m1: str, m2: str) -> None:
+    """The bound is 64 eps cond(D) with unit diagonal: up to 4e9 with the links in line."""
     module = with_methods(double_pendulum(m1, m2, 1.0), "rk4")
     random, conditions = np.random.default_rng(0), []
     for k in range(200):
@@ -212,8 +217,8 @@ def test_accelerations_lose_what_the_condition_of_D_takes(m1: str, m2: str) -> N
         size = np.sqrt(np.diag(D))
         conditions.append(np.linalg.cond(D / np.outer(size, size)))
         exact = exact_acceleration(module.defaults, q, qd)
-        found = module.acceleration(q, qd)
-        off = max(abs(float(e - float(f))) for e, f in zip(exact, found, strict=True))
+        computed = module.acceleration(q, qd)
+        off = max(abs(float(e - float(f))) for e, f in zip(exact, computed, strict=True))
         assert off < 64 * 2.0**-53 * conditions[-1] * max(abs(float(e)) for e in exact)
     if m2 == "1.0":
         assert max(conditions) > 0.1 / float(m1)
@@ -225,8 +230,12 @@ def test_accelerations_lose_what_the_condition_of_D_takes(m1: str, m2: str) -> N
     [("1e-05", "1.0", 0.5, 2**18, 1e-9), ("1.0", "1e-08", 1.0, 2**14, 1e-12)],
     ids=["light inner", "light tip"],
 )
-def test_motions_of_mass_ratios(m1: str, m2: str, duration: float, steps: int, most: float) -> None:
-    """Against 25 digits, all along. Inner: a mode of 1,000 rad/s grows and dies, cond D = 1e5."""
+def test_motion_at_extreme_mass_ratios(
+    m1: str, m2: str, duration: float, steps: int, most: float
+) -> None:
+    """Compare with 25 digits all along. "Inner" has a transient mode of 1,000 rad/s; cond D =
+    1e5.
+    """
     text = double_pendulum(m1, m2, duration)
     exact = reference_solution.solve(from_scene(parse(text, "ratio.toml")), root=BUILDS)
     assert exact.digits[-1] > 25

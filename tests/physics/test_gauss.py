@@ -1,4 +1,4 @@
-"""The implicit methods: order, stability, energy, evaluations, and what they say when they fail."""
+"""Implicit methods: order, stability, energy, evaluations, and how failures are reported."""
 
 from __future__ import annotations
 
@@ -49,8 +49,10 @@ def oscillator(name: str, k: float, c: float, start: float = 1.0, rate: float = 
     return scene_file(name, text)
 
 
-def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[float], int]:
-    """(accelerations evaluated, q and qd at the end, status) of a run of the generated C."""
+def count_evaluations(
+    path: Path, method: str, h: float, steps: int
+) -> tuple[int, list[float], int]:
+    """Run the generated C; return (accelerations evaluated, final q and qd, status)."""
     system = eomc.read(path)
     name, n = system.name, len(system.coordinates)
     files = fast_kit(eomc.sources(system))
@@ -59,7 +61,7 @@ def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[fl
         r"long evaluations;\n\1\n    evaluations++;", files[f"{name}.c"], count=1,
     )  # fmt: skip
     assert "evaluations++" in source
-    given = "q, qd, 0, " if re.search(rf"{name}_{method}_step\([^)]*\bt,", source) else "q, qd, "
+    args = "q, qd, 0, " if re.search(rf"{name}_{method}_step\([^)]*\bt,", source) else "q, qd, "
     folder = Path("build/tests") / f"counted_{name}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.h").write_text(files[f"{name}.h"], encoding="utf-8")
@@ -74,7 +76,7 @@ int main(void)
     {name}_status status;
     for (int i = 0; i < {n}; i++)
         q[i] = {name}_q0[i], qd[i] = {name}_qd0[i];
-    {name}_{method}_run({given}{h!r}, 0, {steps}, 0, NULL, NULL, &{name}_defaults, NULL, &status);
+    {name}_{method}_run({args}{h!r}, 0, {steps}, 0, NULL, NULL, &{name}_defaults, NULL, &status);
     printf("%ld %d", evaluations, (int)status);
     for (int i = 0; i < {n}; i++)
         printf(" %.17g %.17g", q[i], qd[i]);
@@ -94,8 +96,8 @@ int main(void)
 
 
 @pytest.mark.parametrize("name", GAUSS)
-def test_coefficients(name: str) -> None:
-    """Order conditions of quadrature, C(s), and symmetry; nodes against SymPy's."""
+def test_coefficients_satisfy_the_order_conditions(name: str) -> None:
+    """Check conditions of quadrature, C(s) and symmetry; compare the nodes with SymPy's."""
     m, exact = METHODS[name], Fraction(1, 10**40)
     x, s = sympy.Symbol("x"), m.stages
     roots = sorted(r.evalf(40) for r in sympy.Poly(sympy.legendre(s, 2 * x - 1)).nroots(n=45))
@@ -114,9 +116,11 @@ def test_coefficients(name: str) -> None:
             assert abs(off) < exact
     for row, c in zip(
         m.extrapolation, m.c, strict=True
-    ):  # a polynomial of degree s - 1 goes on exactly
-        found = sum((e * node ** (s - 1) for e, node in zip(row, m.c, strict=True)), Fraction(0))
-        assert abs(found - (1 + c) ** (s - 1)) < exact
+    ):  # a polynomial of degree s - 1 is extrapolated exactly
+        extrapolated = sum(
+            (e * node ** (s - 1) for e, node in zip(row, m.c, strict=True)), Fraction(0)
+        )
+        assert abs(extrapolated - (1 + c) ** (s - 1)) < exact
 
 
 @pytest.mark.slow
@@ -129,9 +133,7 @@ def test_orders_by_check() -> None:
 
 
 @pytest.mark.slow
-def test_a_wrong_coefficient_is_found_by_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_detects_a_wrong_coefficient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import dataclasses
 
     m = METHODS["gauss6"]
@@ -144,8 +146,8 @@ def test_a_wrong_coefficient_is_found_by_check(
 
 
 @pytest.mark.parametrize("name", GAUSS)
-def test_a_fast_decay_does_not_blow_up(name: str) -> None:
-    """h lambda = -1e4: RK4 leaves the finite numbers, |R| < 1 here."""
+def test_fast_decay_is_stable(name: str) -> None:
+    """h lambda = -1e4: RK4 overflows, |R| < 1 here."""
     m = eomc.load(oscillator("gauss_decay", k=1.0, c=1e4, rate=1.0), MODULES)
     run = m.simulate(h=1.0, steps=200, method=name)
     assert run.status == "ok"
@@ -154,12 +156,14 @@ def test_a_fast_decay_does_not_blow_up(name: str) -> None:
         assert m.simulate(h=1.0, steps=200, method="rk4").status != "ok"
 
 
-def test_stiff_in_few_evaluations() -> None:
-    """k = 1e6, c = 2e5, on the slow motion exp(-5 t): 9 digits at 10 s; RK4 needs 3,000,000."""
+def test_stiff_decay_needs_few_evaluations() -> None:
+    """k = 1e6, c = 2e5, slow motion exp(-5 t): 9 digits at 10 s; RK4 needs 3,000,000
+    evaluations.
+    """
     k, c, steps = 1e6, 2e5, 60
     slow = -2 * k / (c + np.sqrt(c * c - 4 * k))
     path = oscillator("gauss_stiff", k, c, start=1.0, rate=slow)
-    evaluations, (q, qd), status = counted(path, "gauss8", 2.0 / steps, steps)
+    evaluations, (q, qd), status = count_evaluations(path, "gauss8", 2.0 / steps, steps)
     exact = np.exp(slow * 2.0)
     assert status == 0
     assert abs(q / exact - 1) < 1e-9 and abs(qd / (slow * exact) - 1) < 1e-9
@@ -167,10 +171,11 @@ def test_stiff_in_few_evaluations() -> None:
 
 
 @pytest.mark.slow
-def test_stiff_spring_pendulum() -> None:
-    """k = 1e6 with damping over 10 s, against thirty trusted digits: 1e-9 in under 4,000.
+def test_stiff_spring_pendulum_needs_few_evaluations() -> None:
+    """k = 1e6 with damping over 10 s, against a 30-digit reference: 1e-9 with under 4,000
+    evaluations.
 
-    RK4 takes 140,000 accelerations, which its stability asks for.
+    For stability RK4 needs 140,000 evaluations.
     """
     name = "spring_pendulum_stiff_damped"
     case = cases()[name]
@@ -178,15 +183,17 @@ def test_stiff_spring_pendulum() -> None:
     path = Path("build/tests") / f"gauss_{name}.toml"
     path.write_text(text.replace('name = "', 'name = "gauss_', 1), encoding="utf-8")
     steps = 120
-    evaluations, state, status = counted(path, "gauss8", float(case["t_end"]) / steps, steps)
+    evaluations, state, status = count_evaluations(
+        path, "gauss8", float(case["t_end"]) / steps, steps
+    )
     assert status == 0
     error = np.max(np.abs(np.array(state[::2]) - np.array(case["q_ref"], float)))
     assert error < 1e-9 * max(1.0, np.max(np.abs(np.array(case["q_ref"], float))))
     assert evaluations < 4000
 
 
-def test_the_energy_of_a_pendulum_does_not_drift() -> None:
-    """8,000 s at a step that leaves errors: as large in the second half as in the first."""
+def test_energy_of_a_pendulum_does_not_drift() -> None:
+    """8,000 s with a coarse step: the error in the second half is as large as in the first."""
     m = eomc.load(variant("simple_pendulum", "gauss_pendulum", method=ALL), MODULES)
     run = m.simulate(h=0.2, duration=8000.0, method="gauss4")
     error = run.energy - run.energy[0]
@@ -196,8 +203,8 @@ def test_the_energy_of_a_pendulum_does_not_drift() -> None:
     assert abs(np.mean(error[half:]) - np.mean(error[:half])) < 0.01 * np.max(np.abs(error))
 
 
-def test_no_convergence_is_told_and_the_last_state_kept() -> None:
-    """A potential that is not smooth at such a step: the stages have no solution that is found."""
+def test_no_convergence_is_reported_with_the_last_good_state() -> None:
+    """The potential varies too fast for the step, so that the iteration does not converge."""
     text = (
         'eomc = 1\nname = "gauss_dive"\n[coordinates]\nx = { start = 1.0 }\n[parameters]\nm = 1.0\n'
         '[energy]\nkinetic = "m*x_dot**2/2"\npotential = "-m*1e6*cos(50*x)"\n'
@@ -205,7 +212,7 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
     )
     path = Path("build/tests/gauss_dive.toml")
     path.write_text(text, encoding="utf-8")
-    evaluations, (q, qd), status = counted(path, "gauss8", 1.0, 20)
+    evaluations, (q, qd), status = count_evaluations(path, "gauss8", 1.0, 20)
     assert status == 3
     assert np.isfinite([q, qd]).all() and evaluations < 20 * 4 * 200
 
@@ -213,24 +220,24 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
 @pytest.mark.parametrize(
     ("form", "method", "h"), tiers([("fast", "gauss8", 20.0), ("plain", "gauss6", 40.0)], "fast")
 )
-def test_stages_are_sought_anew_where_derivatives_in_the_middle_lead_astray(
+def test_newton_iteration_restarts_if_midpoint_derivatives_mislead_it(
     form: str, method: str, h: float
 ) -> None:
-    """A quartic well in long steps: from the start of each Newton's method gets there."""
+    """A quartic well with long steps: Newton's method converges with derivatives of each stage."""
     text = (
         'eomc = 1\nname = "quartic"\n[coordinates]\nx = { rate = 3e-5 }\n'
         '[energy]\nkinetic = "x_dot**2/2"\npotential = "0.05*x**2 + 2e3*x**4"\n'
         '[run]\nmethod = ["gauss8", "gauss6"]\n'
     )
-    made = from_scene(parse(text, "quartic.toml"))
-    with warnings.catch_warnings(action="ignore"):  # of h beyond what follows the motion
-        run = eomc.load(made, MODULES, form=form).simulate(h=h, steps=20, method=method)
+    system = from_scene(parse(text, "quartic.toml"))
+    with warnings.catch_warnings(action="ignore"):  # about an h that does not resolve the motion
+        run = eomc.load(system, MODULES, form=form).simulate(h=h, steps=20, method=method)
     assert (run.status, run.steps) == ("ok", 20)
     assert np.ptp(run.energy) < 1e-2 * run.energy[0]
 
 
-def test_runs_are_the_same_however_they_are_cut(modules: Modules) -> None:
-    """To the last bit, also where C is called for one step at a time."""
+def test_run_in_pieces_equals_the_whole_run(modules: Modules) -> None:
+    """Require equal bits, also if C is called for one step at a time."""
     text = Path("scenes/cartpole_driven.toml").read_text(encoding="utf-8")
     m = modules.unoptimised(text.replace("[run]\n", f"[run]\nmethod = {ALL}\n"))
     with warnings.catch_warnings(action="ignore"):
@@ -241,7 +248,7 @@ def test_runs_are_the_same_however_they_are_cut(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_float() -> None:
+def test_single_precision() -> None:
     m = eomc.load(variant("cartpole", "gauss_float", method=ALL, real='"float"'), MODULES)
     exact = eomc.load(variant("cartpole", "gauss_double", method=ALL), MODULES).simulate(h=0.01)
     for name in GAUSS:
@@ -251,7 +258,7 @@ def test_float() -> None:
 
 
 @pytest.mark.slow
-def test_against_scipy_on_a_stiff_scene() -> None:
+def test_stiff_scene_agrees_with_scipy() -> None:
     from scipy.integrate import solve_ivp
 
     m: Any = eomc.load(oscillator("gauss_scipy", k=1e4, c=300.0, rate=2.0), MODULES)
@@ -261,13 +268,13 @@ def test_against_scipy_on_a_stiff_scene() -> None:
     assert np.max(np.abs(np.array([*run.q[-1], *run.qd[-1]]) - other)) < 1e-9
 
 
-def test_batches_are_refused_with_the_reason() -> None:
+def test_batches_are_refused_with_a_reason() -> None:
     path = variant("cartpole", "gauss_batch", method=ALL, batch="true")
     with pytest.raises(eomc.SceneError, match="is for one trajectory: leave out batch"):
         eomc.sources(eomc.read(path))
 
 
-def test_verlet_and_euler() -> None:
+def test_orders_and_energy_of_verlet_and_euler() -> None:
     m = eomc.load(variant("mass_spring", "verlet_ms", method='["verlet", "euler"]'), MODULES)
     omega = 1.0
     runs = {name: m.simulate(h=0.05, duration=500.0, method=name) for name in m.methods}
@@ -279,10 +286,11 @@ def test_verlet_and_euler() -> None:
 
 
 @pytest.mark.slow
-def test_feedback_in_a_signal_is_as_cheap_as_in_a_force() -> None:
-    """u = -1e6 x - 2e5 x_dot: the derivatives of Newton's corrections follow the signals.
+def test_feedback_in_a_signal_costs_as_much_as_in_a_force() -> None:
+    """u = -1e6 x - 2e5 x_dot: the derivatives of Newton's corrections include those of the signals.
 
-    On the slow motion exp(-5 t), h lambda = -2,000 beside it; without du/dx no stage converges.
+    The slow motion is exp(-5 t), with h lambda = -2,000 of the fast mode; without du/dx no stage
+    converges.
     """
     text = """
 eomc = 1
@@ -305,9 +313,9 @@ method = ["gauss8", "gauss4"]
 """
     signal, force = Path("build/tests/gauss_signal.toml"), Path("build/tests/gauss_force.toml")
     signal.write_text(text, encoding="utf-8")
-    given = '[inputs]\nu = { signal = "-k*x - c*x_dot" }\n'
-    assert given in text
-    text = text.replace(given, "").replace('x = "u"', 'x = "-k*x - c*x_dot"')
+    section = '[inputs]\nu = { signal = "-k*x - c*x_dot" }\n'
+    assert section in text
+    text = text.replace(section, "").replace('x = "u"', 'x = "-k*x - c*x_dot"')
     force.write_text(text.replace("gauss_signal", "gauss_force"), encoding="utf-8")
     one, other = (
         eomc.load(path, MODULES).simulate(h=0.01, steps=200, method="gauss8")

@@ -1,4 +1,4 @@
-"""Loops in space with more rows than they need: Bennett's linkage; a four-bar on a turntable."""
+"""Spatial loops with redundant constraints: Bennett's linkage; a four-bar on a turntable."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
-# four hinges; sin(alpha)/a = sin(beta)/b makes it move, tan(q1/2) tan(q2/2) = const, q3 = -q1
+# Four hinges; sin(alpha)/a = sin(beta)/b makes the linkage movable, with tan(q1/2) tan(q2/2) =
+# const and q3 = -q1.
 A, B, ALPHA = 1.0, 1.4, 0.7
 BETA = math.asin(B * math.sin(ALPHA) / A)
 LINK = """
@@ -92,22 +93,24 @@ DRIVEN = BENNETT.replace("[[loop]]", '[constraints]\ndrive = "q1 - 1 - t"\n[[loo
 
 
 def tilted() -> str:
-    """A four-bar in a plane across an axis in doubles, along which all its points are."""
+    """Return a four-bar in a plane whose normal is given in doubles; its points lie on that
+    normal.
+    """
     c, s = math.cos(0.7), math.sin(0.7)
 
-    def at(x: float) -> list[float]:
+    def point(x: float) -> list[float]:
         return [x * math.cos(0.4), x * math.sin(0.4) * c, x * math.sin(0.4) * s]
 
     axis = f"0, {-s!r}, {c!r}"
-    crank = link("crank", "", "q1", axis, at(0.1), at(0.15))
-    coupler = link("coupler", "crank", "q2", axis, at(0.3), at(0.5))
-    rocker = link("rocker", "", "q3", axis, at(1.1), at(0.4))
-    pinned = f'bodies = ["coupler", "rocker"]\npoints = [{at(1)}, {at(0.8)}]\naxis = [{axis}]'
+    crank = link("crank", "", "q1", axis, point(0.1), point(0.15))
+    coupler = link("coupler", "crank", "q2", axis, point(0.3), point(0.5))
+    rocker = link("rocker", "", "q3", axis, point(1.1), point(0.4))
+    pinned = f'bodies = ["coupler", "rocker"]\npoints = [{point(1)}, {point(0.8)}]\naxis = [{axis}]'
     return scene("tilted", FOUR_BAR, crank + coupler + rocker, pinned)
 
 
 def locked(angle: float) -> str:
-    """A joint about z that a hinge across it locks at an angle."""
+    """Return a joint about z that a perpendicular hinge locks at an angle."""
     c, s = math.cos(angle), math.sin(angle)
     return scene(
         "locked",
@@ -129,21 +132,23 @@ def bennett(modules: Modules) -> ModuleType:
 
 
 def constant(q: np.ndarray) -> np.ndarray:
-    """What Bennett's linkage keeps, as an angle's sine and cosine that have no infinity."""
+    """Return the invariant of Bennett's linkage as sine and cosine of an angle, which stay
+    finite.
+    """
     one, two = q[:, 0] / 2, q[:, 1] / 2
     return np.arctan2(np.sin(one) * np.sin(two), np.cos(one) * np.cos(two))
 
 
-def test_sums_of_rows_stand_for_rows_that_depend_on_one_another() -> None:
-    """No two of Bennett's five rows hold it everywhere; two sums of them do."""
+def test_dependent_constraints_are_replaced_by_sums() -> None:
+    """No two of Bennett's five constraints suffice everywhere; two sums of them do."""
     closure = read(BENNETT).closure
     assert closure is not None and closure.rank == 2 and closure.freedoms == 1
     assert closure.redundant == () and len(closure.sums) == 2 and len(closure.shared) == 5
     assert "2 sums of them stand for these" in closure.ranks
 
 
-def test_a_plane_mechanism_closes_in_a_plane_across_an_axis_in_doubles() -> None:
-    """Rows across the plane are rounding, and left out; of the others one is redundant, nearly."""
+def test_planar_mechanism_closes_in_a_plane_with_a_rounded_normal() -> None:
+    """Constraints across the plane are rounding and are dropped; one of the others is redundant."""
     flat, there = read(STANDING), read(tilted())
     assert [c.name for c in there.constraints] == ["pin_x", "pin_y", "pin_z"]
     for one, other in zip(flat.coordinates, there.coordinates, strict=True):
@@ -151,8 +156,8 @@ def test_a_plane_mechanism_closes_in_a_plane_across_an_axis_in_doubles() -> None
 
 
 @pytest.mark.parametrize("name", ["bennett", "tilted"])
-def test_rows_in_doubles_that_imply_others_stand_for_these_as_time_goes_on(name: str) -> None:
-    """Where they were all kept each step was said to be singular, and Bennett's linkage locked."""
+def test_redundant_constraints_with_rounded_coefficients_are_dropped(name: str) -> None:
+    """With all of them each step was reported as singular, and Bennett's linkage was locked."""
     drive = '[constraints]\ndrive = "q1 - 1 - 2*t"\n[run]'
     text = {"bennett": DRIVEN, "tilted": tilted().replace("[run]", drive)}[name]
     closure = read(text).closure
@@ -161,9 +166,9 @@ def test_rows_in_doubles_that_imply_others_stand_for_these_as_time_goes_on(name:
     assert not any("far from singular" in remark for remark in closure.remarks)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.4])  # at which numbers are exact, or doubles
-def test_a_row_without_slope_that_others_hold_is_left_out(angle: float) -> None:
-    """It was refused, or weighed by the inverse of its rounding in a sum."""
+@pytest.mark.parametrize("angle", [0.0, 0.4])  # exact numbers, or doubles
+def test_implied_constraint_without_gradient_is_dropped(angle: float) -> None:
+    """It was refused, or weighted in a sum by the inverse of its rounding error."""
     closure = read(locked(angle)).closure
     assert closure is not None and closure.rank == 1 and closure.freedoms == 1
     assert "pin_y" in closure.redundant
@@ -171,7 +176,7 @@ def test_a_row_without_slope_that_others_hold_is_left_out(angle: float) -> None:
 
 
 @pytest.mark.slow
-def test_bennett_s_linkage_is_driven_round(modules: Modules) -> None:
+def test_bennett_linkage_is_driven_around(modules: Modules) -> None:
     run = modules.unoptimised(DRIVEN).simulate(method="rk4")
     assert run.status == "ok" and run.singular_steps == 0
     assert run.q[-1, 0] == pytest.approx(4) and np.abs(run.q[:, 2] + run.q[:, 0]).max() < 1e-11
@@ -179,8 +184,10 @@ def test_bennett_s_linkage_is_driven_round(modules: Modules) -> None:
 
 @pytest.mark.parametrize("how", [{"tol": 1e-10}, {"method": "rk4"}, {"method": "gauss8"}])
 @pytest.mark.slow
-def test_bennett_s_linkage_turns(bennett: ModuleType, how: dict[str, object]) -> None:
-    """Through positions in which all its bars are in a line."""
+def test_bennett_linkage_turns_through_singular_positions(
+    bennett: ModuleType, how: dict[str, object]
+) -> None:
+    """The motion passes positions in which all links are collinear."""
     run = bennett.simulate(**how)
     assert run.status == "ok" and run.singular_steps == 0
     assert run.q[:, 0].min() < -3.2 and run.q[0, 0] == 1
@@ -193,7 +200,7 @@ def test_bennett_s_linkage_turns(bennett: ModuleType, how: dict[str, object]) ->
 
 
 @pytest.mark.slow
-def test_multipliers_are_of_the_rows_as_they_are_written(bennett: ModuleType) -> None:
+def test_multipliers_belong_to_the_constraints_of_the_scene(bennett: ModuleType) -> None:
     run = bennett.simulate(tol=1e-10, times=[0.0, 0.4, 1.1, 2.0])
     for q, qd in zip(run.q, run.qd, strict=True):
         x = bennett.multipliers(q, qd)
@@ -203,22 +210,24 @@ def test_multipliers_are_of_the_rows_as_they_are_written(bennett: ModuleType) ->
 
 
 @pytest.mark.slow
-def test_a_state_is_put_onto_such_rows(bennett: ModuleType) -> None:
+def test_projection_onto_redundant_constraints(bennett: ModuleType) -> None:
     q, qd = bennett.project([1.0, 2.7, -0.9], [1.0, 0.0, -1.0], fixed=["q1", "q1_dot"])
     assert q[0] == 1 and qd[0] == 1 and q[2] == pytest.approx(-1, abs=1e-14)
     assert qd[2] == pytest.approx(-1, abs=1e-14)
 
 
 @pytest.mark.slow
-def test_the_check_passes_of_sums(modules: Modules) -> None:
-    text = BENNETT.replace(', "gauss8"', "")  # whose starts far out are not on all rows
+def test_check_passes_for_sums_of_constraints(modules: Modules) -> None:
+    text = BENNETT.replace(', "gauss8"', "")  # far start values violate constraints
     report = check(read(text), modules.unoptimised(text))
     assert report.passed, report.table()
 
 
 @pytest.mark.slow
-def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules) -> None:
-    """A four-bar on a table: hinges across it are zero, however the table is turned."""
+def test_constraints_do_not_depend_on_the_motion_of_a_common_ancestor(modules: Modules) -> None:
+    """A four-bar on a turntable: constraints across its plane vanish for every angle of the
+    table.
+    """
     system = read(TURNTABLE)
     assert [c.name for c in system.constraints] == ["pin_x", "pin_z"]
     assert system.closure is not None and system.closure.rank == 2
@@ -227,25 +236,25 @@ def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules)
     assert run.status == "ok" and np.abs(run.energy - run.energy[0]).max() < 1e-8
     momentum = np.array([turning.D(q) @ qd for q, qd in zip(run.q, run.qd, strict=True)])[:, 0]
     assert momentum == pytest.approx(momentum[0], rel=1e-9)
-    # at rest it is as if it stood, and its pin's force turns with it
+    # Without rotation the table acts as ground, and the pin force rotates with it.
     times = [0.1, 0.5]
-    still = standing.simulate(tol=1e-11, times=times)
+    ground_run = standing.simulate(tol=1e-11, times=times)
     for angle in (0.0, 0.7, math.pi / 2):
         heavy = turning.simulate(
             [angle, *standing.start[0]], [0.0, *standing.start[1]], tol=1e-11, times=times
         )
         if angle == 0:
             assert heavy.q[:, 0] == pytest.approx(0, abs=1e-12)
-        assert heavy.q[:, 1:] == pytest.approx(still.q, abs=1e-9)
-        force = still.reactions["pin"][:, :3]
+        assert heavy.q[:, 1:] == pytest.approx(ground_run.q, abs=1e-9)
+        force = ground_run.reactions["pin"][:, :3]
         c, s = math.cos(angle), math.sin(angle)
         turned = np.stack([c * force[:, 0], s * force[:, 0], force[:, 2]], axis=1)
         assert heavy.reactions["pin"][:, :3] == pytest.approx(turned, abs=1e-7)
 
 
 @pytest.mark.slow
-def test_rods_that_close_a_loop_may_have_no_mass(modules: Modules) -> None:
-    """The crank of a four-bar swings as if it were alone; bodies without mass were refused."""
+def test_closing_rods_may_be_massless(modules: Modules) -> None:
+    """The crank of a four-bar moves as if it were alone; massless bodies used to be refused."""
     crank, rods = STANDING.split('name = "coupler"')
     rods = rods.replace("mass = 1\n", "mass = 0\n").replace("[0.01, 0.1, 0.1]", "[0, 0, 0]")
     linkage = modules.unoptimised(crank + 'name = "coupler"' + rods.replace(', "gauss8"', ""))

@@ -1,12 +1,12 @@
-"""Compiled scenes against trusted answers: 30 digits at the end of 44 hard motions.
+"""Compiled scenes against 30-digit references at the end of 44 demanding motions.
 
-The errors have to be those of the classical Runge-Kutta method at its step size h, no more and
-no less: within a factor of two of what an independent implementation in doubles made of the same
-case (`rk4_measured` in data/cases.json). Where that is so small that rounding shows, rounding may
-add what it adds up to along the run, see `rounding`.
+The error must be that of the classical Runge-Kutta method at its step size h: within a factor of
+two of the error of an independent implementation in doubles (`rk4_measured` in data/cases.json).
+Where this error is so small that rounding matters, accumulated rounding may be added, see
+`rounding`.
 
-And with its best stepper each has to come down to what the rounding of its start alone makes
-(`double_floor`), but for those that `UNREACHED` names, with the reason.
+With its best method each case must also reach the error that rounding of its initial state alone
+causes (`double_floor`), except those that `UNREACHED` lists with a reason.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from eomc.report import cost_of_digits
 
 CASES = ROOT / "build" / "tests" / "cases"
 
-# mass_spring has tests of its own
+# mass_spring has its own tests
 SCENES = {scene: case for scene, case in ALIKE.items() if scene != "mass_spring"}
-# those that other tests of the quick tier have built
+# scenes that other tests of the quick tier build too
 QUICK = ("cartpole", "cartpole_driven", "kepler_orbit", "heavy_top")
 MOST_STEPS = 11_000_000  # about half a second
 
-# The quickest stepper and number of steps, of powers of two, that come down to the floor and stay
-# there with twice as many; found by docs/hard_cases.py's ladder of runs.
+# The fastest method, and the number of steps (a power of two), that reach the floor and remain
+# there with twice as many steps; determined with the ladder of runs of docs/hard_cases.py.
 BEST = {
     "cartpole_drop_tutorialP": ("dp8", 2**10),
     "cartpole_drop_physicalP": ("gauss6", 2**11),
@@ -78,9 +78,9 @@ BEST = {
     "toda_periodic_3": ("gauss8", 2**13),
     "slider_crank_near_changepoint": ("dp8", 2**15),
 }
-FLOORS = 10.0  # times double_floor: that is one rounding of the start, and a run rounds each step
+FLOORS = 10.0  # times double_floor, which is one rounding of the initial state
 
-# Cases that no fixed step brings there: the error that its best one may make, and why.
+# Cases that no fixed step size brings there: the admissible error of the best one, and the reason.
 UNREACHED = {
     "harmonic_1e6_periods": (
         4e-5, "6e6 s: 3e7 steps of 0.19 s still leave dp8's own 2e-7; four times as many 1e-10",
@@ -107,53 +107,55 @@ UNREACHED = {
     "fput_alpha_31": (8e-12, "1e5 steps of 31 masses; the floor, 9.9e-16, is one rounding"),
 }  # fmt: skip
 
-# an error at the start grows by 1.7e11: at every step size listed the motion is lost
-LOST = {"double_pendulum_chaotic"}
-# runs into the pole of its Euler angles; the right answer is a reported failure
+# An initial error grows by 1.7e11: the motion is unpredictable at every step size listed.
+CHAOTIC = {"double_pendulum_chaotic"}
+# The motion reaches the pole of its Euler angles; the correct result is a reported failure.
 AT_A_POLE = {"heavy_top_benchmark"}
 PLAIN = [
     name
     for name, case in cases().items()
     if not case["constraints"]
-    and name not in LOST | AT_A_POLE | {"harmonic_1e6_periods"}
+    and name not in CHAOTIC | AT_A_POLE | {"harmonic_1e6_periods"}
 ]  # fmt: skip
 
 
 def listed(name: str) -> list[tuple[float, int, float]]:
-    """Two of the case's (h, steps, error): the finest whose run is not long, errors below 1.
+    """Return two of the case's (h, steps, error): the finest ones with short runs and errors below
+    1.
 
-    An error of 1 rad or m or more says that the motion is lost, and how far off it is means
-    nothing: arenstorf_orbit at h = 0.01 is 22 or 93 off, by the last bit of a close encounter.
+    An error of 1 rad or m or more means that the motion is not resolved, and its size is then
+    meaningless: arenstorf_orbit at h = 0.01 is off by 22 or 93, depending on the last bit of a
+    close encounter.
     """
     measured = [(m["h"], m["steps"], float(m["err_q"])) for m in cases()[name]["rk4_measured"]]
     return [m for m in measured if m[2] < 1 and m[1] <= MOST_STEPS][-2:]
 
 
 def rounding(name: str, steps: int) -> float:
-    """What a rounding of q in each step may add up to, as a random walk, carried to the end."""
+    """Return the accumulated rounding of q in each step, as a random walk, amplified to the end."""
     case = cases()[name]
     size = max(1.0, *(abs(float(x)) for x in case["q_ref"]))
     return 2.0**-53 * size * math.sqrt(steps) * (case["amplification"] or 1.0)
 
 
-# what was measured there is the rounding of plain sums, which ours are not: they may be better
+# The measured error is the rounding of plain sums; ours are compensated and may be better.
 OF_ROUNDING = frozenset({"mass_spring_stiff_k1e12"})
 
 
 def assert_error_of_rk4(name: str, module: ModuleType, h: float, steps: int, error: float) -> None:
     run = module.simulate(h=h, steps=steps, every=max(1, steps))
     assert run.status == "ok"
-    found, extra = error_of(name, run.q[-1]), rounding(name, steps)
-    assert found < 2 * error + extra
+    measured, extra = error_of(name, run.q[-1]), rounding(name, steps)
+    assert measured < 2 * error + extra
     if name not in OF_ROUNDING:
-        assert error / 2 - extra < found
+        assert error / 2 - extra < measured
 
 
 @cache
 def compiled(name: str) -> ModuleType:
-    """A case with rk4, which its runs use, and with its best stepper."""
+    """Load a case with rk4, which its runs use, and with its best method."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EOMC_CFLAGS", "-O1")  # it is the compiling that takes the time here
+        patch.setenv("EOMC_CFLAGS", "-O1")  # compilation takes most of the time here
         methods = dict.fromkeys(("rk4", BEST[name][0] if name in BEST else "rk4"))
         module, skipped = cost_of_digits.build_variant(case_system(name), tuple(methods), CASES)
     assert not skipped
@@ -161,14 +163,14 @@ def compiled(name: str) -> ModuleType:
 
 
 @pytest.mark.parametrize(("name", "case"), tiers(SCENES.items(), *QUICK))
-def test_scene_makes_the_error_of_rk4(modules: Modules, name: str, case: str) -> None:
+def test_error_of_scene_is_that_of_rk4(modules: Modules, name: str, case: str) -> None:
     for h, steps, error in listed(case):
         assert_error_of_rk4(case, modules(name), h, steps, error)
 
 
 @pytest.mark.parametrize("h", [0.05, 0.02, 0.01])
-def test_mass_on_a_spring_makes_the_error_of_rk4(modules: Modules, h: float) -> None:
-    """x = cos t; RK4 turns slower by h^4/120 of the angle and shrinks by h^5 t/144."""
+def test_error_of_a_mass_on_a_spring_is_that_of_rk4(modules: Modules, h: float) -> None:
+    """x = cos t; RK4 is slow by h^4/120 of the angle and shrinks by h^5 t/144."""
     run = modules("mass_spring").simulate(h=h, duration=20)
     t = run.t
     expected = np.exp(-(h**5) * t / 144) * np.cos(t * (1 - h**4 / 120))
@@ -179,7 +181,7 @@ def test_mass_on_a_spring_makes_the_error_of_rk4(modules: Modules, h: float) -> 
 
 @pytest.mark.slow
 def test_mass_on_a_spring_for_a_million_periods(modules: Modules) -> None:
-    """63 million steps; the error is theory's, the end known to 30 digits."""
+    """63 million steps; the error follows the theory, the end is known to 30 digits."""
     name = "harmonic_1e6_periods"
     measured = cases()[name]["rk4_measured"][0]
     assert_error_of_rk4(name, modules("mass_spring"), 0.1, 62_831_850, measured["err_q"])
@@ -187,7 +189,7 @@ def test_mass_on_a_spring_for_a_million_periods(modules: Modules) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLAIN)
-def test_case_makes_the_error_of_rk4(name: str) -> None:
+def test_error_of_case_is_that_of_rk4(name: str) -> None:
     module = compiled(name)
     assert listed(name)
     for h, steps, error in listed(name):
@@ -196,8 +198,8 @@ def test_case_makes_the_error_of_rk4(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BEST)
-def test_case_comes_down_to_rounding_with_its_best_stepper(name: str) -> None:
-    """Error relative to the largest coordinate, or to 1; at most ten times the floor."""
+def test_case_reaches_the_rounding_floor_with_its_best_method(name: str) -> None:
+    """The error, relative to the largest coordinate or 1, is at most ten times the floor."""
     method, steps = BEST[name]
     case = cases()[name]
     h = float(case["t_end"]) / steps
@@ -214,8 +216,8 @@ def test_case_comes_down_to_rounding_with_its_best_stepper(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_stiff_case_in_few_evaluations() -> None:
-    """k = 1e6 with damping, 10 s, nine digits; rk4 takes 140,000, which its stability asks for."""
+def test_stiff_case_needs_few_evaluations() -> None:
+    """k = 1e6 with damping, 10 s, nine digits; for stability rk4 needs 140,000 evaluations."""
     name = "spring_pendulum_stiff_damped"
     steps = 120
     h = float(cases()[name]["t_end"]) / steps
@@ -229,8 +231,10 @@ CRITERIA = [name for name in PLAIN if isinstance(cases()[name]["pass"]["rk4"], d
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CRITERIA)
-def test_case_meets_its_own_criterion(name: str) -> None:
-    """What the case asks of RK4 at one h; stiff ones ask for forces without cancellation."""
+def test_case_satisfies_its_own_criterion(name: str) -> None:
+    """Check the case's requirement for RK4 at one h; stiff ones require forces without
+    cancellation.
+    """
     case = cases()[name]
     h, most = case["pass"]["rk4"]["h"], case["pass"]["rk4"]["err_q_max"]
     steps = round(float(case["t_end"]) / h)
@@ -241,8 +245,8 @@ def test_case_meets_its_own_criterion(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLAIN)
-def test_case_where_the_step_is_too_long(name: str) -> None:
-    """Where the other implementation left the finite numbers, so does this one, and says so."""
+def test_overflow_with_too_long_steps_is_reported(name: str) -> None:
+    """Where the independent implementation overflows, ours does too and reports it."""
     module = compiled(name)
     for measured in cases()[name]["rk4_measured"]:
         if math.isnan(float(measured["err_q"])) and measured["steps"] <= MOST_STEPS:
@@ -252,12 +256,12 @@ def test_case_where_the_step_is_too_long(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_chaotic_motion_is_found_as_far_as_doubles_go() -> None:
+def test_chaotic_motion_is_as_accurate_as_doubles_allow() -> None:
     """Errors grow by 1.7e11 in 15 s, so doubles allow 1.8e-5; the listed h are 40 times too long.
 
-    At h = 2e-5, 750,000 steps, what rounding does to each step decides.
+    At h = 2e-5 (750,000 steps) the rounding of each step dominates.
     """
-    (name,) = LOST
+    (name,) = CHAOTIC
     case, module = cases()[name], compiled(name)
     run = module.simulate(h=2e-5, steps=750_000, every=750_000)
     assert error_of(name, run.q[-1]) < 2 * rounding(name, 750_000)
@@ -269,8 +273,10 @@ def test_a_chaotic_motion_is_found_as_far_as_doubles_go() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(AT_A_POLE))
-def test_a_run_into_a_pole_is_reported(name: str) -> None:
-    """7e-7 rad from the pole of the Euler angles, in 2 s: no listed h gets past it."""
+def test_run_into_a_pole_is_reported(name: str) -> None:
+    """The motion passes the pole of the Euler angles within 7e-7 rad at 2 s: every listed h
+    fails.
+    """
     module = compiled(name)
     for measured in cases()[name]["rk4_measured"]:
         with pytest.warns(RuntimeWarning, match="heavy_top_benchmark: stopped at t = "):
@@ -279,26 +285,26 @@ def test_a_run_into_a_pole_is_reported(name: str) -> None:
         assert 0 < run.t[-1] < 2
 
 
-def test_every_case_is_looked_at() -> None:
+def test_every_case_is_tested() -> None:
     free = {name for name, case in cases().items() if not case["constraints"]}
     assert len(free) == 45
-    assert free == {*PLAIN, *LOST, *AT_A_POLE, "harmonic_1e6_periods"}
-    # a pole ends runs, and a force that jumps leaves no order: both have tests of their own
+    assert free == {*PLAIN, *CHAOTIC, *AT_A_POLE, "harmonic_1e6_periods"}
+    # A pole ends runs, and a discontinuous force has no order: both have their own tests.
     assert free == {*BEST, *AT_A_POLE, "coulomb_friction"}
     assert set(UNREACHED) <= set(BEST)
 
 
 @pytest.mark.slow
-def test_a_wrong_sign_would_be_seen() -> None:
-    """The bounds are tight: parameters off by a thousandth of a per cent leave them."""
+def test_bounds_are_tight() -> None:
+    """With a parameter changed by a thousandth of a per cent the error exceeds the bounds."""
     name = "cartpole_drop_physicalP"
     module = compiled(name)
     h, steps, error = listed(name)[-1]
 
-    class Bent:
+    class PerturbedModule:
         def simulate(self, **how: Any) -> Any:
             return module.simulate(**how, params={"l": 2.0 * (1 + 1e-5)})
 
     assert_error_of_rk4(name, module, h, steps, error)
     with pytest.raises(AssertionError):
-        assert_error_of_rk4(name, Bent(), h, steps, error)  # type: ignore[arg-type]
+        assert_error_of_rk4(name, PerturbedModule(), h, steps, error)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The steppers' coefficients, and what dp8 reaches where RK4 can't."""
+"""Coefficients of the explicit methods, and the accuracy of dp8 where that of RK4 is limited."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MODULES = Path("build/tests/modules")
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
-# Runge-Kutta methods proper: those with an `end` of their own are Nystrom's
+# Runge-Kutta methods; those with an `end` of their own are Nystrom methods.
 EXPLICIT = [m for m in METHODS.values() if not m.implicit and not m.end]
 
 
@@ -38,7 +38,9 @@ def dot(x: tableaux.Row, y: tableaux.Row) -> Fraction:
 
 @pytest.mark.parametrize("method", EXPLICIT, ids=lambda m: m.name)
 def test_order_conditions(method: Method) -> None:
-    """Those of quadrature, and of the trees with one branching: b A c^k = 1/((k+1)(k+2))."""
+    """Check conditions of quadrature, and of the trees with one branching: b A c^k =
+    1/((k+1)(k+2)).
+    """
     exact = Fraction(1, 10**25)
     powers = [tuple(c**k for c in method.c) for k in range(method.order)]
     for k, power in enumerate(powers):
@@ -46,7 +48,7 @@ def test_order_conditions(method: Method) -> None:
         if k + 2 <= method.order:
             inner = tuple(dot(row, power) for row in method.a)
             assert abs(dot(method.b, inner) - Fraction(1, (k + 1) * (k + 2))) < exact
-            # the same through the matrices that the generated code uses
+            # the same with the matrices that the generated code uses
             assert abs(dot(method.b_a, power) - Fraction(1, (k + 1) * (k + 2))) < exact
     assert abs(dot(method.b, powers[-1]) - Fraction(1, method.order)) < exact
     next_one = tuple(c**method.order for c in method.c)
@@ -54,8 +56,8 @@ def test_order_conditions(method: Method) -> None:
 
 
 @pytest.mark.parametrize("method", EXPLICIT, ids=lambda m: m.name)
-def test_stability_ends_at_the_limits(method: Method) -> None:
-    """Those of an undamped oscillation and of a pure decay at the rate 1, to three digits."""
+def test_stability_limits(method: Method) -> None:
+    """Check limits of an undamped oscillation and of a decay at the rate 1, to three digits."""
     undamped, decay = method.limits
 
     def growth(acceleration: one_step.Acceleration, h: float) -> float:
@@ -69,16 +71,18 @@ def test_stability_ends_at_the_limits(method: Method) -> None:
 
 @pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda real: real.name)
 @pytest.mark.parametrize("method", METHODS.values(), ids=lambda m: m.name)
-def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> None:
-    """Each a number of C's type, off by no more than all of them are if rounded one by one."""
-    found = coefficients.round_weights(method.b, real)
+def test_rounded_weights_add_up_to_one(method: Method, real: Real) -> None:
+    """Each weight is a number of C's type; its error is at most that of rounding them
+    separately.
+    """
+    rounded = coefficients.round_weights(method.b, real)
     kind = np.dtype(real.dtype).type
-    assert [Fraction(float(kind(float(x)))) for x in found] == list(found)
-    assert sum(found) == 1
-    assert [x == 0 for x in found] == [x == 0 for x in method.b]
-    assert (found == found[::-1]) == (method.b == method.b[::-1])
+    assert [Fraction(float(kind(float(x)))) for x in rounded] == list(rounded)
+    assert sum(rounded) == 1
+    assert [x == 0 for x in rounded] == [x == 0 for x in method.b]
+    assert (rounded == rounded[::-1]) == (method.b == method.b[::-1])
     most = Fraction(real.epsilon) / 2 * sum(map(abs, method.b))
-    assert all(abs(x - y) <= most for x, y in zip(found, method.b, strict=True))
+    assert all(abs(x - y) <= most for x, y in zip(rounded, method.b, strict=True))
 
 
 def case_module(name: str) -> tuple[ModuleType, dict]:
@@ -88,7 +92,7 @@ def case_module(name: str) -> tuple[ModuleType, dict]:
     return eomc.load(path, MODULES), case
 
 
-# case: a step at which the method's own error has gone below that of rounding
+# Case: a step size at which the error of the method is below the rounding error.
 REACHED = {
     "cartpole_drop_tutorialP": 0.01,
     "cartpole_torque_physicalP": 0.05,
@@ -100,7 +104,7 @@ REACHED = {
 
 
 @pytest.mark.parametrize(("name", "h"), tiers(REACHED.items(), "cartpole_torque_physicalP"))
-def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
+def test_dp8_reaches_the_rounding_floor(name: str, h: float) -> None:
     m, case = case_module(name)
     t_end = float(case["t_end"])
     steps = round(t_end / h)
@@ -113,7 +117,7 @@ def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
         / scale
         for method in m.methods
     }
-    # the floor of the arithmetic, and the growth of one rounding a step
+    # The rounding floor, plus one rounding error in each step, amplified to the end.
     floor = max(float(case["double_floor"]), case["amplification"] * 2e-16 * np.sqrt(steps))
     assert error["dp8"] < 20 * floor
     assert error["rk4"] > 100 * error["dp8"]
@@ -121,9 +125,7 @@ def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_wrong_coefficient_is_found_by_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_detects_a_wrong_coefficient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = list(DP8.a[7])
     row[3] += Fraction(1, 1000)
     broken = dataclasses.replace(DP8, a=(*DP8.a[:7], tuple(row), *DP8.a[8:]))
@@ -136,14 +138,14 @@ def test_a_wrong_coefficient_is_found_by_check(
         (Advice, "failing_fraction"),
         (Convergence, "compare_methods"),
     ):
-        # which say nothing of it
+        # these would fail too
         monkeypatch.setattr(of, row, lambda *_: Measurement(math.nan, "not looked at"))
-    made = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)
-    made.add_convergence_checks()
-    assert [row.name for row in made.results if not row.passed] == ["order of dp8"]
+    comparison = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)
+    comparison.add_convergence_checks()
+    assert [row.name for row in comparison.results if not row.passed] == ["order of dp8"]
 
 
-def test_a_method_that_is_not_there_is_refused_by_name(cartpole: ModuleType) -> None:
+def test_unknown_method_is_refused_by_name(cartpole: ModuleType) -> None:
     assert cartpole.methods == ("rk4",)
     with pytest.raises(ValueError, match=r"method: 'dp8' is not in this module, which has rk4"):
         cartpole.simulate(method="dp8")
@@ -151,20 +153,22 @@ def test_a_method_that_is_not_there_is_refused_by_name(cartpole: ModuleType) -> 
     assert "dp8" not in source
 
 
-def test_inputs_are_held_or_followed_by_each_method() -> None:
+def test_each_method_evaluates_signals_and_holds_constant_inputs() -> None:
     path = variant("cartpole_driven", "driven_dp8", method='["dp8", "rk4"]')
     m = eomc.load(path, MODULES)
     assert m.methods == ("dp8", "rk4")
     followed = [m.simulate(h=h, duration=2.0).q[-1] for h in (0.1, 0.05)]
     assert np.max(np.abs(followed[0] - followed[1])) < 1e-11
-    held = [m.simulate(h=h, duration=2.0, u=[0.3], method="rk4").q[-1] for h in (0.02, 0.01, 0.005)]
+    constant = [
+        m.simulate(h=h, duration=2.0, u=[0.3], method="rk4").q[-1] for h in (0.02, 0.01, 0.005)
+    ]
     exact = m.simulate(h=0.05, duration=2.0, u=[0.3]).q[-1]
-    errors = [np.max(np.abs(q - exact)) for q in held]
+    errors = [np.max(np.abs(q - exact)) for q in constant]
     assert all(12 < a / b < 20 for a, b in pairwise(errors))
 
 
-def test_steps_are_the_methods_at_any_speed(cartpole: ModuleType) -> None:
-    """Angles that a stage turns by little are rotated by a series, by more by another, or anew."""
+def test_steps_at_any_angular_velocity(cartpole: ModuleType) -> None:
+    """Stages rotate small angles by one series, larger ones by another, or evaluate sines again."""
 
     def slope(x: np.ndarray) -> np.ndarray:
         return np.concatenate([x[2:], cartpole.acceleration(x[:2], x[2:])])
@@ -172,12 +176,12 @@ def test_steps_are_the_methods_at_any_speed(cartpole: ModuleType) -> None:
     worst = 0.0
     for h, turned in product(np.geomspace(0.01, 0.4, 30), 1.3 * 2.0 ** np.arange(-9, 2)):
         run = cartpole.simulate(q0=[0.1, 0.7], qd0=[-0.2, turned / h], h=h, steps=5)
-        for x, found in pairwise(np.hstack([run.q, run.qd])):
+        for x, result in pairwise(np.hstack([run.q, run.qd])):
             k1 = slope(x)
             k2 = slope(x + h / 2 * k1)
             k3 = slope(x + h / 2 * k2)
             k4 = slope(x + h * k3)
             expected = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             scale = 1 + np.abs(x) + h * np.max(np.abs([k1, k2, k3, k4]), axis=0)
-            worst = max(worst, float(np.max(np.abs(found - expected) / scale)))
+            worst = max(worst, float(np.max(np.abs(result - expected) / scale)))
     assert worst < 5e-15

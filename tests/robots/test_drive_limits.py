@@ -1,4 +1,4 @@
-"""Limits of drives in robot files as limits of inputs: the unit of each, gear and gain, signs."""
+"""Actuator limits of robot files as limits of inputs: units, gear, gain and signs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ URDF = f"""<robot name="pusher"><link name="rail"/>
 <joint name="end" type="continuous"><parent link="arm"/><child link="tip"/><axis xyz="1 0 0"/>
 <limit effort="0.5" velocity="1"/></joint></robot>"""
 HINGE = '<body><joint name="{name}" {more}/><geom size="0.1" mass="1"/></body>'
-# gears, gains, ranges of controls and of forces, ranges of what drives a joint; shared and servos
+# gears, gains, control ranges, force ranges of actuators and joints; shared joints and servos
 MOTORS = """
 <motor name="geared" joint="a" gear="150" ctrlrange="-1 2"/>
 <general name="gained" joint="b" gear="2" gainprm="-4" ctrlrange="-5 5" forcerange="-8 12"/>
@@ -37,9 +37,9 @@ MOTORS = """
 LIMITS = {
     "geared": [-1, 2],  # of the control, before the gear
     "gained": [-3, 2],  # the force -4 u within -8 and 12
-    "weak": [-0.4, 0.3],  # the joint takes -3 to 4 N m of -10 u
-    "servo": [-1, 1],  # of its set point; those of its force are in its law
-    "first": [-1, 1],  # and second, idle and odd have none
+    "weak": [-0.4, 0.3],  # the joint takes -3 to 4 N m of the force -10 u
+    "servo": [-1, 1],  # of its set point; force limits are part of its law
+    "first": [-1, 1],  # and second; idle and odd have none
 }
 
 
@@ -52,74 +52,74 @@ def mjcf(*joints: str) -> str:
     )
 
 
-def imported(folder: Path, text: str, *words: str) -> tuple[str, dict]:
-    """What the command says, and the scene."""
-    said, scene = mjcf_text.imported(folder, text, *words)
-    return said, tomllib.loads(scene)
+def import_scene(folder: Path, text: str, *words: str) -> tuple[str, dict]:
+    """Import a robot; return the command's output and the parsed scene."""
+    output, scene = mjcf_text.imported(folder, text, *words)
+    return output, tomllib.loads(scene)
 
 
-def taken(scene: dict) -> dict:
+def input_limits(scene: dict) -> dict:
     return {name: u["limits"] for name, u in scene["inputs"].items() if "limits" in u}
 
 
-def test_an_effort_of_urdf_is_the_largest_force(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, URDF, "--limits")
-    assert taken(scene) == {"slide_force": [-80, 80], "end_torque": [-0.5, 0.5]}
-    assert "limits of drives: 2 of 3 inputs have them, and act within" in said
-    assert "without are turn_torque" in said
-    assert "limits of 3 joints, of position and speed: their values are in the notes" in said
+def test_urdf_effort_limits_the_input(tmp_path: Path) -> None:
+    output, scene = import_scene(tmp_path, URDF, "--limits")
+    assert input_limits(scene) == {"slide_force": [-80, 80], "end_torque": [-0.5, 0.5]}
+    assert "limits of drives: 2 of 3 inputs have them, and act within" in output
+    assert "without are turn_torque" in output
+    assert "limits of 3 joints, of position and speed: their values are in the notes" in output
 
 
-def test_without_the_option_they_are_notes(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, URDF)
-    assert not taken(scene) and "limits of 3 joints: their values" in said
+def test_without_the_option_limits_are_notes(tmp_path: Path) -> None:
+    output, scene = import_scene(tmp_path, URDF)
+    assert not input_limits(scene) and "limits of 3 joints: their values" in output
     assert "at most 80 N" in scene["inputs"]["slide_force"]["note"]
 
 
-def test_with_stops_speeds_alone_are_notes(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, URDF, "--limits", "--stops")
-    assert "pushes back; those of speed are notes" in said and taken(scene)
+def test_with_stops_only_speed_limits_are_notes(tmp_path: Path) -> None:
+    output, scene = import_scene(tmp_path, URDF, "--limits", "--stops")
+    assert "pushes back; those of speed are notes" in output and input_limits(scene)
 
 
-def test_limits_of_mjcf_are_those_of_the_input_before_the_gear(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, mjcf(*"abcdefg"), "--limits")
-    assert taken(scene) == LIMITS
+def test_mjcf_limits_apply_before_the_gear(tmp_path: Path) -> None:
+    output, scene = import_scene(tmp_path, mjcf(*"abcdefg"), "--limits")
+    assert input_limits(scene) == LIMITS
     for words in (
         "limits of drives: 5 of 8 inputs have them, and act within; without are second, idle, odd",
         "limits of force on joints that several inputs, or tendons, drive: e",
         "ranges of actuators that exclude each other: odd",
     ):
-        assert words in said, said
-    assert "limits of actuators" not in said
+        assert words in output, output
+    assert "limits of actuators" not in output
     law = "servo_kp*(servo - 2*d)"
     assert scene["definitions"]["servo_force"] == f"min(max({law}, -7), 7)"
     (tmp_path / "free").mkdir()
-    scene = imported(tmp_path / "free", mjcf(*"abcdefg"))[1]
-    assert scene["definitions"]["servo_force"] == law and not taken(scene)
+    scene = import_scene(tmp_path / "free", mjcf(*"abcdefg"))[1]
+    assert scene["definitions"]["servo_force"] == law and not input_limits(scene)
 
 
-def test_what_a_joint_takes_is_a_limit_of_its_servo(tmp_path: Path) -> None:
+def test_joint_force_range_limits_its_servo(tmp_path: Path) -> None:
     text = mjcf("d").replace('name="d" ', 'name="d" actuatorfrcrange="-8 20"')
     servo = re.search("<position.*", MOTORS)[0]
     text = text.replace(MOTORS, servo)
-    _, scene = imported(tmp_path, text, "--limits")
+    _, scene = import_scene(tmp_path, text, "--limits")
     assert scene["definitions"]["servo_force"] == "min(max(servo_kp*(servo - 2*d), -4), 7)"
 
 
 @pytest.mark.parametrize("words", [("--no-drives",), ("--lock", "slide=0", "--lock", "end=0")])
-def test_they_need_an_input_that_has_some(words: tuple[str, ...], tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, URDF, "--limits", *words)
-    assert "--limits: no input of this robot has limits" in said and not scene
+def test_option_needs_an_input_with_limits(words: tuple[str, ...], tmp_path: Path) -> None:
+    output, scene = import_scene(tmp_path, URDF, "--limits", *words)
+    assert "--limits: no input of this robot has limits" in output and not scene
 
 
-def test_ranges_meet() -> None:
+def test_intersection_of_ranges() -> None:
     assert input_range((-8, 12), -4) == (-3, 2) and input_range((-8, 12), 0) == (-np.inf, np.inf)
     assert intersection((-1, 2), (0, 5)) == (0, 2)
     assert intersection((0, 1), (1, 2)) is None
 
 
-def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:
-    imported(tmp_path, URDF, "--limits")
+def test_input_limits_saturate_inputs(tmp_path: Path, quickly_compiled: None) -> None:
+    import_scene(tmp_path, URDF, "--limits")
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     most, more = (m.acceleration([0, 0, 0], [0, 0, 0], u=[f, 0, 0]) for f in (80.0, 200.0))
     np.testing.assert_array_equal(most, more)
@@ -127,11 +127,11 @@ def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:
 
 
 @pytest.mark.slow
-def test_the_forces_are_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
-    """What drives each joint, of controls within and beyond all ranges."""
+def test_forces_equal_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
+    """Compare joint forces for controls within and beyond all ranges."""
     mujoco = pytest.importorskip("mujoco", reason="pip install '.[robots]'")
     text = mjcf(*"abcd").split('<motor name="first"')[0] + "</actuator></mujoco>"
-    imported(tmp_path, text, "--limits")
+    import_scene(tmp_path, text, "--limits")
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

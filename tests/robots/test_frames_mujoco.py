@@ -1,6 +1,6 @@
-"""Poses, Jacobians, inverse dynamics and momenta of real robot files, as MuJoCo has them.
+"""Poses, Jacobians, inverse dynamics and momenta of real robot files, compared with MuJoCo.
 
-The program is evaluated without a compiler: what C makes of it is compared with it elsewhere.
+The program is evaluated in Python; other tests compare it with the generated C.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from robots.test_robots_mujoco import (
     Array,
-    elsewhere,  # noqa: F401 - a fixture, for all tests here
+    angular_velocity_map,
     from_urdf,
+    indices_of_euler_angles,
     mujoco,
     positions,
-    turned_by_angles,
-    turning,
+    working_folder,  # noqa: F401 - a fixture, for all tests here
 )
 
 from eomc.derive.frames import momentum, motions, wrenches
@@ -33,7 +33,7 @@ from eomc.scene.read import parse
 
 pytestmark = pytest.mark.slow
 
-CLOSE = 1e-10  # of the largest number
+CLOSE = 1e-10  # relative to the largest number
 FIXED = """
     ur3_robot ur5_robot ur10_robot panda kinova xarm7 z1 so100 so101 TwoDofs finger_edu
     double_pendulum double_pendulum_simple double_pendulum_continuous allegro_right_hand
@@ -44,7 +44,7 @@ FREE = "solo12 solo go1 go2 a1 b1 laikago bolt hyq_no_sensors anymal iris quadro
 
 
 class Ours:
-    """Functions of a scene at a state."""
+    """Functions of a scene, evaluated at a state."""
 
     def __init__(self, text: str) -> None:
         system = from_scene(parse(text, "robot.toml"))
@@ -52,30 +52,30 @@ class Ours:
         self.system = replace(system, run=run)
         self.motions = motions(self.system)
 
-    def values(self, tape: Tape, outputs: Sequence[object], *given: Array) -> Array:
+    def values(self, tape: Tape, outputs: Sequence[object], *arguments: Array) -> Array:
         system: System = self.system
         function = lower("values", tape, outputs, system.names)
         leaves = [system.q, system.qd, system.qdd, wrenches(system)]
         state = {p.name: p.value for p in system.parameters} | {"t": 0.0}
-        for symbols, numbers in zip(leaves, given, strict=False):
+        for symbols, numbers in zip(leaves, arguments, strict=False):
             state |= {x.name: float(v) for x, v in zip(symbols, numbers, strict=True)}
-        found, _ = evaluate(function, state)
-        return np.array(found)
+        result, _ = evaluate(function, state)
+        return np.array(result)
 
-    def frames(self, what: str, *given: Array) -> Array:
-        made = self.motions
-        found = self.values(made.tape, getattr(made, what), *given)
-        return found if what == "forces" else found.reshape(len(self.system.output_frames), -1)
+    def frames(self, what: str, *arguments: Array) -> Array:
+        motions_of_system = self.motions
+        result = self.values(motions_of_system.tape, getattr(motions_of_system, what), *arguments)
+        return result if what == "forces" else result.reshape(len(self.system.output_frames), -1)
 
 
-def near(found: Array, expected: Array, what: str, of: float = 0.0) -> None:
-    size = max(float(np.max(np.abs(expected))), of)
-    off = float(np.max(np.abs(found - expected))) / size
+def near(computed: Array, expected: Array, what: str, scale: float = 0.0) -> None:
+    size = max(float(np.max(np.abs(expected))), scale)
+    off = float(np.max(np.abs(computed - expected))) / size
     assert off <= CLOSE, f"{what} is off by {off:.1e} of its largest number"
 
 
 @pytest.mark.parametrize(("name", "free"), [(n, False) for n in FIXED] + [(n, True) for n in FREE])
-def test_robots(name: str, free: bool, tmp_path: Path) -> None:
+def test_robots_agree_with_mujoco(name: str, free: bool, tmp_path: Path) -> None:
     both = from_urdf(f"/{name}.urdf", tmp_path, free, fuse=False)
     model, n = both.model, both.model.nv
     robot = prepare_for_scene(both.robot)
@@ -83,7 +83,7 @@ def test_robots(name: str, free: bool, tmp_path: Path) -> None:
     names = [b.name for b in sorted(robot.bodies, key=lambda b: b.point)]
     assert [f.name for f in ours.system.output_frames] == names
     inside = {b.name: k for k, b in enumerate(robot.bodies)}
-    # the same bodies in the order of the file's
+    # The bodies in the order of the file.
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, both.robot.bodies[inside[x]].name)
            for x in names]  # fmt: skip
     random = np.random.default_rng(5)
@@ -91,9 +91,9 @@ def test_robots(name: str, free: bool, tmp_path: Path) -> None:
     w = random.uniform(-1, 1, 6 * len(ids))
     data = mujoco.MjData(model)
     T, T_dot = np.eye(n), np.zeros((n, n))
-    for at in turned_by_angles(model):
+    for at in indices_of_euler_angles(model):
         three = slice(at, at + 3)
-        T[three, three], T_dot[three, three] = turning(q[three], qd[three])
+        T[three, three], T_dot[three, three] = angular_velocity_map(q[three], qd[three])
     data.qpos[:], data.qvel[:], data.qacc[:] = positions(model, q), T @ qd, T @ qdd + T_dot @ qd
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
@@ -120,11 +120,11 @@ def test_robots(name: str, free: bool, tmp_path: Path) -> None:
     tau = np.zeros(n)
     mujoco.mj_rne(model, data, 1, tau)
     tau += model.dof_armature * data.qacc
-    found = ours.values(*inverse_dynamics(ours.system), q, qd, qdd)
-    near(found, T.T @ tau, "inverse dynamics")
+    computed = ours.values(*inverse_dynamics(ours.system), q, qd, qdd)
+    near(computed, T.T @ tau, "inverse dynamics")
 
     if free:
-        found = ours.values(*momentum(ours.system), q, qd)
+        computed = ours.values(*momentum(ours.system), q, qd)
         mass = model.body_subtreemass[0]
         linear, angular = mass * data.subtree_linvel[0], data.subtree_angmom[0]
-        near(found, np.hstack([mass, data.subtree_com[0], linear, angular]), "momentum")
+        near(computed, np.hstack([mass, data.subtree_com[0], linear, angular]), "momentum")

@@ -1,7 +1,7 @@
-"""Poses, velocities, Jacobians and inverse dynamics of robot files, as Pinocchio has them.
+"""Poses, velocities, Jacobians and inverse dynamics of robot files, compared with Pinocchio.
 
-Where Pinocchio is installed (pip install pin), which the tests' own environment does not do: there
-MuJoCo is the judge (test_frames_mujoco.py).
+These tests need Pinocchio (pip install pin), which the test environment does not include: there
+test_frames_mujoco.py compares with MuJoCo.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import pytest
 pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
 from robots.test_frames_mujoco import FIXED, Ours, near  # noqa: E402
 from robots.test_robots_mujoco import (  # noqa: E402
-    elsewhere,  # noqa: F401 - a fixture, for all tests here
     from_urdf,
     robot_data,
-    stripped,
+    without_meshes,
+    working_folder,  # noqa: F401 - a fixture, for all tests here
 )
 
 from eomc.derive.lagrange import inverse_dynamics  # noqa: E402
@@ -34,11 +34,11 @@ MORE = """
 
 
 @pytest.mark.parametrize("name", [*FIXED, *MORE])
-def test_robots(name: str, tmp_path: Path) -> None:
+def test_robots_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
     both = from_urdf(f"/{name}.urdf", tmp_path, fuse=False)
     ours, bodies = Ours(both.text()), prepare_for_scene(both.robot).bodies
     order = sorted(range(len(bodies)), key=lambda k: bodies[k].point)
-    model = pinocchio.buildModelFromUrdf(str(stripped(robot_data(f"/{name}.urdf"), tmp_path)))
+    model = pinocchio.buildModelFromUrdf(str(without_meshes(robot_data(f"/{name}.urdf"), tmp_path)))
     data, n = model.createData(), model.nv
     random = np.random.default_rng(7)
     q, qd, qdd = random.uniform(-1, 1, (3, n))
@@ -49,8 +49,8 @@ def test_robots(name: str, tmp_path: Path) -> None:
         v[joint.idx_v], a[joint.idx_v] = qd[k], qdd[k]
         turns = [math.cos(q[k]), math.sin(q[k])] if joint.nq == 2 else [q[k]]
         at[joint.idx_q : joint.idx_q + joint.nq] = turns
-    found = ours.values(*inverse_dynamics(ours.system), q, qd, qdd)
-    near(found, pinocchio.rnea(model, data, at, v, a)[places], "inverse dynamics")
+    computed = ours.values(*inverse_dynamics(ours.system), q, qd, qdd)
+    near(computed, pinocchio.rnea(model, data, at, v, a)[places], "inverse dynamics")
 
     pinocchio.forwardKinematics(model, data, at, v, a)
     pinocchio.computeJointJacobians(model, data, at)

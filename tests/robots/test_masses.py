@@ -36,39 +36,39 @@ TWO = '<body name="{}" pos="0 {} 0"><joint/><geom size="0.1" pos="0.2 0 0"/></bo
 
 
 def equations(robot: Robot, q: list[float], qd: list[float], values: Mapping[str, float]) -> dict:
-    """D and bias at the given values of parameters."""
+    """Return D and bias at the given parameter values."""
     system = from_scene(parse(scene_text(robot), "robot.toml"))
     known = {p.name: p.value for p in system.parameters}
     assert values.keys() <= known.keys()
     known |= {**values, "t": 0.0}
     known |= dict(zip([x.name for x in (*system.q, *system.qd)], [*q, *qd], strict=True))
     functions = program.build(derive(system)).functions
-    found = {name: np.array(evaluate(functions[name], known)[0]) for name in ("D", "bias")}
-    return {"D": found["D"].reshape(len(q), len(q)), "bias": found["bias"]}
+    result = {name: np.array(evaluate(functions[name], known)[0]) for name in ("D", "bias")}
+    return {"D": result["D"].reshape(len(q), len(q)), "bias": result["bias"]}
 
 
 def test_masses_and_the_payload_are_parameters(tmp_path: Path) -> None:
     text = f"<mujoco><worldbody>{ARM.format(more='')}</worldbody></mujoco>"
     _, scene = imported(tmp_path, text, "--parameters", "masses")
-    found = tomllib.loads(scene)
-    assert list(found["parameters"]) == ["mass_upper", "mass_fore", "payload"]
-    assert found["parameters"]["payload"] == {
+    parsed = tomllib.loads(scene)
+    assert list(parsed["parameters"]) == ["mass_upper", "mass_fore", "payload"]
+    assert parsed["parameters"]["payload"] == {
         "value": 0, "unit": "kg", "note": "payload at tool",
     }  # fmt: skip
-    mass = found["parameters"]["mass_fore"]["value"]
-    bodies = {body["name"]: body for body in found["body"]}
+    mass = parsed["parameters"]["mass_fore"]["value"]
+    bodies = {body["name"]: body for body in parsed["body"]}
     assert bodies["fore"]["mass"] == "mass_fore"
     assert all(e.endswith(f"*mass_fore/{mass!r}") for e in bodies["fore"]["inertia"])
-    assert isinstance(bodies["base"]["mass"], float)  # it does not move
+    assert isinstance(bodies["base"]["mass"], float)  # it is fixed
     assert bodies["load"]["parent"] == "tool"
 
 
-def test_at_their_values_the_equations_are_those_without_parameters(tmp_path: Path) -> None:
+def test_equations_at_default_masses_equal_those_without_parameters(tmp_path: Path) -> None:
     robot = model(tmp_path, ARM.format(more=""))
     q, qd = [0.3, -0.4], [1.0, 0.8]
-    plain, found = equations(robot, q, qd, {}), equations(with_masses(robot), q, qd, {})
+    plain, parametrized = equations(robot, q, qd, {}), equations(with_masses(robot), q, qd, {})
     for name, value in plain.items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(parametrized[name], value, rtol=1e-12, atol=1e-14)
 
 
 def test_armature_does_not_follow_the_mass(tmp_path: Path) -> None:
@@ -91,23 +91,23 @@ def test_armature_does_not_follow_the_mass(tmp_path: Path) -> None:
         ('<body name="flange"/><body name="load"/>', "", {"payload": "load"}),
     ],
 )  # fmt: skip
-def test_where_payloads_are(more: str, tip: str, names: dict[str, str], tmp_path: Path) -> None:
+def test_positions_of_payloads(more: str, tip: str, names: dict[str, str], tmp_path: Path) -> None:
     robot = with_masses(model(tmp_path, ARM.format(more=more)), tip)
     loads = {b.parameter: b.parent for b in robot.bodies if b.parameter.startswith("payload")}
     assert loads == names
-    found = tomllib.loads(scene_text(robot))
-    assert loads.keys() <= found["parameters"].keys()
+    parsed = tomllib.loads(scene_text(robot))
+    assert loads.keys() <= parsed["parameters"].keys()
     parse(scene_text(robot), "robot.toml")
 
 
-def test_a_parameter_takes_a_name_that_is_free(tmp_path: Path) -> None:
+def test_parameter_names_avoid_collisions(tmp_path: Path) -> None:
     robot = with_masses(model(tmp_path, ARM.format(more="").replace('"a"', '"payload"')))
     assert {"payload_2", "mass_fore"} <= tomllib.loads(scene_text(robot))["parameters"].keys()
 
 
-@pytest.mark.slow  # in the tier that installs MuJoCo
-def test_changed_masses_are_those_of_mujoco(tmp_path: Path) -> None:
-    """Their bodies have masses and inertias times a factor, and one more has the payload."""
+@pytest.mark.slow  # runs in the tier that installs MuJoCo
+def test_changed_masses_agree_with_mujoco(tmp_path: Path) -> None:
+    """Scale masses and inertias of the bodies, and add the payload to one body."""
     mujoco = pytest.importorskip("mujoco")
     robot = with_masses(model(tmp_path, ARM.format(more="")))
     masses = {b.parameter: b.mass for b in robot.bodies if b.parameter}
@@ -127,7 +127,7 @@ def test_changed_masses_are_those_of_mujoco(tmp_path: Path) -> None:
         mujoco.mj_forward(theirs, data)
         M = np.zeros((2, 2))
         mujoco.mj_fullM(theirs, data, M)
-        found = equations(robot, list(q), list(qd), values)
-        np.testing.assert_allclose(found["D"], M, rtol=1e-10)
-        wanted = data.qfrc_bias - data.qfrc_gravcomp
-        np.testing.assert_allclose(found["bias"], wanted, rtol=1e-10, atol=1e-10)
+        computed = equations(robot, list(q), list(qd), values)
+        np.testing.assert_allclose(computed["D"], M, rtol=1e-10)
+        expected = data.qfrc_bias - data.qfrc_gravcomp
+        np.testing.assert_allclose(computed["bias"], expected, rtol=1e-10, atol=1e-10)

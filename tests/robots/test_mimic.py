@@ -1,4 +1,4 @@
-"""Joints of a URDF that mimic others: moved by their coordinates, refused, or fixed."""
+"""URDF joints with <mimic>: driven by another coordinate, refused, or fixed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MIMICS = {
 
 
 def hand(**mimics: str) -> str:
-    """A wrist, two finger joints, a thumb and a tendon's slide, each with its <mimic>."""
+    """Return a URDF with a wrist, two finger joints, a thumb and a slide, each with its <mimic>."""
     joints = [
         ("wrist", "revolute", "base", "palm", "0 0 1"),
         ("near", "revolute", "palm", "finger", "0 1 0"),
@@ -51,32 +51,32 @@ def read(text: str, folder: Path) -> Robot:
     return urdf.read(folder / "hand.urdf")
 
 
-def moved_by(robot: Robot) -> dict[str, list[str]]:
-    """The coordinates of each body's joint, as the scene has them."""
+def coordinates_of_bodies(robot: Robot) -> dict[str, list[str]]:
+    """Return the coordinates of each body's joint in the scene."""
     scene = parse(scene_text.scene_text(robot), "hand.toml")
     assert scene.assembly and not scene.warnings
     return {b.name: [f.text for f in b.coordinates] for b in scene.assembly.bodies}
 
 
-def test_a_joint_that_mimics_has_no_coordinate_and_no_drive(tmp_path: Path) -> None:
+def test_mimic_joint_has_no_coordinate_and_no_drive(tmp_path: Path) -> None:
     robot = read(hand(**MIMICS), tmp_path)
     assert [m.name for m in robot.motions] == ["wrist", "near"]
     assert [d.coordinate for d in robot.drives] == ["wrist", "near"]
     assert not any("mimic" in words for words in robot.left_out)
     assert "thumb mimics near; -3 to 3" in robot.bodies[4].note
-    assert moved_by(robot) == {
+    assert coordinates_of_bodies(robot) == {
         "base": [], "palm": ["wrist"], "finger": ["near"], "tip": ["0.5*near + 0.1"],
         "thumb": ["-near - 0.2"], "tendon": ["0.04*near"],
     }  # fmt: skip
 
 
-def test_their_equations_are_those_of_free_joints_projected(tmp_path: Path) -> None:
-    """D = G^T D' G, and so for bias, g and tau, with q' = G q + c and G constant."""
+def test_equations_are_projections_of_those_of_free_joints(tmp_path: Path) -> None:
+    """D = G^T D' G, and so for bias, g and tau, with q' = G q + c and constant G."""
     G = np.array([[1, 0], [0, 1], [0, 0.5], [0, -1], [0, 0.04]])
     c = np.array([0, 0, 0.1, -0.2, 0])
     q, qd = np.array([0.4, 0.7]), np.array([-0.8, 1.3])
-    found, free = (
-        values(read(hand(**mimics), tmp_path), *state)
+    projected, free = (
+        evaluate_equations(read(hand(**mimics), tmp_path), *state)
         for mimics, state in ((MIMICS, (q, qd)), ({}, (G @ q + c, G @ qd)))
     )
     for name, right in {
@@ -85,21 +85,24 @@ def test_their_equations_are_those_of_free_joints_projected(tmp_path: Path) -> N
         "kinetic_energy": free["kinetic_energy"],
         "potential_energy": free["potential_energy"],
     }.items():
-        np.testing.assert_allclose(found[name], right, rtol=1e-13, err_msg=name)
+        np.testing.assert_allclose(projected[name], right, rtol=1e-13, err_msg=name)
 
 
-def values(robot: Robot, q: np.ndarray, qd: np.ndarray) -> dict[str, np.ndarray]:
-    """What the equations give, without inputs."""
-    made = from_scene(parse(scene_text.scene_text(robot), "hand.toml"))
-    state = {**dict(zip([x.name for x in (*made.q, *made.qd)], [*q, *qd], strict=True)), "t": 0.0}
-    state |= {x.name: 0.0 for x in made.u}
-    functions = program.build(lagrange.derive(made)).functions
+def evaluate_equations(robot: Robot, q: np.ndarray, qd: np.ndarray) -> dict[str, np.ndarray]:
+    """Evaluate the equations with zero inputs."""
+    system = from_scene(parse(scene_text.scene_text(robot), "hand.toml"))
+    state = {
+        **dict(zip([x.name for x in (*system.q, *system.qd)], [*q, *qd], strict=True)),
+        "t": 0.0,
+    }
+    state |= {x.name: 0.0 for x in system.u}
+    functions = program.build(lagrange.derive(system)).functions
     out = {name: np.array(evaluate(functions[name], state)[0]) for name in functions}
     out["D"] = out["D"].reshape(len(q), -1)
     return out
 
 
-def test_a_lock_freezes_what_mimics_too(tmp_path: Path) -> None:
+def test_lock_fixes_mimic_joints_too(tmp_path: Path) -> None:
     robot = read(hand(**MIMICS), tmp_path)
     locked = edit.lock(robot, {"near": 0.4})
     assert [m.name for m in locked.motions] == ["wrist"]
@@ -117,28 +120,28 @@ def test_a_lock_freezes_what_mimics_too(tmp_path: Path) -> None:
         edit.lock(robot, {"near": 0.4, "far": 0.1})
 
 
-def test_without_the_joint_it_mimics_a_joint_stands_where_it_starts(tmp_path: Path) -> None:
+def test_mimic_of_a_removed_joint_is_fixed_at_its_initial_value(tmp_path: Path) -> None:
     text = hand(**MIMICS).replace('limit lower="-3"', 'limit lower="0.2"')
     cut = edit.cut(read(text, tmp_path), tip="tendon")
-    assert moved_by(cut) == {"base": [], "palm": ["wrist"], "tendon": []}
+    assert coordinates_of_bodies(cut) == {"base": [], "palm": ["wrist"], "tendon": []}
     assert cut.bodies[-1].offset[0] > 0.2  # near starts at 0.2, so the slide at 0.008
 
 
-def test_a_mimic_of_what_does_not_move_is_fixed(tmp_path: Path) -> None:
+def test_mimic_of_a_fixed_joint_is_fixed(tmp_path: Path) -> None:
     text = hand(
         far='<mimic joint="thumb" offset="0.3"/>', tendon='<mimic joint="near" multiplier="0"/>'
     )
     robot = read(
         text.replace('name="thumb" type="revolute"', 'name="thumb" type="fixed"'), tmp_path
     )
-    assert moved_by(robot) == {
+    assert coordinates_of_bodies(robot) == {
         "base": [], "palm": ["wrist"], "finger": ["near"], "tip": [], "thumb": [], "tendon": [],
     }  # fmt: skip
     assert "stands at 0.3 rad" in robot.bodies[3].note
 
 
 @pytest.mark.parametrize(
-    ("mimics", "said"),
+    ("mimics", "message"),
     [
         ({"far": '<mimic joint="naer"/>'}, "joint far: it mimics joint 'naer', which is not in the "
          "file; did you mean 'near'?"),
@@ -150,14 +153,14 @@ def test_a_mimic_of_what_does_not_move_is_fixed(tmp_path: Path) -> None:
         ({"loose": '<mimic joint="near"/>'}, "loose: it mimics 'near'; 'loose' is a floating"),
     ],
 )  # fmt: skip
-def test_what_can_not_be_mimicked(mimics: dict[str, str], said: str, tmp_path: Path) -> None:
+def test_invalid_mimics_are_refused(mimics: dict[str, str], message: str, tmp_path: Path) -> None:
     text = hand(**mimics)
     if "loose" in str(mimics):
-        loose = (
+        floating_joint = (
             f'type="floating"><parent link="palm"/><child link="loose"/>{mimics.get("loose", "")}'
         )
-        more = LINK.format("loose", 0, 1) + f'<joint name="loose" {loose}</joint></robot>'
+        more = LINK.format("loose", 0, 1) + f'<joint name="loose" {floating_joint}</joint></robot>'
         text = text.replace("</robot>", more)
     with pytest.raises(EomcError) as fault:
         read(text, tmp_path)
-    assert said in str(fault.value)
+    assert message in str(fault.value)

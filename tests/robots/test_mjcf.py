@@ -21,7 +21,7 @@ def test_angles_are_degrees_unless_the_compiler_says_radian(tmp_path: Path) -> N
     (a,) = model(tmp_path, body).bodies
     assert a.motions[0].start == pytest.approx(PI / 6, rel=CLOSE)
     assert a.motions[0].rest == pytest.approx(PI / 3, rel=CLOSE)
-    assert a.motions[0].stiffness == 2  # by rad, always
+    assert a.motions[0].stiffness == 2  # always per radian
     assert a.motions[0].note == "from -1.5708 to 0.785398 rad"
     body = body.replace("90", "1").replace("30", "0.5")
     (b,) = model(tmp_path, body, '<compiler angle="radian"/>').bodies
@@ -29,16 +29,16 @@ def test_angles_are_degrees_unless_the_compiler_says_radian(tmp_path: Path) -> N
     assert b.rotation[0][0] == pytest.approx(math.cos(0.5), rel=CLOSE)
 
 
-def test_orientations_say_the_same_in_five_ways(tmp_path: Path) -> None:
-    # a quarter turn about z, then one about the new x: x to y, y to z, z to x
-    ways = [
+def test_five_notations_of_one_orientation_are_equal(tmp_path: Path) -> None:
+    # A quarter turn about z, then one about the new x: x to y, y to z, z to x.
+    orientations = [
         'quat="1 1 1 1"',
         'euler="90 0 90"',
         'axisangle="2 2 2 120"',
         'xyaxes="0 1 0 0 5 1"',
     ]
     compiler = '<compiler eulerseq="zyx"/>'
-    for way in ways:
+    for way in orientations:
         (a,) = model(tmp_path, f"<body {way}><joint/>{BALL}</body>", compiler).bodies
         assert np.array(a.rotation) == pytest.approx(
             np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), abs=1e-15
@@ -47,7 +47,7 @@ def test_orientations_say_the_same_in_five_ways(tmp_path: Path) -> None:
     assert a.rotation == ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
 
 
-def test_capitals_of_eulerseq_are_axes_that_stay(tmp_path: Path) -> None:
+def test_capitals_in_eulerseq_are_fixed_axes(tmp_path: Path) -> None:
     body = f'<body euler="10 20 30"><joint/>{BALL}</body>'
     (a,) = model(tmp_path, body, '<compiler eulerseq="XYZ"/>').bodies
     back = body.replace("10 20 30", "30 20 10")
@@ -55,7 +55,7 @@ def test_capitals_of_eulerseq_are_axes_that_stay(tmp_path: Path) -> None:
     assert np.array(a.rotation) == pytest.approx(np.array(b.rotation), abs=1e-15)
 
 
-def test_a_joint_off_the_bodys_origin_takes_the_frame_with_it(tmp_path: Path) -> None:
+def test_joint_position_moves_the_body_frame(tmp_path: Path) -> None:
     child = f'<body name="b" pos="0 0 1">{BALL}</body>'
     parts = '<joint pos="0 0 0.25"/><geom size="0.1" pos="0 0 0.5"/>'
     a, b = model(tmp_path, f'<body name="a" pos="1 0 0">{parts}{child}</body>').bodies
@@ -65,11 +65,11 @@ def test_a_joint_off_the_bodys_origin_takes_the_frame_with_it(tmp_path: Path) ->
     assert "(0, 0, 0.25)" in a.note
 
 
-def test_ref_is_the_coordinate_in_the_pose_of_the_file(tmp_path: Path) -> None:
+def test_ref_is_the_coordinate_at_the_pose_of_the_file(tmp_path: Path) -> None:
     hinge = f'<body name="a"><joint name="j" axis="0 0 1" ref="90"/>{BALL}</body>'
     slide = '<joint name="k" type="slide" axis="0 3 4" ref="5"/>'
     a, b = model(tmp_path, f'{hinge}<body name="b" pos="1 0 0">{slide}{BALL}</body>').bodies
-    # at j = 0 the body is turned by -90 degrees; at k = 0 it lies 5 m behind along the axis
+    # At j = 0 the body is rotated by -90 degrees; at k = 0 it is 5 m behind along the axis.
     assert a.rotation == ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
     assert a.motions[0].start == pytest.approx(PI / 2, rel=CLOSE)
     assert b.offset == pytest.approx((1, -3, -4), rel=CLOSE)
@@ -77,7 +77,7 @@ def test_ref_is_the_coordinate_in_the_pose_of_the_file(tmp_path: Path) -> None:
     assert b.motions[0].start == 5
 
 
-def test_several_joints_of_a_body_become_a_chain_in_their_order(tmp_path: Path) -> None:
+def test_several_joints_of_a_body_become_a_chain_in_order(tmp_path: Path) -> None:
     joints = (
         '<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>'
         '<joint name="y" axis="0 1 0" pos="0 0 1"/>'
@@ -95,7 +95,7 @@ def test_several_joints_of_a_body_become_a_chain_in_their_order(tmp_path: Path) 
     assert [m.name for m in robot.motions] == ["x", "z", "y", "k"]
 
 
-def test_a_free_joint_starts_at_the_bodys_pose(tmp_path: Path) -> None:
+def test_free_joint_starts_at_the_pose_of_the_body(tmp_path: Path) -> None:
     text = f'<body pos="1 2 3" euler="0 0 30"><freejoint name="root"/>{BALL}</body>'
     (a,) = model(tmp_path, text).bodies
     assert (a.joint, a.offset, a.rotation) == ("free", (0, 0, 0), IDENTITY)
@@ -104,7 +104,7 @@ def test_a_free_joint_starts_at_the_bodys_pose(tmp_path: Path) -> None:
     assert starts == pytest.approx([1, 2, 3, PI / 6, 0, 0], abs=1e-15)
 
 
-def test_coordinates_of_several_free_and_ball_joints_carry_their_names(tmp_path: Path) -> None:
+def test_coordinates_of_several_free_and_ball_joints_contain_joint_names(tmp_path: Path) -> None:
     free = f'<body><freejoint name="p"/>{BALL}</body><body><freejoint name="q"/>{BALL}</body>'
     ball = f'<body><joint name="b" type="ball" range="0 60"/>{BALL}</body>'
     robot = model(tmp_path, free + ball)
@@ -114,7 +114,7 @@ def test_coordinates_of_several_free_and_ball_joints_carry_their_names(tmp_path:
     assert len({m.name for m in robot.motions}) == 15
 
 
-def test_armature_of_a_free_joint_is_mass_along_and_inertia_about(tmp_path: Path) -> None:
+def test_armature_of_a_free_joint_adds_mass_and_inertia(tmp_path: Path) -> None:
     text = '<body><joint type="free" armature="0.5"/><geom size="1" mass="5"/></body>'
     (a,) = model(tmp_path, text).bodies
     assert [m.armature for m in a.motions] == [0.5] * 3 + [0] * 3
@@ -122,13 +122,13 @@ def test_armature_of_a_free_joint_is_mass_along_and_inertia_about(tmp_path: Path
     assert "0.5" in a.note
 
 
-def test_what_acts_on_balls_that_is_not_the_same_is_reported(tmp_path: Path) -> None:
+def test_approximations_for_ball_joints_are_reported(tmp_path: Path) -> None:
     ball = f'<body><joint name="b" type="ball" armature="2" damping="3"/>{BALL}</body>'
     robot = model(tmp_path, f'<body name="a"><joint name="j"/>{BALL}{ball}</body>')
     assert [(m.armature, m.damping) for m in robot.bodies[1].motions] == [(2, 3)] * 3
     assert reported(robot, "damping of whole turns", "b")
     assert reported(robot, "exact armature of ball joints", "b")
-    robot = model(tmp_path, ball)  # on the world: the armature is exact
+    robot = model(tmp_path, ball)  # attached to the world: the armature is exact
     assert not reported(robot, "armature")
     assert robot.bodies[0].inertia[0] > 2
 
@@ -144,7 +144,7 @@ DEFAULTS = """<default>
 </default>"""
 
 
-def test_classes_inherit_and_childclass_holds_for_all_below(tmp_path: Path) -> None:
+def test_classes_inherit_and_childclass_applies_to_all_descendants(tmp_path: Path) -> None:
     geom = "<geom/>"
     text = (
         f"<body><joint/>{geom}</body>"
@@ -158,11 +158,11 @@ def test_classes_inherit_and_childclass_holds_for_all_below(tmp_path: Path) -> N
     assert numbers == [(1, 2, 0), (3, 2, 0), (3, 2, 4), (5, 2, 4), (1, 2, 0)] + [(0, 0, 0)] * 6
 
 
-def test_an_element_overrides_the_first_numbers_and_any_orientation(tmp_path: Path) -> None:
+def test_element_overrides_leading_numbers_and_any_orientation(tmp_path: Path) -> None:
     defaults = '<default><geom type="box" size="0.1 0.2 0.3" mass="3" euler="90 0 0"/></default>'
     text = '<body><joint/><geom size="0.2"/></body><body><joint/><geom quat="1 0 0 0"/></body>'
     a, b = model(tmp_path, text, defaults).bodies
-    assert a.inertia[:3] == pytest.approx((0.13, 0.08, 0.13), rel=CLOSE)  # turned: x, z, y
+    assert a.inertia[:3] == pytest.approx((0.13, 0.08, 0.13), rel=CLOSE)  # rotated: x, z, y
     assert b.inertia[:3] == pytest.approx((0.13, 0.10, 0.05), rel=CLOSE)
 
 
@@ -188,14 +188,14 @@ def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
     assert reported(robot, "actuators on sites", ": t")
 
 
-def test_armature_and_damping_of_actuators_count_by_the_gear_squared(tmp_path: Path) -> None:
+def test_armature_and_damping_of_actuators_scale_with_gear_squared(tmp_path: Path) -> None:
     body = BODY.replace('name="j"', 'name="j" armature="1" damping="2"')
     motor = '<actuator><motor joint="j" gear="-3" armature="0.1" damping="0.2"/></actuator>'
     (motion,) = model(tmp_path, body, after=motor).motions
     assert (motion.armature, motion.damping) == pytest.approx((1.9, 3.8), rel=CLOSE)
 
 
-def test_a_shortcut_does_not_inherit_the_law_of_another(tmp_path: Path) -> None:
+def test_actuator_shortcut_does_not_inherit_the_law_of_another(tmp_path: Path) -> None:
     defaults = '<default><position kp="7" gear="5"/></default>'
     actuators = '<actuator><motor name="m" joint="j"/><general name="g" joint="j"/></actuator>'
     robot = model(tmp_path, BODY, defaults, actuators)
@@ -207,7 +207,7 @@ HOME = """<keyframe> <key name="other" qpos="1"/>
   <key name="home" qpos="0.1 0.2 0.3 1 0 0 1 0.5 1 0 1 0 -0.25"/> </keyframe>"""
 
 
-def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
+def test_key_frame_home_is_the_initial_state(tmp_path: Path) -> None:
     text = f"""<body name="a" pos="9 9 9"><freejoint/>{BALL}
       <body><joint name="h"/>{BALL}<body><joint name="b" type="ball"/>{BALL}
       <body><joint name="s" type="slide"/>{BALL}</body></body></body></body>"""
@@ -226,7 +226,7 @@ def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
     assert reported(model(tmp_path, text, after=moving), "home has besides positions", ": qvel")
 
 
-def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
+def test_ignored_elements_are_reported(tmp_path: Path) -> None:
     inside = """<light/><camera name="cam"/><site name="s1"/><site name="s2"/>
       <geom name="floor" type="plane" size="1 1 1"/>
       <body name="a" gravcomp="1"><joint name="j" stiffness="1 2" range="0 9"/>
@@ -265,8 +265,8 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         assert reported(robot, *words), words
 
 
-def test_springdamper_is_a_stiffness_and_a_damping_for_what_the_joint_moves(tmp_path: Path) -> None:
-    """A ball of 2 kg about its centre has 0.008 kg m^2: k = m/(t r)^2, d = 2 m/t."""
+def test_springdamper_gives_stiffness_and_damping_for_the_moving_mass(tmp_path: Path) -> None:
+    """A ball of 2 kg about its center has 0.008 kg m^2: k = m/(t r)^2, d = 2 m/t."""
     ball = '<geom size="0.1" mass="2"/>'
     own = 'springdamper="0.2 1.5" stiffness="7" damping="7" armature="0.5"'
 
@@ -277,7 +277,7 @@ def test_springdamper_is_a_stiffness_and_a_damping_for_what_the_joint_moves(tmp_
         ('<joint springdamper="0.2 1.5"/>', 0.008),
         ('<joint type="slide" springdamper="0.2 1.5"/>', 2.0),
         ('<joint type="ball" springdamper="0.2 1.5"/>', 0.008),
-        ('<joint type="free" springdamper="0.2 1.5"/>', 2 / (1 / 0.008 + 1 / 2)),  # a mean
+        ('<joint type="free" springdamper="0.2 1.5"/>', 2 / (1 / 0.008 + 1 / 2)),  # a mean value
         (f"<joint {own}/>", 0.508),
     ):
         for motion in motions(joint):
@@ -295,7 +295,7 @@ def test_springdamper_is_a_stiffness_and_a_damping_for_what_the_joint_moves(tmp_
         assert "a time constant and a damping ratio, both positive" in words
 
 
-def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: Path) -> None:
+def test_ignored_attributes_of_joints_actuators_and_couplings_are_reported(tmp_path: Path) -> None:
     inside = f"""<body name="a"><freejoint name="fly" align="true"/>{BALL}
       <body name="b"><joint name="turn" type="ball" damping="1" armature="0.1"/>{BALL}
       <body name="c"><joint name="j" springyield="2" actuatorfrcrange="-3 3"/>{BALL}
@@ -326,7 +326,7 @@ def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: 
         assert reported(robot, *words), (words, robot.left_out)
 
 
-def test_many_names_are_cut_and_counted(tmp_path: Path) -> None:
+def test_long_lists_of_names_are_shortened_and_counted(tmp_path: Path) -> None:
     sites = "".join(f'<site name="s{i}"/>' for i in range(30))
     robot = model(tmp_path, BODY + sites)
     assert reported(robot, "sites (30): s0, s1", "s11 and 18 more")
@@ -339,7 +339,7 @@ def test_gravity(tmp_path: Path) -> None:
     assert model(tmp_path, BODY, off).gravity == (0, 0, 0)
 
 
-def test_names_come_from_the_file_or_from_the_place(tmp_path: Path) -> None:
+def test_names_come_from_the_file_or_from_the_position(tmp_path: Path) -> None:
     text = f'<body><joint/>{BALL}</body><body name="body3"><joint/><joint/>{BALL}</body><body/>'
     robot = model(tmp_path, text)
     assert [b.name for b in robot.bodies] == ["body1", "body3_body3_joint", "body3", "body3_2"]
@@ -347,7 +347,7 @@ def test_names_come_from_the_file_or_from_the_place(tmp_path: Path) -> None:
     assert names == ["body1_joint", "body3_joint", "body3_joint_2"]
 
 
-def test_a_nest_of_a_thousand_bodies_is_read(tmp_path: Path) -> None:
+def test_thousand_nested_bodies_are_read(tmp_path: Path) -> None:
     deep = 1000
     text = "<body pos='1 0 0'><joint/><geom size='1'/>" * deep + "</body>" * deep
     assert len(model(tmp_path, text).bodies) == deep

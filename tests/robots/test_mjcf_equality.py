@@ -1,4 +1,4 @@
-"""Equality constraints of MJCF: rows of the scene, beside MuJoCo's own at random positions."""
+"""Equality constraints of MJCF, compared with those of MuJoCo at random positions."""
 
 import math
 from pathlib import Path
@@ -68,17 +68,17 @@ HARD = [
 
 
 def scene_of(robot):
-    """The scene as it is written, read."""
+    """Write the scene of a robot and read it."""
     return from_scene(parse(scene_text(robot)))
 
 
 def rows(system):
-    """A function of the coordinates, the rows in the order of the file."""
+    """Return a function of the coordinates: the constraint residuals in the order of the file."""
     return numeric(system, [c.formula for c in system.constraints])
 
 
 def numeric(system, expressions):
-    """A function of the coordinates."""
+    """Return a function of the coordinates that evaluates the expressions."""
     for name, e in reversed(needed_definitions(system.definitions, expressions)):
         expressions = [x.xreplace({name: e}) for x in expressions]
     return sympy.lambdify([system.q], expressions)
@@ -88,9 +88,9 @@ def equality(*entries):
     return f"{TENDONS}<equality>{''.join(entries)}</equality>"
 
 
-@pytest.mark.slow  # in the tier that installs MuJoCo
+@pytest.mark.slow  # runs in the tier that installs MuJoCo
 @pytest.mark.parametrize("entry", HARD)
-def test_rows_are_those_of_mujoco(
+def test_constraints_equal_those_of_mujoco(
     entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mujoco = pytest.importorskip("mujoco")
@@ -104,10 +104,10 @@ def test_rows_are_those_of_mujoco(
         data.qpos[:] = q
         mujoco.mj_forward(theirs, data)
         equal = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-        wanted, found = data.efc_pos[equal], np.array(values(q))
-        assert len(found) == len(wanted)
-        np.testing.assert_allclose(np.abs(found[:3]), np.abs(wanted[:3]), atol=1e-12)
-    if "weld" in entry:  # rows of rotation are others: they are zero together
+        expected, computed = data.efc_pos[equal], np.array(values(q))
+        assert len(computed) == len(expected)
+        np.testing.assert_allclose(np.abs(computed[:3]), np.abs(expected[:3]), atol=1e-12)
+    if "weld" in entry:  # Rotation constraints are formulated differently: both vanish together.
         (reaction,) = system.reactions
         q = _closed(values, numeric(system, reaction.branches), len(system.q))
         data.qpos[:] = q
@@ -116,7 +116,7 @@ def test_rows_are_those_of_mujoco(
 
 
 def _closed(values, branches, n):
-    """Where the rows of rotation are zero, by Gauss and Newton's method."""
+    """Solve the rotation constraints by the Gauss-Newton method."""
     rows_of = slice(3, 6)
     for start in np.random.default_rng(1).uniform(-1, 1, (100, n)):
         q = start
@@ -132,7 +132,7 @@ def _closed(values, branches, n):
 
 
 @pytest.mark.slow
-def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
+def test_constraints_are_satisfied_in_the_pose_of_the_file(tmp_path: Path) -> None:
     hard = [e for e in HARD if "site" not in e and "relpose" not in e and "0.1 2" not in e]
     hard = [e for e in hard if 'polycoef="0.2"' not in e and "0.01" not in e]
     system = scene_of(model(tmp_path, INSIDE, after=equality(*hard)))
@@ -149,7 +149,7 @@ def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
         ('body1="a" body2="hinged"', ((1, 2, 3), (-0.4, 0.2, 0.3))),
     ],
 )
-def test_relpose_is_met_by_the_anchor_of_the_second_body(
+def test_relpose_is_relative_to_the_anchor_of_the_second_body(
     ends: str, points: object, tmp_path: Path
 ) -> None:
     """MuJoCo: x1 + R1 relpos = x2 + R2 anchor, and R2 = R1 R(relquat)."""
@@ -163,12 +163,12 @@ def test_relpose_is_met_by_the_anchor_of_the_second_body(
     np.testing.assert_allclose(loop.rotation, np.diag([1, -1, -1]), atol=1e-15)
 
 
-def test_a_linear_coupling_of_two_joints_is_a_gear(tmp_path: Path) -> None:
+def test_linear_coupling_of_two_joints_is_a_gear(tmp_path: Path) -> None:
     text = scene_text(model(tmp_path, INSIDE, after=equality(HARD[7])))
     assert 'joint       = "gear"\ncoordinates = ["q1", "g"]\nratio       = 2\n' in text
 
 
-def test_what_is_not_held_is_told(tmp_path: Path) -> None:
+def test_ignored_constraints_are_reported(tmp_path: Path) -> None:
     robot = model(
         tmp_path, INSIDE, "<default><equality active='false'/></default>",
         equality(
@@ -185,48 +185,46 @@ def test_what_is_not_held_is_told(tmp_path: Path) -> None:
     assert reported(robot, "of other kinds", "cloth")
 
 
-STILL = '<body name="{}" pos="0 {} 0"><geom size="0.1"/></body>'
+FIXED_BODY = '<body name="{}" pos="0 {} 0"><geom size="0.1"/></body>'
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "reason"),
     [
         ('<weld body1="left" body2="right"/>', "weld_left_right"),
         ('<weld body1="left"/>', "weld_left"),
         ('<connect body1="left" body2="right" anchor="0 0 0.1"/>', "connect_left_right"),
         ('<connect body1="rocker" body2="flange" anchor="0 0 0"/>', "connect_rocker_flange"),
-        ('<connect body1="crank" anchor="0 0 0"/>', "connect_crank"),  # a point of its axis
+        ('<connect body1="crank" anchor="0 0 0"/>', "connect_crank"),  # a point on its axis
         ('<joint joint1="q1" joint2="q1"/>', "joint_q1_q1"),
         ('<weld body1="left" body2="right" relpose="0 0 1 1 0 0 0"/>',
          "weld_left_right (open by 2.24 m)"),
     ],
 )  # fmt: skip
-def test_constraints_that_no_motion_changes_are_left_out(
-    entry: str, said: str, tmp_path: Path
-) -> None:
+def test_constant_constraints_are_left_out(entry: str, reason: str, tmp_path: Path) -> None:
     flange = '<body name="flange" euler="0 0 90"><geom size="0.1"/></body></body>'
     inside = INSIDE.replace('</body>\n<body name="wheel"', f'{flange}\n<body name="wheel"')
-    inside += STILL.format("left", 1) + STILL.format("right", 3)
+    inside += FIXED_BODY.format("left", 1) + FIXED_BODY.format("right", 3)
     robot = prepare_for_scene(model(tmp_path, inside, after=equality(entry, HARD[0])))
     assert [loop.name for loop in robot.loops] == ["pin"]
     assert not robot.couplings
-    assert reported(robot, "constraints that no motion changes", said)
+    assert reported(robot, "constraints that no motion changes", reason)
     assert prepare_for_scene(robot) == robot
 
 
-def test_a_loop_between_locked_bodies_is_left_out(tmp_path: Path) -> None:
+def test_loop_between_locked_bodies_is_left_out(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[0]))
     locked = prepare_for_scene(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
     assert not locked.loops
     assert reported(locked, "constraints that no motion changes", "pin (open by")
 
 
-def test_sites_that_are_used_are_not_left_out(tmp_path: Path) -> None:
+def test_used_sites_are_read(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[2]))
     assert [line for line in robot.left_out if line.startswith("site")] == ["sites: hub"]
 
 
-def test_a_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
+def test_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[7], HARD[8]))
     q1 = 0.1
     g = math.radians(15) + 0.1 + 2 * q1
@@ -235,7 +233,7 @@ def test_a_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
         assert [m.name for m in locked.motions] == ["q2", "q3", "slip", "h", "k"]
         assert [c.name for c in locked.couplings] == ["cubic"]
         assert not [words for words in locked.left_out if words.startswith("constraints")]
-        turned, whole = (moved_as(r, {"q1": q1, "g": g}) for r in (locked, robot))
+        turned, whole = (poses_in_parents(r, {"q1": q1, "g": g}) for r in (locked, robot))
         for name, pose in whole.items():
             np.testing.assert_allclose(turned[name][1], pose[1], atol=1e-15)
     assert (
@@ -246,30 +244,32 @@ def test_a_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
         lock(robot, {"g": g - 0.2, "q1": q1})
 
 
-def moved_as(robot, values):
-    """The pose of each body in its parent."""
+def poses_in_parents(robot, values):
+    """Return the pose of each body in its parent."""
     return {
         b.name: body_pose(b, [values.get(m.name, 0.0) for m in b.motions]) for b in robot.bodies
     }
 
 
-def test_a_locked_joint_is_the_root_of_a_polynomial_next_to_the_start(tmp_path: Path) -> None:
+def test_locked_joint_is_the_root_of_a_polynomial_closest_to_the_initial_value(
+    tmp_path: Path,
+) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[8]))  # slip is a polynomial of q3
     value = 0.3 + np.polynomial.Polynomial([0.01, 0.1, 0.5, -2, 0.7])(0.2)
-    (found,) = [b for b in lock(robot, {"slip": value}).bodies if "q3" in b.note]
-    assert "joint q3 stands at 0.2 rad" in found.note
+    (body,) = [b for b in lock(robot, {"slip": value}).bodies if "q3" in b.note]
+    assert "joint q3 stands at 0.2 rad" in body.note
     with pytest.raises(EomcError, match="coupling cubic: no value of 'q3' fulfils it while slip"):
         lock(robot, {"slip": -9.0})
 
 
-def test_couplings_in_a_chain_fix_one_another(tmp_path: Path) -> None:
+def test_chained_couplings_fix_each_other(tmp_path: Path) -> None:
     chain = equality(HARD[7], '<joint joint1="h" joint2="g"/>', '<joint joint1="k" joint2="g"/>')
     assert [m.name for m in lock(model(tmp_path, INSIDE, after=chain), {"k": 0.1}).motions] == [
         "q2", "q3", "slip",
     ]  # fmt: skip
 
 
-def test_a_sum_of_several_joints_keeps_the_locked_one_as_a_constant(tmp_path: Path) -> None:
+def test_locked_joint_is_a_constant_in_a_sum_of_joints(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[12]))
     (row,) = lock(robot, {"g": 0.5}).couplings
     (whole,) = robot.couplings
@@ -283,14 +283,14 @@ def test_a_sum_of_several_joints_keeps_the_locked_one_as_a_constant(tmp_path: Pa
     scene_of(lock(robot, {"slip": 0.5}))
 
 
-def test_a_coupling_to_what_carries_the_new_root_fixes_the_other(tmp_path: Path) -> None:
+def test_coupling_to_a_joint_below_the_new_root_fixes_the_other(tmp_path: Path) -> None:
     entry = '<joint joint1="k" joint2="g" polycoef="0.1 2"/>'
     robot = cut(model(tmp_path, INSIDE, after=equality(entry)), "wheel_h")
     assert not robot.motions
     assert robot.left_out[0] == "fixed by couplings to what is locked: k at 0.1 rad"
 
 
-def test_constraints_of_what_is_cut_off_are_told(tmp_path: Path) -> None:
+def test_constraints_of_removed_bodies_are_reported(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[0], HARD[7], HARD[8]))
     without = cut(robot, root="crank")
     assert not without.loops
@@ -298,7 +298,7 @@ def test_constraints_of_what_is_cut_off_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ('<connect body1="rocker"/>', 'it needs an anchor="x y z"'),
         ('<connect body1="rocker" anchor="1 2"/>', "takes 3"),
@@ -317,8 +317,8 @@ def test_constraints_of_what_is_cut_off_are_told(tmp_path: Path) -> None:
         ('<joint joint1="g" active="maybe"/>', "is not one of false, true"),
     ],
 )  # fmt: skip
-def test_faults(entry: str, said: str, tmp_path: Path) -> None:
-    assert said in refused(tmp_path, INSIDE, after=equality(entry))
+def test_faults(entry: str, message: str, tmp_path: Path) -> None:
+    assert message in refused(tmp_path, INSIDE, after=equality(entry))
 
 
 FOUR_BAR = """<body name="base" pos="0 0 0.9116" quat="1 0 0 -1">
@@ -330,11 +330,11 @@ FOUR_BAR = """<body name="base" pos="0 0 0.9116" quat="1 0 0 -1">
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
-def test_a_linkage_that_the_file_closes_to_rounding_is_closed(size: float, tmp_path: Path) -> None:
+def test_linkage_closed_to_rounding_is_assembled(size: float, tmp_path: Path) -> None:
     """The second point of `connect` follows from the pose of the file, in doubles."""
     connect = '<connect name="pin" body1="coupler" body2="follower" anchor="0 0 0"/>'
     for seed in (0, 5, 7):
         lengths = size * (np.random.default_rng(seed).normal(size=10) / 2).round(3)
         robot = model(tmp_path, FOUR_BAR.format(*lengths), after=equality(connect)[len(TENDONS) :])
-        made = assembled(scene_of(robot))
-        assert max(abs(c.start) for c in made.coordinates) < 1e-12
+        system = assembled(scene_of(robot))
+        assert max(abs(c.start) for c in system.coordinates) < 1e-12

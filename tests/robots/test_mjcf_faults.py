@@ -1,4 +1,4 @@
-"""MJCF that is refused, and included files."""
+"""MJCF files that are refused, and included files."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ from eomc.robots.robot import JointMotion
         ("<body/>", '<include file="part.xml"/>', ['"part.xml" is not opened', "--include"]),
     ],
 )
-def test_faults_say_where_what_and_what_to_do(
+def test_messages_name_the_place_the_problem_and_the_remedy(
     tmp_path: Path, inside: str, before: str, words: list[str]
 ) -> None:
     text = refused(tmp_path, inside, before)
@@ -80,7 +80,7 @@ def test_faults_say_where_what_and_what_to_do(
         assert word in text
 
 
-def test_faults_are_reported_all_at_once_with_their_lines(tmp_path: Path) -> None:
+def test_all_faults_are_reported_with_their_lines(tmp_path: Path) -> None:
     text = refused(
         tmp_path,
         '\n<body name="a"><joint axis="0 0 0"/>\n<geom size="-1"/>\n</body>',
@@ -91,7 +91,7 @@ def test_faults_are_reported_all_at_once_with_their_lines(tmp_path: Path) -> Non
     assert 'no joint "nowhere"' in text
 
 
-def test_what_is_not_mjcf_is_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "model.xml"
     for text, words in (
         ('<robot name="r"/>', "URDF"),
@@ -115,7 +115,7 @@ def write(folder: Path, **files: str) -> Path:
     return folder / "main.xml"
 
 
-def test_included_files_stand_in_the_place_of_include(tmp_path: Path) -> None:
+def test_included_files_replace_include(tmp_path: Path) -> None:
     main = write(
         tmp_path,
         main="""<mujoco><include file="set.xml"/>
@@ -144,7 +144,7 @@ def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
             read.read(main, include=True)
 
 
-def test_what_an_include_would_have_brought_is_no_second_fault(tmp_path: Path) -> None:
+def test_refused_include_causes_no_further_faults(tmp_path: Path) -> None:
     joint = '<actuator><motor joint="of_the_part"/></actuator>'
     main = write(tmp_path, main=f'<mujoco><include file="../part.xml"/>{joint}</mujoco>')
     for include, words in ((True, "outside the folder"), (False, "is not opened")):
@@ -153,7 +153,7 @@ def test_what_an_include_would_have_brought_is_no_second_fault(tmp_path: Path) -
         assert "of_the_part" not in str(fault.value)
 
 
-def test_a_part_of_a_model_is_called_so(tmp_path: Path) -> None:
+def test_part_of_a_model_is_refused_as_such(tmp_path: Path) -> None:
     main = write(tmp_path, main="<mujocoinclude><body/></mujocoinclude>")
     words = "import the file that includes it, with --include"
     with pytest.raises(SceneError, match=words):
@@ -161,7 +161,7 @@ def test_a_part_of_a_model_is_called_so(tmp_path: Path) -> None:
     assert words in CliRunner().invoke(cli, ["import", str(main)]).output
 
 
-def test_a_file_that_is_missing_or_included_twice_is_reported(tmp_path: Path) -> None:
+def test_missing_or_repeated_include_is_reported(tmp_path: Path) -> None:
     main = write(tmp_path, main='<mujoco><include file="none.xml"/></mujoco>')
     with pytest.raises(SceneError, match=r'no file "none.xml"'):
         read.read(main, include=True)

@@ -1,4 +1,4 @@
-"""MJCF read by us and by MuJoCo itself: masses, inertias, poses, axes and the joints' numbers."""
+"""MJCF read by eomc and by MuJoCo: masses, inertias, poses, axes and joint parameters."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from eomc.robots.robot import Robot, RobotBody
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
-WANTED = "MuJoCo is what these tests compare with: pip install '.[robots]'"
-mujoco = pytest.importorskip("mujoco", reason=WANTED)
-pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
+MUJOCO_REQUIRED = "MuJoCo is what these tests compare with: pip install '.[robots]'"
+mujoco = pytest.importorskip("mujoco", reason=MUJOCO_REQUIRED)
+pytestmark = pytest.mark.slow  # runs in the tier that installs MuJoCo
 
 Array = NDArray[np.float64]
 
-# relative to the size of what is compared; both sides round a handful of times a body
+# Relative to the largest compared number; both sides round a few times per body.
 CLOSE = 1e-12
 
 
 def shipped() -> list[Path]:
-    """The MJCF files that gymnasium ships."""
-    gymnasium = pytest.importorskip("gymnasium", reason=WANTED)
+    """Return the MJCF files that gymnasium ships."""
+    gymnasium = pytest.importorskip("gymnasium", reason=MUJOCO_REQUIRED)
     folder = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
     return sorted(folder.glob("*.xml"))
 
 
-# ---- the meaning of a Robot, computed anew
+# --- a Robot, evaluated independently -----
 
 
-def turned(axis: Sequence[float], angle: float) -> Array:
-    """The rotation about a unit axis: the exponential of its cross product, by Rodrigues."""
+def rotation_about_axis(axis: Sequence[float], angle: float) -> Array:
+    """Return the rotation about a unit axis, by Rodrigues' formula."""
     x, y, z = axis
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
@@ -46,7 +46,7 @@ X, Y, Z = np.eye(3)
 
 
 def axes(body: RobotBody) -> list[Sequence[float]]:
-    """The axis of each motion, in the frame that the motions before it have moved."""
+    """Return the axis of each motion, in the frame that the preceding motions have moved."""
     return {
         "fixed": [],
         "spherical": [Z, Y, X],
@@ -55,7 +55,7 @@ def axes(body: RobotBody) -> list[Sequence[float]]:
 
 
 def poses(robot: Robot, q: Array) -> dict[str, tuple[Array, Array]]:
-    """The origin and the axes (columns) of every body in the world."""
+    """Return the origin and the axes (columns) of every body in the world."""
     out = {WORLD: (np.zeros(3), np.eye(3))}
     values = iter(q)
     for body in robot.bodies:
@@ -66,7 +66,7 @@ def poses(robot: Robot, q: Array) -> dict[str, tuple[Array, Array]]:
             if motion == "t":
                 place = place + turn @ np.asarray(axis) * value
             else:
-                turn = turn @ turned(axis, value)
+                turn = turn @ rotation_about_axis(axis, value)
         out[body.name] = place, turn
     return out
 
@@ -77,7 +77,7 @@ def tensor(inertia: Sequence[float]) -> Array:
 
 
 def quaternion(yaw: float, pitch: float, roll: float) -> Array:
-    """That of Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll)."""
     q = np.array([1.0, 0.0, 0.0, 0.0])
     for axis, angle in ((Z, yaw), (Y, pitch), (X, roll)):
         out = np.zeros(4)
@@ -87,7 +87,7 @@ def quaternion(yaw: float, pitch: float, roll: float) -> Array:
 
 
 def qpos(model: mujoco.MjModel, q: Array) -> Array:
-    """MuJoCo's coordinates for ours."""
+    """Return MuJoCo's coordinates for those of eomc."""
     out: list[float] = []
     at = 0
     for kind in model.jnt_type:
@@ -110,7 +110,9 @@ def near(a: object, b: object, size: float, what: str) -> None:
 
 
 def compare(path: Path, seed: int = 1) -> Robot:
-    """Every number that both have, and all poses at random coordinates and at the start."""
+    """Compare all numbers that both have, and all poses at random coordinates and at the initial
+    state.
+    """
     robot = read.read(path)
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
@@ -167,12 +169,12 @@ def compare(path: Path, seed: int = 1) -> Robot:
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes its warnings into MUJOCO_LOG.TXT where it runs."""
+def _working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Change the working folder, because MuJoCo writes MUJOCO_LOG.TXT there."""
     monkeypatch.chdir(tmp_path)
 
 
-def test_the_models_of_gymnasium_are_read_as_mujoco_reads_them() -> None:
+def test_gymnasium_models_are_read_as_by_mujoco() -> None:
     files = shipped()
     assert len(files) >= 10
     for file in files:
@@ -314,7 +316,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_texts_with_what_is_easily_misread(name: str, tmp_path: Path) -> None:
+def test_ambiguous_elements_are_read_as_by_mujoco(name: str, tmp_path: Path) -> None:
     file = tmp_path / "model.xml"
     file.write_text(TEXTS[name])
     compare(file)

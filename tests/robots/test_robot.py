@@ -1,4 +1,4 @@
-"""Robots as numbers: rotations and tensors, what a user asks for, and the scene that is written."""
+"""The robot model: rotations and inertia tensors, editing, and the scene that is written."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ angles = st.one_of(
 R_X = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # a quarter turn about x
 
 
-def turn(axis: str, by: float) -> np.ndarray:
-    """Written out for each axis, as textbooks print them."""
+def rotation_matrix(axis: str, by: float) -> np.ndarray:
+    """Return the rotation matrix about an axis, as textbooks print it."""
     c, s = math.cos(by), math.sin(by)
     return np.array(
         {
@@ -40,24 +40,24 @@ def turn(axis: str, by: float) -> np.ndarray:
 
 
 @given(angles, angles, angles)
-def test_rpy_is_the_product_of_textbook_rotations(roll: float, pitch: float, yaw: float) -> None:
-    expected = turn("z", yaw) @ turn("y", pitch) @ turn("x", roll)
-    # entries within 1e-12 of 0 and 1 are put there, in each factor
+def test_rpy_is_the_product_of_elementary_rotations(roll: float, pitch: float, yaw: float) -> None:
+    expected = rotation_matrix("z", yaw) @ rotation_matrix("y", pitch) @ rotation_matrix("x", roll)
+    # Entries within 1e-12 of 0 and 1 are rounded to these, in each factor.
     assert np.allclose(rotations.from_rpy(roll, pitch, yaw), expected, atol=4e-12, rtol=0)
 
 
 @given(angles, angles, angles)
-def test_turns_make_the_rotation_again_at_a_pitch_of_pi_half_too(
+def test_decomposed_rotation_is_reproduced_also_at_gimbal_lock(
     a: float, b: float, c: float
 ) -> None:
     rotation = rotations.from_rpy(a, b, c)
     turns = rotations.axis_rotations(rotation)
     again = rotations.from_euler("".join(x for x, _ in turns), [angle for _, angle in turns])
-    # turns below 1e-10 are left out
+    # rotations below 1e-10 are dropped
     assert np.allclose(again, rotation, atol=3e-10, rtol=0)
 
 
-def test_few_turns_where_few_will_do() -> None:
+def test_decomposition_uses_the_fewest_rotations() -> None:
     quarter = math.pi / 2
     assert rotations.axis_rotations(rotations.from_rpy(quarter, 0, 0)) == (("x", quarter),)
     assert rotations.axis_rotations(rotations.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
@@ -68,30 +68,32 @@ def test_few_turns_where_few_will_do() -> None:
 
 
 @given(angles, angles, angles)
-def test_quaternions_and_euler_angles_agree_with_turns(a: float, b: float, c: float) -> None:
+def test_quaternions_and_euler_angles_agree(a: float, b: float, c: float) -> None:
     w, x = math.cos(a / 2), math.sin(a / 2)
-    assert np.allclose(rotations.from_quaternion(2 * w, 2 * x, 0, 0), turn("x", a), atol=4e-12)
-    small = turn("x", a) @ turn("y", b) @ turn("z", c)
+    assert np.allclose(
+        rotations.from_quaternion(2 * w, 2 * x, 0, 0), rotation_matrix("x", a), atol=4e-12
+    )
+    small = rotation_matrix("x", a) @ rotation_matrix("y", b) @ rotation_matrix("z", c)
     assert np.allclose(rotations.from_euler("xyz", (a, b, c)), small, atol=4e-12)
-    capitals = turn("z", c) @ turn("y", b) @ turn("x", a)
+    capitals = rotation_matrix("z", c) @ rotation_matrix("y", b) @ rotation_matrix("x", a)
     assert np.allclose(rotations.from_euler("XYZ", (a, b, c)), capitals, atol=4e-12)
 
 
-def test_an_exact_quarter_turn_has_exact_zeros() -> None:
+def test_quarter_turn_has_exact_zeros() -> None:
     assert np.array_equal(rotations.from_rpy(math.pi / 2, 0, 0), R_X)
 
 
-def test_a_turned_tensor_keeps_its_energy() -> None:
+def test_rotated_tensor_gives_the_same_energy() -> None:
     inertia = (1.0, 2.0, 2.5, 0.1, -0.2, 0.3)
     rotation = rotations.from_rpy(0.3, -0.4, 1.1)
     old = np.array([[1.0, 0.1, -0.2], [0.1, 2.0, 0.3], [-0.2, 0.3, 2.5]])
     expected = np.array(rotation) @ old @ np.array(rotation).T
     xx, yy, zz, xy, xz, yz = inertias.rotated_inertia(inertia, rotation)
-    # a few roundings
+    # some rounding errors
     assert np.allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], expected, rtol=0, atol=1e-15)
 
 
-def test_tensors_that_no_body_has_are_reported_with_one_that_would_do() -> None:
+def test_invalid_tensors_are_reported_with_a_valid_one() -> None:
     assert not inertias.triangle_message((1.0, 1.0, 2.0, 0, 0, 0))
     assert not inertias.indefinite_message((0.0, 0.0, 0.0, 0, 0, 0))
     reported = inertias.triangle_message((1.0, 1.0, 2.1, 0, 0, 0))
@@ -107,27 +109,27 @@ def test_tensors_that_no_body_has_are_reported_with_one_that_would_do() -> None:
     [(0.001, 0.002, 0.006, 0.0003, -0.0002, 0.0004), (1.0, 1.0, -1.0, 0, 0, 0),
      (1e-8, 2e-8, 4e-8, 6e-8, 1e-8, 1e-8), (-1.0, -2.0, -0.5, 0.1, 0, 0)],
 )  # fmt: skip
-def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> None:
+def test_nearest_valid_tensor_is_valid_and_nearest(inertia: Inertia) -> None:
     near = inertias.nearest_valid(inertia)
     assert not inertias.indefinite_message(near) and not inertias.triangle_message(near)
 
-    def off(other: Inertia) -> float:
-        """Of all nine entries."""
+    def distance(other: Inertia) -> float:
+        """Return the Frobenius distance, over all nine entries."""
         difference = np.array(other) - inertia
         return float(difference**2 @ [1, 1, 1, 2, 2, 2])
 
     random = np.random.default_rng(2)
-    for k in range(300):  # others, drawn from wide to close by
+    for k in range(300):  # others, at distances from large to small
         points = random.normal(size=(4, 3))
         m = np.abs(random.normal(size=4)) * max(map(abs, inertia)) / 3
         x, y, z = (points - m @ points / m.sum()).T
         bodys = np.array([m @ (y * y + z * z), m @ (x * x + z * z), m @ (x * x + y * y),
                           -m @ (x * y), -m @ (x * z), -m @ (y * z)])  # fmt: skip
-        part = 10.0 ** -(k % 5)  # between two bodies' tensors lie those of bodies
+        part = 10.0 ** -(k % 5)  # the valid tensors are a convex set
         other = tuple(part * bodys + (1 - part) * np.array(near))
-        assert off(near) <= off(other) + 1e-12 * off((0, 0, 0, 0, 0, 0))
+        assert distance(near) <= distance(other) + 1e-12 * distance((0, 0, 0, 0, 0, 0))
     good = (1.0, 1.1, 1.2, 0.1, 0, 0)
-    assert inertias.nearest_valid(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
+    assert inertias.nearest_valid(good) == pytest.approx(good, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +141,8 @@ def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> N
         (0, 0, 0, 1, 1, 1),
     ],
 )
-def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inertia) -> None:
-    """The nearest tensor of a body is zero there, or unlike it."""
+def test_no_replacement_is_proposed_for_tensors_with_wrong_signs(tensor: Inertia) -> None:
+    """The nearest valid tensor is zero there, or very different."""
     base, body, *rest = arm().bodies
     robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
     assert edit.with_nearest_inertias(robot) == robot
@@ -150,7 +152,7 @@ def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inert
     assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
 
 
-def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
+def test_invalid_tensors_are_replaced_on_request() -> None:
     bad = replace(arm().bodies[2], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     worse = replace(arm().bodies[1], inertia=(0.1, -0.1, 0.3, 0.0, 0.0, 0.0))
     bodies = tuple({"boom": bad, "column": worse}.get(b.name, b) for b in arm().bodies)
@@ -168,7 +170,7 @@ def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
 
 
 def arm() -> Robot:
-    """A column that turns about z, a boom that turns about y, a slide along x, a hook fixed."""
+    """Return a column that turns about z, a boom about y, a slide along x and a fixed hook."""
     inertia = (0.1, 0.2, 0.2, 0.0, 0.0, 0.0)
     return Robot(
         "arm",
@@ -191,56 +193,64 @@ def arm() -> Robot:
     )  # fmt: skip
 
 
-def place(robot: Robot, of: str, q: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Where a body's frame is in the world."""
+def pose_in_world(
+    robot: Robot, body_name: str, q: dict[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a body's frame in the world."""
     by_name = {body.name: body for body in robot.bodies}
     at, turned = np.zeros(3), np.eye(3)
-    while of != "world":
-        body = by_name[of]
+    while body_name != "world":
+        body = by_name[body_name]
         offset, rotation = body_pose(body, [q[m.name] for m in body.motions])
         at, turned = np.array(offset) + np.array(rotation) @ at, np.array(rotation) @ turned
-        of = body.parent
+        body_name = body.parent
     return at, turned
 
 
-def test_a_body_is_where_its_joints_put_it() -> None:
-    at, turned = place(arm(), "hook", {"pan": 0.3, "lift": -0.2, "reach": 0.7})
-    rotation = turn("z", 0.3) @ turn("z", math.pi / 2) @ turn("y", -0.2)
-    expected = [0, 0, 0.4] + turn("z", 0.3) @ [0.1, 0, 0] + rotation @ [0.9, 0, 0]
+def test_pose_of_a_body_follows_from_its_joints() -> None:
+    at, turned = pose_in_world(arm(), "hook", {"pan": 0.3, "lift": -0.2, "reach": 0.7})
+    rotation = (
+        rotation_matrix("z", 0.3) @ rotation_matrix("z", math.pi / 2) @ rotation_matrix("y", -0.2)
+    )
+    expected = [0, 0, 0.4] + rotation_matrix("z", 0.3) @ [0.1, 0, 0] + rotation @ [0.9, 0, 0]
     assert np.allclose(at, expected, atol=1e-15) and np.allclose(turned, rotation, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ["pan", "lift", "reach"])
-def test_a_locked_joint_stays_where_it_was_put(name: str) -> None:
+def test_locked_joint_keeps_its_value(name: str) -> None:
     q = {"pan": 0.3, "lift": -0.2, "reach": 0.7}
     locked = edit.lock(arm(), {name: q[name]})
     assert [m.name for m in locked.motions] == [n for n in q if n != name]
-    for ours, theirs in zip(place(locked, "hook", q), place(arm(), "hook", q), strict=True):
+    for ours, theirs in zip(
+        pose_in_world(locked, "hook", q), pose_in_world(arm(), "hook", q), strict=True
+    ):
         assert np.allclose(ours, theirs, atol=1e-15)
     assert name not in [drive.coordinate for drive in locked.drives]
     assert f"joint {name} locked at {q[name]}" in scene_text.scene_text(locked)
 
 
-def test_what_can_not_be_locked() -> None:
+def test_invalid_locks_are_refused() -> None:
     with pytest.raises(EomcError, match="did you mean 'lift'"):
         edit.lock(arm(), {"lif": 0.0})
     with pytest.raises(EomcError, match="only a joint with one coordinate"):
         edit.lock(edit.with_base(arm(), free=True), {"yaw": 0.0})
 
 
-def test_a_cut_keeps_the_root_where_it_stood_at_the_start() -> None:
+def test_cut_keeps_the_initial_pose_of_the_root() -> None:
     whole = arm()
     part = edit.cut(whole, "boom")
     assert [b.name for b in part.bodies] == ["boom", "trolley", "hook", "tip frame"]
     assert part.bodies[0].joint == "fixed" and part.bodies[0].parent == "world"
-    q = {"pan": 0.5, "lift": 0.0, "reach": 0.7}  # pan at its start
-    for ours, theirs in zip(place(part, "hook", q), place(whole, "hook", q), strict=True):
+    q = {"pan": 0.5, "lift": 0.0, "reach": 0.7}  # pan at its initial value
+    for ours, theirs in zip(
+        pose_in_world(part, "hook", q), pose_in_world(whole, "hook", q), strict=True
+    ):
         assert np.allclose(ours, theirs, atol=1e-15)
     assert "cut off: base, column, lamp" in part.left_out
     assert [drive.name for drive in part.drives] == ["reach_force"]
 
 
-def test_a_chain_keeps_what_is_fixed_to_it_but_not_what_the_tip_carries() -> None:
+def test_chain_keeps_fixed_bodies_but_not_those_beyond_the_tip() -> None:
     chain = edit.cut(arm(), tip="boom")
     assert [b.name for b in chain.bodies] == ["base", "column", "boom", "lamp"]
     assert [m.name for m in chain.motions] == ["pan", "lift"]
@@ -250,7 +260,7 @@ def test_a_chain_keeps_what_is_fixed_to_it_but_not_what_the_tip_carries() -> Non
         edit.cut(arm(), "bom")
 
 
-def test_a_base_is_freed_and_fixed_again() -> None:
+def test_base_is_freed_and_fixed_again() -> None:
     free = edit.with_base(arm(), free=True)
     assert [m.name for m in free.motions][:6] == ["x", "y", "z", "yaw", "pitch", "roll"]
     assert edit.with_base(free, free=False) == arm()
@@ -261,7 +271,7 @@ def test_a_base_is_freed_and_fixed_again() -> None:
     free = edit.with_base(stood, free=True)
     assert [m.start for m in free.motions[:6]] == pytest.approx([1, 2, 3, 0.3, 0.2, 0.1])
     at_start = {m.name: m.start for m in free.motions}
-    hooks = place(free, "hook", at_start), place(stood, "hook", at_start)
+    hooks = pose_in_world(free, "hook", at_start), pose_in_world(stood, "hook", at_start)
     for ours, theirs in zip(*hooks, strict=True):
         assert np.allclose(ours, theirs, atol=1e-15)
     crowd = replace(arm(), bodies=(*arm().bodies, RobotBody("other")))
@@ -272,7 +282,7 @@ def test_a_base_is_freed_and_fixed_again() -> None:
 # --- the scene ------------------------------------------------------------------------------------
 
 
-def test_the_scene_says_what_differs_from_the_defaults_and_no_more() -> None:
+def test_scene_contains_only_what_differs_from_the_defaults() -> None:
     tree = tomllib.loads(scene_text.scene_text(arm()))
     assert tree["gravity"] == [0, 0, -9.81]
     assert tree["coordinates"]["pan"] == {"unit": "rad", "start": 0.5}
@@ -299,18 +309,18 @@ def test_springs_of_joints() -> None:
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_read_back_as_they_were(x: float) -> None:
+def test_numbers_survive_writing_and_reading(x: float) -> None:
     assert tomllib.loads(f"x = {scene_text.number(x)}")["x"] == x
 
 
 @given(angles)
-def test_angles_read_back_within_their_rounding(x: float) -> None:
+def test_angles_survive_writing_and_reading_within_rounding(x: float) -> None:
     text = scene_text.angle(x)
     value = eval(text.strip('"'), {"pi": math.pi})
     assert abs(value - x) <= (1e-10 if text.startswith('"') or text == "0" else 4e-16)
 
 
-def test_names_become_such_as_a_scene_can_bear() -> None:
+def test_names_become_valid_in_a_scene() -> None:
     body = arm().bodies[1]
     bodies = (
         RobotBody("lambda"),
@@ -332,14 +342,14 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     assert preparation.prepare_for_scene(robot) == robot
 
 
-def test_texts_of_strangers_stay_texts() -> None:
+def test_foreign_texts_are_escaped() -> None:
     wild = 'x"""\n\x7f\x00 = [[body]] \\'
     robot = replace(arm(), title=wild, left_out=(wild,))
     tree = tomllib.loads(scene_text.scene_text(robot))
     assert tree["title"] == 'x"""\\n\\x7f\\x00 = [[body]] \\' and tree["name"] == "arm"
 
 
-def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
+def test_joints_without_mass_are_refused_with_the_remedy() -> None:
     finger = RobotBody(
         "finger", "hook", "revolute", (JointMotion("f-1", "rad"),), ((1.0, 0.0, 0.0),),
         note="a mesh only",
@@ -357,7 +367,7 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
         preparation.prepare_for_scene(replace(arm(), bodies=arm().bodies[:1]))
 
 
-def test_inertias_that_no_body_has() -> None:
+def test_invalid_inertias_are_refused() -> None:
     broken = replace(arm().bodies[1], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
     assert any(

@@ -1,11 +1,11 @@
-"""Robots as MuJoCo has them: D, bias and accelerations of real robot files, at random states.
+"""D, bias and accelerations of real robot files at random states, compared with MuJoCo.
 
-MuJoCo writes a free or ball joint's velocity v as (velocity in the world, turning rate in the
-body's axes); ours are the rates of yaw, pitch and roll. With v = T(q) qd,
+MuJoCo writes the velocity v of a free or ball joint as (velocity in the world, angular velocity in
+body axes); eomc uses the rates of yaw, pitch and roll. With v = T(q) qd,
 
-    D = T^T M T,    bias = T^T (M dT/dt qd + their bias),    v' = T qdd + dT/dt qd.
+    D = T^T M T,    bias = T^T (M dT/dt qd + MuJoCo's bias),    v' = T qdd + dT/dt qd.
 
-Contacts, limits, dry friction, drag of the air and equality constraints are off on both sides;
+Contacts, limits, dry friction, air drag and equality constraints are disabled on both sides;
 masses, springs, damping, armatures and motors are as in the files.
 """
 
@@ -35,46 +35,47 @@ from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
 from eomc.scene.read import parse
 
-WANTED = "robots are compared with MuJoCo where it is there: pip install '.[robots]'"
-mujoco = pytest.importorskip("mujoco", reason=WANTED)
-pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
+MUJOCO_REQUIRED = "robots are compared with MuJoCo where it is there: pip install '.[robots]'"
+mujoco = pytest.importorskip("mujoco", reason=MUJOCO_REQUIRED)
+pytestmark = pytest.mark.slow  # runs in the tier that installs MuJoCo
 
 Array = NDArray[np.float64]
 
-# of the largest entry. Both sides round to 2e-15 for D and bias, 2e-14 for accelerations; scenes
-# write angles within 1e-10 of a quarter turn as such, which makes up to 1e-11 on the UR5
+# Relative to the largest entry. Both sides round to 2e-15 for D and bias, 2e-14 for accelerations;
+# scenes round angles within 1e-10 of a quarter turn to it, which makes up to 1e-11 on the UR5.
 CLOSE = 1e-10
 STATES = 3
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes its warnings into the working folder."""
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Change the working folder, because MuJoCo writes its warnings there."""
     monkeypatch.chdir(tmp_path)
 
 
-# --- the files ------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 @cache
 def robot_data(name: str) -> Path:
-    """A URDF of example-robot-data, which has no Python of its own to ask."""
+    """Return a URDF of example-robot-data, which has no Python module."""
     try:
-        found = [f for f in files("example-robot-data") or () if str(f).endswith(name)]
+        candidates = [f for f in files("example-robot-data") or () if str(f).endswith(name)]
     except PackageNotFoundError:
-        pytest.skip(f"example-robot-data is not there: {WANTED}")
-    return Path(str(found[0].locate()))
+        pytest.skip(f"example-robot-data is not there: {MUJOCO_REQUIRED}")
+    return Path(str(candidates[0].locate()))
 
 
 def gymnasium_model(name: str) -> Path:
-    gymnasium = pytest.importorskip("gymnasium", reason=WANTED)
+    gymnasium = pytest.importorskip("gymnasium", reason=MUJOCO_REQUIRED)
     return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / name
 
 
-def stripped(urdf_file: Path, folder: Path, coupled: bool = False) -> Path:
-    """The file without meshes and, unless `coupled`, <mimic>, which MuJoCo would tie together.
+def without_meshes(urdf_file: Path, folder: Path, coupled: bool = False) -> Path:
+    """Copy the file without meshes and, unless `coupled`, without <mimic>.
 
-    Tensors that no body can have, which both sides refuse, become balls of the same trace.
+    MuJoCo would couple mimic joints. Invalid inertia tensors, which both sides refuse, become those
+    of balls with the same trace.
     """
     tree = ElementTree.parse(urdf_file)
     root = tree.getroot()
@@ -100,14 +101,14 @@ def stripped(urdf_file: Path, folder: Path, coupled: bool = False) -> Path:
     return out
 
 
-# --- one robot, two ways --------------------------------------------------------------------------
+# --- one robot, read by both ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A robot as we read it and as MuJoCo does, coordinates in the same order."""
+    """A robot as read by eomc and by MuJoCo, with coordinates in the same order."""
 
-    robot: Robot  # in the file's names
+    robot: Robot  # with the names of the file
     model: Any
 
     def text(self) -> str:
@@ -118,7 +119,7 @@ def from_urdf(
     name: str, folder: Path, free: bool = False, locked: Mapping[str, float] | None = None,
     fuse: bool = True,
 ) -> Pair:  # fmt: skip
-    file = stripped(robot_data(name), folder)
+    file = without_meshes(robot_data(name), folder)
     robot = edit.lock(urdf.read(file), locked or {})
     if free:
         robot = edit.with_base(robot, free=True)
@@ -128,7 +129,7 @@ def from_urdf(
         assert value == 0.0
         spec.delete(spec.joint(joint))
     if free:
-        spec.compiler.fusestatic = False  # or the base would be the world
+        spec.compiler.fusestatic = False  # otherwise the base would be merged with the world
         spec.bodies[1].add_freejoint()
     return pair(robot, spec.compile())
 
@@ -138,8 +139,8 @@ def from_mjcf(name: str) -> Pair:
     return pair(read.read(file), mujoco.MjModel.from_xml_path(str(file)))
 
 
-def without_the_rest(model: Any) -> Any:
-    """MuJoCo's model without contacts, limits and drag of the air."""
+def disable_other_forces(model: Any) -> Any:
+    """Disable contacts, limits and air drag in MuJoCo's model."""
     off = mujoco.mjtDisableBit
     model.opt.disableflags |= off.mjDSBL_CONSTRAINT | off.mjDSBL_CLAMPCTRL
     model.opt.density = model.opt.viscosity = 0.0
@@ -147,8 +148,8 @@ def without_the_rest(model: Any) -> Any:
 
 
 def pair(robot: Robot, model: Any) -> Pair:
-    """Both without what we do not model, or model otherwise."""
-    without_the_rest(model)
+    """Pair both models, without what eomc does not model or models differently."""
+    disable_other_forces(model)
     bodies = tuple(
         replace(b, motions=tuple(replace(m, friction=0.0) for m in b.motions)) for b in robot.bodies
     )
@@ -163,11 +164,11 @@ def pair(robot: Robot, model: Any) -> Pair:
     return Pair(replace(robot, bodies=bodies), model)
 
 
-# --- their coordinates ----------------------------------------------------------------------------
+# --- coordinates of MuJoCo ------------------------------------------------------------------------
 
 
 def quaternion(yaw: float, pitch: float, roll: float) -> list[float]:
-    """Of Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll)."""
     (cz, sz), (cy, sy), (cx, sx) = ((math.cos(a / 2), math.sin(a / 2)) for a in (yaw, pitch, roll))
     return [
         cz * cy * cx + sz * sy * sx,
@@ -177,8 +178,8 @@ def quaternion(yaw: float, pitch: float, roll: float) -> list[float]:
     ]
 
 
-def turning(angles: Array, rates: Array) -> tuple[Array, Array]:
-    """E and dE/dt: E (yaw', pitch', roll') is the turning rate in the body's axes."""
+def angular_velocity_map(angles: Array, rates: Array) -> tuple[Array, Array]:
+    """Return E and dE/dt, where E (yaw', pitch', roll') is the angular velocity in body axes."""
     _, p, r = angles
     _, pd, rd = rates
     sp, cp, sr, cr = math.sin(p), math.cos(p), math.sin(r), math.cos(r)
@@ -193,8 +194,8 @@ def turning(angles: Array, rates: Array) -> tuple[Array, Array]:
     return E, E_dot
 
 
-def turned_by_angles(model: Any) -> list[int]:
-    """Where three angles stand among the coordinates."""
+def indices_of_euler_angles(model: Any) -> list[int]:
+    """Return the first index of each triple of angles among the coordinates."""
     kinds = mujoco.mjtJoint
     more = {int(kinds.mjJNT_FREE): 3, int(kinds.mjJNT_BALL): 0}
     joints = zip(model.jnt_type.tolist(), model.jnt_dofadr.tolist(), strict=True)
@@ -202,16 +203,16 @@ def turned_by_angles(model: Any) -> list[int]:
 
 
 def positions(model: Any, q: Array) -> Array:
-    """qpos: quaternions in place of angles."""
+    """Return qpos: quaternions in place of angles."""
     out: list[float] = list(q)
-    for at in reversed(turned_by_angles(model)):
+    for at in reversed(indices_of_euler_angles(model)):
         out[at : at + 3] = quaternion(*q[at : at + 3])
     return np.array(out)
 
 
 @dataclass(frozen=True)
 class Theirs:
-    """What MuJoCo says: D and bias in our coordinates, v', and T, dT/dt."""
+    """Results of MuJoCo: D and bias in the coordinates of eomc, v', and T, dT/dt."""
 
     D: Array
     bias: Array
@@ -223,9 +224,9 @@ class Theirs:
 def theirs(model: Any, q: Array, qd: Array, u: Array, applied: Array) -> Theirs:
     data = mujoco.MjData(model)
     T, T_dot = np.eye(model.nv), np.zeros((model.nv, model.nv))
-    for at in turned_by_angles(model):
+    for at in indices_of_euler_angles(model):
         three = slice(at, at + 3)
-        T[three, three], T_dot[three, three] = turning(q[three], qd[three])
+        T[three, three], T_dot[three, three] = angular_velocity_map(q[three], qd[three])
     data.qpos[:] = positions(model, q)
     data.qvel[:] = T @ qd
     data.ctrl[:] = u
@@ -233,7 +234,7 @@ def theirs(model: Any, q: Array, qd: Array, u: Array, applied: Array) -> Theirs:
     mujoco.mj_forward(model, data)
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, M)
-    bias = data.qfrc_bias - data.qfrc_spring  # springs have a potential: ours are in g
+    bias = data.qfrc_bias - data.qfrc_spring  # springs have a potential: in eomc they are part of g
     return Theirs(
         D=T.T @ M @ T,
         bias=T.T @ (M @ T_dot @ qd + bias),
@@ -243,32 +244,32 @@ def theirs(model: Any, q: Array, qd: Array, u: Array, applied: Array) -> Theirs:
     )
 
 
-# --- ours -----------------------------------------------------------------------------------------
+# --- results of eomc ------------------------------------------------------------------------------
 
 Ask = Callable[[str, Array, Array, Array], Array]
 
 
 def in_python(text: str) -> Ask:
-    """The program, evaluated without a compiler."""
-    made = from_scene(parse(text, "robot.toml"))
-    quick = program.build(derive(made))
+    """Return functions that evaluate the program without a compiler."""
+    system = from_scene(parse(text, "robot.toml"))
+    quick = program.build(derive(system))
 
     def ask(name: str, q: Array, qd: Array, u: Array) -> Array:
-        state = {x.name: float(v) for x, v in zip(made.q, q, strict=True)}
-        state |= {x.name: float(v) for x, v in zip(made.qd, qd, strict=True)}
-        state |= {x.name: float(v) for x, v in zip(made.u, u, strict=True)}
-        state |= {p.name: p.value for p in made.parameters} | {"t": 0.0}
+        state = {x.name: float(v) for x, v in zip(system.q, q, strict=True)}
+        state |= {x.name: float(v) for x, v in zip(system.qd, qd, strict=True)}
+        state |= {x.name: float(v) for x, v in zip(system.u, u, strict=True)}
+        state |= {p.name: p.value for p in system.parameters} | {"t": 0.0}
         if name == "D":
             return np.array(program.matrix(quick, "D", state))
-        found, regular = evaluate(quick[name], state)
+        result, regular = evaluate(quick[name], state)
         assert regular
-        return np.array(found)
+        return np.array(result)
 
     return ask
 
 
 def in_c(module: ModuleType) -> Ask:
-    """The module, compiled."""
+    """Return functions of the compiled module."""
 
     def ask(name: str, q: Array, qd: Array, u: Array) -> Array:
         if name == "D":
@@ -281,19 +282,19 @@ def in_c(module: ModuleType) -> Ask:
 
 
 def compare(pair: Pair, ask: Ask, seed: int = 3) -> None:
-    """D, bias and accelerations at random states, with random forces at the joints."""
+    """Compare D, bias and accelerations at random states, with random forces at the joints."""
     model, robot = pair.model, pair.robot
     random = np.random.default_rng(seed)
     n = model.nv
     for _ in range(STATES):
         q, qd = random.uniform(-2, 2, n), random.uniform(-2, 2, n)
-        for at in turned_by_angles(model):
-            q[at + 1] = random.uniform(-1, 1)  # well away from a pitch of pi/2
+        for at in indices_of_euler_angles(model):
+            q[at + 1] = random.uniform(-1, 1)  # away from a pitch of pi/2
         u = random.uniform(-1, 1, len(robot.drives))
         applied, control = np.zeros(n), np.zeros(model.nu)
         if model.nu:
             control[:] = u
-        else:  # a URDF has no motors: ours act on the joints
+        else:  # a URDF has no motors: the inputs of eomc act on the joints
             names = [m.name for m in robot.motions]
             for drive, value in zip(robot.drives, u, strict=True):
                 applied[names.index(drive.coordinate)] += drive.gear * value
@@ -304,12 +305,12 @@ def compare(pair: Pair, ask: Ask, seed: int = 3) -> None:
         near(right.T @ qdd + right.T_dot @ qd, right.rates, "accelerations")
 
 
-def near(found: Array, expected: Array, what: str) -> None:
-    off = float(np.max(np.abs(found - expected)) / np.max(np.abs(expected)))
+def near(computed: Array, expected: Array, what: str) -> None:
+    off = float(np.max(np.abs(computed - expected)) / np.max(np.abs(expected)))
     assert off <= CLOSE, f"{what} is off by {off:.1e} of its largest entry"
 
 
-# --- the robots -----------------------------------------------------------------------------------
+# --- robots ---------------------------------------------------------------------------------------
 
 PANDA = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
 
@@ -324,44 +325,44 @@ def test_plane_mechanisms_of_gymnasium(name: str) -> None:
     compare(both, in_python(both.text()))
 
 
-def test_an_arm_as_compiled_c(tmp_path: Path, modules: Modules) -> None:
+def test_arm_in_compiled_c(tmp_path: Path, modules: Modules) -> None:
     both = from_urdf("ur5_robot.urdf", tmp_path)
     compare(both, in_c(modules.of_text(both.text())))
 
 
 @pytest.mark.slow
-def test_the_panda_with_its_fingers_locked(tmp_path: Path) -> None:
+def test_panda_with_locked_fingers(tmp_path: Path) -> None:
     both = from_urdf("panda_description/urdf/panda.urdf", tmp_path, locked=PANDA)
     compare(both, in_python(both.text()))
 
 
 @pytest.mark.slow
-def test_a_hand(tmp_path: Path) -> None:
+def test_hand(tmp_path: Path) -> None:
     both = from_urdf("allegro_right_hand.urdf", tmp_path)
     compare(both, in_python(both.text()))
 
 
 @pytest.mark.slow
-def test_an_ant(tmp_path: Path) -> None:
+def test_ant(tmp_path: Path) -> None:
     both = from_mjcf("ant.xml")
     compare(both, in_python(both.text()))
 
 
 @pytest.mark.slow
-def test_a_quadruped_with_a_free_base_as_compiled_c(tmp_path: Path, modules: Modules) -> None:
+def test_quadruped_with_a_free_base_in_compiled_c(tmp_path: Path, modules: Modules) -> None:
     both = from_urdf("solo12.urdf", tmp_path, free=True)
     compare(both, in_c(modules.of_text(both.text())))
 
 
 @pytest.mark.slow
-def test_a_humanoid_with_a_free_base_as_compiled_c(modules: Modules) -> None:
+def test_humanoid_with_a_free_base_in_compiled_c(modules: Modules) -> None:
     both = from_mjcf("humanoid.xml")
     compare(both, in_c(modules.of_text(both.text())))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["talos_reduced.urdf", "simple_humanoid.urdf"])
-def test_a_humanoid_with_a_fixed_base(name: str, tmp_path: Path) -> None:
+def test_humanoid_with_a_fixed_base(name: str, tmp_path: Path) -> None:
     both = from_urdf(name, tmp_path)
     compare(both, in_python(both.text()))
 
@@ -369,13 +370,13 @@ def test_a_humanoid_with_a_fixed_base(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["panda_description/urdf/panda.urdf", "urdf/baxter.urdf", "urdf/pr2.urdf"]
 )
-def test_joints_that_mimic_others(name: str, tmp_path: Path) -> None:
+def test_mimic_joints(name: str, tmp_path: Path) -> None:
     """D = G^T M G and bias = G^T bias', where MuJoCo's joints, all free, move by G q + c."""
     (tmp_path / "coupled").mkdir()
-    robot = urdf.read(stripped(robot_data(name), tmp_path / "coupled", coupled=True))
-    spec = mujoco.MjSpec.from_file(str(stripped(robot_data(name), tmp_path)))
+    robot = urdf.read(without_meshes(robot_data(name), tmp_path / "coupled", coupled=True))
+    spec = mujoco.MjSpec.from_file(str(without_meshes(robot_data(name), tmp_path)))
     spec.compiler.fusestatic = True
-    model = without_the_rest(spec.compile())
+    model = disable_other_forces(spec.compile())
     index = {m.name: k for k, m in enumerate(robot.motions)}
     G, c = np.zeros((model.nv, len(index))), np.zeros(model.nv)
     for motion in (m for body in robot.bodies for m in body.motions):
@@ -393,13 +394,13 @@ def test_joints_that_mimic_others(name: str, tmp_path: Path) -> None:
         near(ask("bias", q, qd, nothing), G.T @ right.bias, "bias")
 
 
-def test_a_wrong_sign_would_be_seen() -> None:
-    both = from_mjcf("hopper.xml")
-    ask = in_python(both.text())
+def test_comparison_detects_a_wrong_sign() -> None:
+    pair_of_hopper = from_mjcf("hopper.xml")
+    ask = in_python(pair_of_hopper.text())
 
     def wrong(name: str, q: Array, qd: Array, u: Array) -> Array:
         return ask(name, q, qd, -u)
 
-    compare(both, ask)
+    compare(pair_of_hopper, ask)
     with pytest.raises(AssertionError, match="accelerations"):
-        compare(both, wrong)
+        compare(pair_of_hopper, wrong)

@@ -1,4 +1,4 @@
-"""What a robot file has and its format does not, or eomc does not read, is reported by name."""
+"""Elements and attributes outside the format, or ignored by eomc, are reported by name."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ ELEMENTS = [
 
 
 def entries(left_out: tuple[str, ...], head: str) -> list[str]:
-    """The entries of the line that begins with `head`, sorted."""
+    """Return the entries of the line that begins with `head`, sorted."""
     lines = [words.partition(": ")[2] for words in left_out if words.startswith(head)]
     return sorted(lines[0].split(", ")) if lines else []
 
 
-def test_what_mjcf_does_not_have_is_reported_wherever_it_stands(tmp_path: Path) -> None:
+def test_elements_unknown_to_mjcf_are_reported_at_any_depth(tmp_path: Path) -> None:
     left = model(tmp_path, INSIDE, BEFORE, AFTER).left_out
     assert entries(left, "attributes that MJCF") == sorted(ATTRIBUTES)
     assert entries(left, "elements that MJCF") == sorted(ELEMENTS)
@@ -67,7 +67,7 @@ URDF = """<robot name="r" axis="1"><Link name="c"/><link name="base"/><link name
   <link name="b"/><drake:joint xmlns:drake="d" name="s"/><gazebo a="1"><b/>text</gazebo></robot>"""
 
 
-def test_what_urdf_does_not_have_is_reported_wherever_it_stands(tmp_path: Path) -> None:
+def test_elements_unknown_to_urdf_are_reported_at_any_depth(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
     file.write_text(URDF, encoding="utf-8")
     left = urdf.read(file).left_out
@@ -86,13 +86,13 @@ def test_what_urdf_does_not_have_is_reported_wherever_it_stands(tmp_path: Path) 
 
 
 def test_groups_and_depths_of_an_outline() -> None:
-    found = xml.parse_format("a: x @g\n b: *\n c: y\n  d:\n b2: z", {"g": "u v"})
-    assert found.attributes == {"x", "u", "v"} and [*found.children] == ["b", "c", "b2"]
-    assert found.children["b"].skipped and [*found.children["c"].children] == ["d"]
+    schema = xml.parse_format("a: x @g\n b: *\n c: y\n  d:\n b2: z", {"g": "u v"})
+    assert schema.attributes == {"x", "u", "v"} and [*schema.children] == ["b", "c", "b2"]
+    assert schema.children["b"].skipped and [*schema.children["c"].children] == ["d"]
 
 
-# One of each element whose attributes bear on the motion. Each value below changes what MuJoCo
-# does, so that the robot, or what is said of it, must be another one.
+# One of each element whose attributes affect the motion. Each value below changes what MuJoCo
+# computes, so that the robot, or the report about it, must change.
 WHOLE = """<mujoco><compiler/><option><flag/></option><default><default class="c">
 <joint damping="9"/><geom density="9"/><general gear="9"/><equality active="false"/>
 <tendon armature="9"/></default></default>
@@ -113,8 +113,8 @@ POSE = {
     "xyaxes": "0 1 0 1 0 0", "zaxis": "0 1 1",
 }  # fmt: skip
 RANGES = {"limited": "false", "range": "-3 3", "actuatorfrcrange": "-4 4"}
-SOFT = {"class": "c", "active": "false"}  # softness is reported in any case
-# by the way to an element
+SOFT = {"class": "c", "active": "false"}  # softness is always reported
+# by the path to an element
 VALUES = {
     "compiler": {
         "angle": "radian", "eulerseq": "zyx", "inertiafromgeom": "true", "boundmass": "5",
@@ -171,8 +171,8 @@ VALUES = {
         "plastic": "1",
     },
 }  # fmt: skip
-# Attributes that bear on contacts, drawings, meshes (refused), solvers, limits (which are notes),
-# on actuators whose laws are left out as a whole, or on nothing without another attribute.
+# Attributes that affect contacts, drawings, meshes (refused), solvers, limits (which are notes),
+# actuators whose laws are left out as a whole, or nothing without another attribute.
 NO_EFFECT = {
     "compiler": """fusestatic discardvisual fitaabb assetdir meshdir texturedir strippath usethread
         savecanonical savecompiled saveinertial passthrough conflict convexhull exactmeshinertia
@@ -196,7 +196,7 @@ NO_EFFECT = {
 
 
 def read_tree(file: Path, root: Element) -> object:
-    """The robot of a tree, or the faults that it has."""
+    """Return the robot of a tree, or its faults."""
     file.write_bytes(tostring(root))
     try:
         return read.read(file)
@@ -204,13 +204,13 @@ def read_tree(file: Path, root: Element) -> object:
         return str(fault)
 
 
-@pytest.mark.parametrize("way", VALUES)
-def test_what_bears_on_the_motion_is_read_or_reported(tmp_path: Path, way: str) -> None:
+@pytest.mark.parametrize("path", VALUES)
+def test_attributes_that_affect_the_motion_are_read_or_reported(tmp_path: Path, path: str) -> None:
     file = tmp_path / "model.xml"
     plain, silent = read_tree(file, fromstring(WHOLE)), []
-    for key, value in VALUES[way].items():
+    for key, value in VALUES[path].items():
         root = fromstring(WHOLE)
-        element = root.find(way)
+        element = root.find(path)
         assert element is not None
         element.set(key, value)
         if read_tree(file, root) == plain:
@@ -218,31 +218,32 @@ def test_what_bears_on_the_motion_is_read_or_reported(tmp_path: Path, way: str) 
     assert not silent
 
 
-@pytest.mark.parametrize("way", sorted({*VALUES, *NO_EFFECT} - {"option", "option/flag"}))
-def test_every_attribute_of_what_is_read_is_accounted_for(way: str) -> None:
-    places = re.sub(r"\[.*?\]", "", way).replace(".//", "worldbody/").split("/")
+@pytest.mark.parametrize("path", sorted({*VALUES, *NO_EFFECT} - {"option", "option/flag"}))
+def test_every_attribute_of_read_elements_is_listed(path: str) -> None:
+    places = re.sub(r"\[.*?\]", "", path).replace(".//", "worldbody/").split("/")
     element = SCHEMA
     for kind in places:
         below = element.children
         element = below[kind] if kind in below else below["body"].children[kind]
     general = SCHEMA.children["actuator"].children["general"].attributes
-    known = {*VALUES[way], *NO_EFFECT.get(way, "").split(), "name", "user"}
+    known = {*VALUES[path], *NO_EFFECT.get(path, "").split(), "name", "user"}
     rest = element.attributes - known - (general if places[-1] == "position" else set())
     assert not rest
 
 
 NAMES = 28  # the column in which MuJoCo's schema begins to list attributes
-# of MuJoCo before 4, and of actuators and frames, which have all of them or are not checked there
+# Attributes of MuJoCo before 4, and of actuators and frames, which have all of them or are not
+# checked.
 OLDER = set(
     """apirate collision mpr_iterations mpr_tolerance passive sensornoise convexhull
     exactmeshinertia ls_iterations ls_tolerance""".split()
 )
 
 
-@pytest.mark.slow  # in the tier that installs MuJoCo
-def test_the_schema_is_that_of_mujoco() -> None:
+@pytest.mark.slow  # runs in the tier that installs MuJoCo
+def test_schema_equals_that_of_mujoco() -> None:
     mujoco = pytest.importorskip("mujoco", minversion="4")
-    way: list[tuple[str, xml.ElementSchema | None]] = []  # to an element, by its first attributes
+    path: list[tuple[str, xml.ElementSchema | None]] = []
     unknown, theirs = [], dict[int, set[str]]()
     elements: dict[int, tuple[str, xml.ElementSchema]] = {}
     for line in mujoco.mj_printSchema(False, False).splitlines():
@@ -250,10 +251,10 @@ def test_the_schema_is_that_of_mujoco() -> None:
         names = line.split()
         if 3 * depth < NAMES - 3 and names:
             kind, _, *names = names
-            del way[depth:]
+            del path[depth:]
             kind = "worldbody" if kind == "(world)body" else kind
-            around = way[-1][1] if way else xml.ElementSchema(children={"mujoco": SCHEMA})
-            if kind == "worldbody":  # bodies are as the world is
+            around = path[-1][1] if path else xml.ElementSchema(children={"mujoco": SCHEMA})
+            if kind == "worldbody":  # bodies have the elements of the world
                 around = xml.ElementSchema(children={kind: SCHEMA.children[kind].children["body"]})
             element = (
                 around.children.get(kind)
@@ -261,9 +262,9 @@ def test_the_schema_is_that_of_mujoco() -> None:
                 else None
             )
             if element is None and around and not (around.skipped or around.is_open):
-                unknown.append(f"{kind} in {way[-1][0]}")
-            way.append((kind, element))
-        kind, element = way[-1] if way else ("", None)
+                unknown.append(f"{kind} in {path[-1][0]}")
+            path.append((kind, element))
+        kind, element = path[-1] if path else ("", None)
         if element and not element.skipped:
             elements[id(element)] = kind, element
             theirs.setdefault(id(element), set()).update(names)

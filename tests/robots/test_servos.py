@@ -1,4 +1,4 @@
-"""Servos, fixed tendons and gravcomp of MJCF: read, written, and beside MuJoCo."""
+"""Servos, fixed tendons and gravcomp of MJCF: reading, writing, and comparison with MuJoCo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from eomc.scene.read import parse
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
 AFFINE = GENERAL.replace("/>", ' biastype="affine"/>')
 SERVO = '<position kp="2" kv="3"/>'
-# a class, an actuator of it, its gain and bias as MuJoCo 4 has them
+# a class, an actuator of it, its gain and bias in MuJoCo 4
 SHORTCUTS = [
     ("", '<position kp="4" kv="0.5"{}/>', (4, 0, 0), (0, -4, -0.5)),
     ("", '<velocity kv="4"{}/>', (4, 0, 0), (0, 0, -4)),
@@ -49,27 +49,29 @@ SHORTCUTS = [
 ]
 
 
-def written(tag: str, default: str) -> tuple[str, str]:
-    """What stands before the bodies, and after."""
+def actuator_sections(tag: str, default: str) -> tuple[str, str]:
+    """Return the sections before and after the bodies."""
     on = tag.format(' name="u" joint="j"')
     return f"<default>{default}</default>", f"<actuator>{on}</actuator>"
 
 
 @pytest.mark.parametrize(("default", "tag", "gain", "bias"), SHORTCUTS)
-def test_laws(default: str, tag: str, gain: tuple, bias: tuple, tmp_path: Path) -> None:
-    (drive,) = model(tmp_path, BODY, *written(tag, default)).drives
+def test_laws_of_actuators(
+    default: str, tag: str, gain: tuple, bias: tuple, tmp_path: Path
+) -> None:
+    (drive,) = model(tmp_path, BODY, *actuator_sections(tag, default)).drives
     assert drive.law == Law(gain, bias)
 
 
-@pytest.mark.slow  # in the tier that installs MuJoCo
-def test_laws_are_those_of_mujoco(tmp_path: Path) -> None:
+@pytest.mark.slow  # runs in the tier that installs MuJoCo
+def test_laws_of_actuators_equal_those_of_mujoco(tmp_path: Path) -> None:
     mujoco = pytest.importorskip("mujoco", minversion="4")
     for default, tag, gain, bias in SHORTCUTS:
-        model(tmp_path, BODY, *written(tag, default))
+        model(tmp_path, BODY, *actuator_sections(tag, default))
         theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
         affine = theirs.actuator_gaintype[0] == mujoco.mjtGain.mjGAIN_AFFINE
-        found = theirs.actuator_gainprm[0, :3] * (1, affine, affine)
-        np.testing.assert_allclose(found, gain, rtol=1e-14, err_msg=f"{default} {tag}")
+        gains = theirs.actuator_gainprm[0, :3] * (1, affine, affine)
+        np.testing.assert_allclose(gains, gain, rtol=1e-14, err_msg=f"{default} {tag}")
         np.testing.assert_array_equal(theirs.actuator_biasprm[0, :3], bias, f"{default} {tag}")
 
 
@@ -110,14 +112,14 @@ AFTER = """
 </actuator>
 <keyframe><key name="home" qpos="0.1 0.2 0.3 0.4" act="0.1 0.2" ctrl="1 2 3 4 5 6 7 0 9"/>
 </keyframe>"""
-ROPE = '<spatial name="rope"/>'  # which MuJoCo refuses without sites
+ROPE = '<spatial name="rope"/>'  # MuJoCo refuses it without sites
 
 
 def arm(folder: Path) -> dict:
     return tomllib.loads(scene_text(model(folder, ARM, BEFORE, AFTER)))
 
 
-def test_servos_have_set_points_gains_and_a_force(tmp_path: Path) -> None:
+def test_servos_have_set_points_gains_and_forces(tmp_path: Path) -> None:
     scene = arm(tmp_path)
     assert {name: scene["definitions"][f"{name}_force"] for name in "qrgvdi"} == {
         "q": "q_kp*(q + 0.5*sum_) + 0.5*q_kv*dot(sum_)".replace("sum_", "sum"),
@@ -137,17 +139,17 @@ def test_servos_have_set_points_gains_and_a_force(tmp_path: Path) -> None:
     assert bodies["fore"]["actuator"] == "v_force + 9*m"
 
 
-def test_the_key_frame_home_has_controls_and_activations(tmp_path: Path) -> None:
+def test_key_frame_home_sets_controls_and_activations(tmp_path: Path) -> None:
     robot = model(tmp_path, ARM, BEFORE, AFTER)
     assert [d.start for d in robot.drives] == [1, 2, 3, 4, 5, 6, 7, 0.1, 9]
-    assert reported(robot, "besides positions and controls: act")  # of the lag
+    assert reported(robot, "besides positions and controls: act")  # of the actuator "lag"
     short = model(tmp_path, ARM, BEFORE, AFTER.replace(" 7 0 9", " 7"))
     assert reported(short, "the ctrl of the key frame home", "9 numbers")
     assert [d.start for d in short.drives] == [0, 0, 0, 0, 0, 0, 0, 0.1, 0]
 
 
-def test_a_damping_ratio_is_that_of_what_moves(tmp_path: Path) -> None:
-    """A block on a sledge that slides freely: m = 1*3/(1 + 3), over the gear squared."""
+def test_damping_ratio_refers_to_the_moving_mass(tmp_path: Path) -> None:
+    """For a block on a free sledge m = 1*3/(1 + 3), divided by the gear squared."""
     inside = """<body name="sledge"><joint name="x" type="slide"/><geom size="0.1" mass="3"/>
       <body><joint name="y" type="slide"/><geom size="0.1" mass="1"/></body></body>"""
     servo = '<position joint="y" kp="12" gear="2" dampratio="0.5"/>'
@@ -156,7 +158,7 @@ def test_a_damping_ratio_is_that_of_what_moves(tmp_path: Path) -> None:
     assert drive.note == "a damping ratio of 0.5"
 
 
-def test_what_is_not_a_law_of_the_input_is_told(tmp_path: Path) -> None:
+def test_unsupported_actuators_are_reported(tmp_path: Path) -> None:
     robot = model(tmp_path, ARM, BEFORE, AFTER)
     assert reported(robot, "activations of actuators", "i (integrator), lag (filterexact)")
     assert reported(robot, "tendons (2): fixed idle, spatial rope")
@@ -176,9 +178,9 @@ def test_what_is_not_a_law_of_the_input_is_told(tmp_path: Path) -> None:
         assert reported(robot, *words), (words, robot.left_out)
 
 
-def test_tendons_and_weights_are_energies(tmp_path: Path) -> None:
+def test_tendons_and_gravity_compensation_are_energies(tmp_path: Path) -> None:
     scene = arm(tmp_path)
-    assert scene["definitions"]["a_2"] == "2*b - 1.5*s"  # the joint has the name
+    assert scene["definitions"]["a_2"] == "2*b - 1.5*s"  # a joint has that name
     assert "idle" not in scene["definitions"]
     assert scene["energy"]["kinetic"] == "0.3*dot(a_2)**2/2"
     assert scene["energy"]["dissipation"] == "2*dot(a_2)**2/2"
@@ -189,7 +191,7 @@ def test_tendons_and_weights_are_energies(tmp_path: Path) -> None:
     )
 
 
-def test_a_sum_of_many_weights_is_not_too_deep(tmp_path: Path) -> None:
+def test_sum_of_many_weights_can_be_parsed(tmp_path: Path) -> None:
     bodies = '<body name="a" gravcomp="1" pos="1 0 0"><joint/><geom size="0.1"/>'.replace(
         ' name="a"', ""
     )
@@ -199,37 +201,37 @@ def test_a_sum_of_many_weights_is_not_too_deep(tmp_path: Path) -> None:
     eomc.scene.read.parse(scene_text(robot))
 
 
-def test_names_are_kept_when_finished_again(tmp_path: Path) -> None:
+def test_repeated_preparation_changes_no_names(tmp_path: Path) -> None:
     robot = prepare_for_scene(model(tmp_path, ARM, BEFORE, AFTER))
     assert prepare_for_scene(robot) == robot
 
 
 def equations(robot: Robot, state: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """D, bias and tau of a robot, from the program that becomes C."""
-    made = from_scene(parse(scene_text(robot), "robot.toml"))
-    known = {**dict.fromkeys((x.name for x in made.u), 0.0), **state, "t": 0.0}
-    known |= {p.name: p.value for p in made.parameters}
-    functions = program.build(derive(made)).functions
+    """Return D, bias and tau of a robot, from the program that becomes C."""
+    system = from_scene(parse(scene_text(robot), "robot.toml"))
+    known = {**dict.fromkeys((x.name for x in system.u), 0.0), **state, "t": 0.0}
+    known |= {p.name: p.value for p in system.parameters}
+    functions = program.build(derive(system)).functions
     out = {name: np.array(evaluate(functions[name], known)[0]) for name in ("D", "bias", "tau")}
     return {**out, "D": out["D"].reshape(len(out["bias"]), -1)}
 
 
 @pytest.mark.parametrize(("joint", "row"), [("s", 2), ("a", 0)])
-def test_a_locked_joint_is_a_constant_in_tendons(joint: str, row: int, tmp_path: Path) -> None:
-    """The equations of the other coordinates are those of the whole robot at its value, at rest."""
+def test_locked_joint_is_a_constant_in_tendons(joint: str, row: int, tmp_path: Path) -> None:
+    """The other coordinates have the equations of the whole robot at the locked value, at rest."""
     robot = model(tmp_path, ARM, BEFORE, AFTER)
     locked = lock(robot, {joint: 0.15})
     assert [t.name for t in locked.tendons] == [t.name for t in robot.tendons]
     state = {"a": 0.3, "b": -0.7, "s": 0.4, "c": 0.5, joint: 0.15}
     state |= {f"{q}_dot": v for q, v in zip("absc", (0.8, 1.2, 0.6, -0.9), strict=True)}
     state |= {f"{joint}_dot": 0.0, "p": 0.5, "q": 1.0, "g": 0.3, "m": 2.0}
-    whole, found = equations(robot, state), equations(locked, state)
+    whole, reduced = equations(robot, state), equations(locked, state)
     whole["D"] = np.delete(whole["D"], row, axis=1)
     for name, value in whole.items():
-        np.testing.assert_allclose(found[name], np.delete(value, row, axis=0), rtol=1e-12)
+        np.testing.assert_allclose(reduced[name], np.delete(value, row, axis=0), rtol=1e-12)
 
 
-def test_a_tendon_of_locked_joints_only_is_left_out(tmp_path: Path) -> None:
+def test_tendon_of_locked_joints_is_left_out(tmp_path: Path) -> None:
     locked = lock(model(tmp_path, ARM, BEFORE, AFTER), {"s": 0.1, "b": 0.2})
     assert "tendons of what is cut off or locked: a_2" in locked.left_out
     assert [(t.name, t.terms, t.offset) for t in locked.tendons] == [
@@ -239,31 +241,31 @@ def test_a_tendon_of_locked_joints_only_is_left_out(tmp_path: Path) -> None:
     assert [d.name for d in locked.drives] == ["p", "q", "r", "d", "m", "i"]
 
 
-def test_joints_that_carry_the_new_root_stay_constants_in_tendons(tmp_path: Path) -> None:
+def test_joints_below_the_new_root_are_constants_in_tendons(tmp_path: Path) -> None:
     after = AFTER.replace('joint="s" coef="3"', 'joint="c" coef="3"')
     robot = cut(model(tmp_path, ARM, BEFORE, after), "fore")
     ((name, terms, offset),) = [(t.name, t.terms, t.offset) for t in robot.tendons]
-    assert (name, terms, offset) == ("pulled", ((3.0, "c"),), 0.1)  # a starts at 0.1
+    assert (name, terms, offset) == ("pulled", ((3.0, "c"),), 0.1)  # the initial value of a is 0.1
 
 
-def test_stops_take_what_servos_and_tendons_give(tmp_path: Path) -> None:
+def test_effort_of_stops_includes_servos_and_tendons(tmp_path: Path) -> None:
     inside = """<body><joint name="j" range="-1 1"/><geom size="0.1"/>
       <body><joint name="k" range="-1 1"/><geom size="0.1" pos="1 0 0"/></body></body>"""
     after = """<tendon><fixed name="t"><joint joint="j" coef="-0.5"/><joint joint="k" coef="3"/>
       </fixed></tendon><actuator><position joint="j" gear="2" kp="9" forcerange="-7 5"/>
       <motor tendon="t" gear="10" ctrlrange="-1 1"/></actuator>"""
-    found = joint_stops(model(tmp_path, inside, after=after))
-    assert [stop.effort for stop in found] == [2 * 7 + 0.5 * 10, 3 * 10]
+    stops = joint_stops(model(tmp_path, inside, after=after))
+    assert [stop.effort for stop in stops] == [2 * 7 + 0.5 * 10, 3 * 10]
 
 
-def test_without_drives_no_tendon_stands_idle(tmp_path: Path) -> None:
+def test_without_drives_no_tendon_is_reported_as_idle(tmp_path: Path) -> None:
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>"
     _, scene = mjcf_text.imported(tmp_path, text, "--no-drives")
     assert list(tomllib.loads(scene)["definitions"]) == ["sum", "a_2"]
 
 
 @pytest.mark.parametrize(
-    ("after", "said"),
+    ("after", "message"),
     [
         ('<actuator><position joint="j" kp="x"/></actuator>', 'kp="x"'),
         ('<actuator><motor tendon="t"/></actuator>', 'there is no tendon "t"'),
@@ -272,17 +274,17 @@ def test_without_drives_no_tendon_stands_idle(tmp_path: Path) -> None:
         ('<tendon><fixed name="t" damping="-1"><joint joint="j"/></fixed></tendon>', "negative"),
     ],
 )
-def test_faults(after: str, said: str, tmp_path: Path) -> None:
+def test_faults(after: str, message: str, tmp_path: Path) -> None:
     fault = refused(tmp_path, BODY, after=after)
-    assert said in fault and fault.count("error") == 1
+    assert message in fault and fault.count("error") == 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [(), ("--limits",)])
-def test_arms_move_as_mujoco_moves_them(
+def test_motion_of_arms_agrees_with_mujoco(
     words: tuple[str, ...], tmp_path: Path, quickly_compiled: None
 ) -> None:
-    """Accelerations at random states, and a run from the key frame with its controls."""
+    """Compare accelerations at random states, and a run from the key frame with its controls."""
     mujoco = pytest.importorskip("mujoco", minversion="4")
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>".replace(ROPE, "")
     mjcf_text.imported(tmp_path, text, *words)
@@ -305,11 +307,11 @@ def test_arms_move_as_mujoco_moves_them(
         data.qpos[:], data.qvel[:] = q, qd
         put(u)
         mujoco.mj_forward(theirs, data)
-        found = m.acceleration(q, qd, u=u)
-        np.testing.assert_allclose(found, data.qacc, atol=1e-12 * np.abs(data.qacc).max())
+        computed = m.acceleration(q, qd, u=u)
+        np.testing.assert_allclose(computed, data.qacc, atol=1e-12 * np.abs(data.qacc).max())
     mujoco.mj_resetDataKeyframe(theirs, data, 0)
-    u = np.array([1, 2, 3, 4, 5, 6, 7, 0.1, 9])  # the scene's own signals
-    data.ctrl[:] = np.where(np.arange(9) == 7, 0, u)  # what integrates to 0.1 stays
+    u = np.array([1, 2, 3, 4, 5, 6, 7, 0.1, 9])  # the signals of the scene
+    data.ctrl[:] = np.where(np.arange(9) == 7, 0, u)  # the activation 0.1 of the integrator stays
     data.act[:] = u[7:]
     for _ in range(300):
         mujoco.mj_step(theirs, data)

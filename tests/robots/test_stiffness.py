@@ -1,4 +1,4 @@
-"""Imported forces that are too stiff for a scene's default steps."""
+"""Imported forces that are too stiff for the default step size of a scene."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def reported(robot: Robot) -> str:
     return "\n".join(words for words in prepare_for_scene(robot).left_out if "friction" in words)
 
 
-def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> None:
+def test_stiff_friction_selects_adaptive_steps_and_is_named(tmp_path: Path) -> None:
     robot = wrist(tmp_path, 0.02)
     scene = tomllib.loads(scene_text(robot))
     assert scene["run"] == {"method": "auto"}
@@ -56,15 +56,13 @@ def test_stiff_friction_asks_for_adaptive_steps_and_is_named(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("friction", [0.0, 1e-5])
-def test_friction_that_steps_of_fixed_size_resolve_changes_nothing(
-    friction: float, tmp_path: Path
-) -> None:
+def test_friction_resolved_by_fixed_steps_changes_nothing(friction: float, tmp_path: Path) -> None:
     robot = wrist(tmp_path, friction)
     assert "run" not in tomllib.loads(scene_text(robot))
     assert not reported(robot)
 
 
-def test_friction_beyond_adaptive_steps_is_smoothed_more_widely(tmp_path: Path) -> None:
+def test_friction_too_stiff_for_adaptive_steps_is_smoothed_more(tmp_path: Path) -> None:
     robot = wrist(tmp_path, 50.0)
     upper, hand = tomllib.loads(scene_text(robot))["body"][1:]
     assert "friction_width" not in upper
@@ -75,7 +73,7 @@ def test_friction_beyond_adaptive_steps_is_smoothed_more_widely(tmp_path: Path) 
 @pytest.mark.parametrize("more", ["", '<mimic joint="shoulder" multiplier="3" offset="0.2"/>'])
 @pytest.mark.parametrize("kind", ["continuous", "prismatic"])
 @pytest.mark.parametrize("free", [False, True])
-def test_the_mass_matrix_is_that_of_the_scene(
+def test_mass_matrix_equals_that_of_the_scene(
     kind: str, more: str, free: bool, tmp_path: Path
 ) -> None:
     robot = wrist(tmp_path, 0.0, kind, more)
@@ -87,7 +85,7 @@ def test_the_mass_matrix_is_that_of_the_scene(
         for b in robot.bodies
     )
     robot = replace(robot, bodies=bodies)
-    if more:  # its joint stands where it mimics
+    if more:  # its joint stands at the value of its mimic
         *rest, hand = robot.bodies
         by_name = {m.name: m.start for m in robot.motions}
         (m,) = hand.motions
@@ -97,12 +95,12 @@ def test_the_mass_matrix_is_that_of_the_scene(
         )
         robot = replace(robot, bodies=(*rest, hand))
     rows = [m.name for m in robot.motions]
-    found = stiffness.mass_matrix(robot, rows)
+    computed = stiffness.mass_matrix(robot, rows)
     system = from_scene(parse(scene_text(robot), "wrist.toml"))
     state = {x.name: c.start for x, c in zip(system.q, system.coordinates, strict=True)}
     values = {**state, **dict.fromkeys((x.name for x in system.qd), 0.0), "t": 0.0}
     expected = program.matrix(program.build(derive(system)), "D", values)
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(computed, expected, rtol=1e-12, atol=1e-14)
 
 
 LIGHT = """<body name="arm">
@@ -111,7 +109,7 @@ LIGHT = """<body name="arm">
 <geom size="0.01" pos="0.01 0 0"/></body>"""
 
 
-def test_stiff_servos_and_dampers_ask_for_adaptive_steps(tmp_path: Path) -> None:
+def test_stiff_servos_and_dampers_select_adaptive_steps(tmp_path: Path) -> None:
     after = '<actuator><position name="lift" joint="light" kp="100" kv="0.5"/></actuator>'
     robot = prepare_for_scene(model(tmp_path, LIGHT.format(damping=0), after=after))
     assert robot.method == "auto"
@@ -121,7 +119,7 @@ def test_stiff_servos_and_dampers_ask_for_adaptive_steps(tmp_path: Path) -> None
     assert robot.left_out[-1].startswith("stiff: damping of light: ")
 
 
-def test_a_light_body_coupled_to_a_heavy_one_is_not_stiff(tmp_path: Path) -> None:
+def test_light_body_coupled_to_a_heavy_one_is_not_stiff(tmp_path: Path) -> None:
     after = '<equality><joint joint1="light" joint2="heavy" polycoef="0 2"/></equality>'
     assert not prepare_for_scene(model(tmp_path, LIGHT.format(damping=0.1), after=after)).method
     after = '<equality><weld body1="arm" body2="finger"/></equality>'
@@ -129,7 +127,7 @@ def test_a_light_body_coupled_to_a_heavy_one_is_not_stiff(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_run_of_an_imported_robot_with_stiff_friction_is_accurate(
+def test_run_of_an_imported_robot_with_stiff_friction_is_accurate(
     tmp_path: Path, modules: Modules
 ) -> None:
     run = modules.of_text(scene_text(wrist(tmp_path, 1.0))).simulate()

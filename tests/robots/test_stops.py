@@ -1,4 +1,4 @@
-"""Limits of joints in robot files as stops: their force, and what they give back."""
+"""Joint limits of robot files as stops: their force and their restitution."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mjcf_text import imported
 
 import eomc
 
-# a slide that reaches from -0.4 to 0.5 m, driven with 80 N at most, and a hinge without limits
+# a slide with range -0.4 to 0.5 m and an effort of 80 N, and a hinge without limits
 URDF = """<robot name="pusher"><link name="rail"/>
 <link name="cart"><inertial><mass value="2"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -28,22 +28,25 @@ MJCF = """<mujoco model="swing"><compiler angle="radian"/><option gravity="0 0 -
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def test_a_joint_rests_in_its_stop_by_its_depth_where_it_is_driven_whole(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, URDF, "--stops")
-    assert "at limits of positions [forces] pushes back" in said and "limits of 1 joint" not in said
+def test_full_effort_pushes_a_joint_into_its_stop_by_the_stop_depth(tmp_path: Path) -> None:
+    output, scene = imported(tmp_path, URDF, "--stops")
+    assert (
+        "at limits of positions [forces] pushes back" in output
+        and "limits of 1 joint" not in output
+    )
     assert "turn " not in scene.split("\n[forces]\n")[1].split("[[body]]")[0]
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
     depth = m.defaults["stop_depth_slide"]
     pulled = m.acceleration([0.5 + depth, 0.0], [-5.0, 0.0], u={"slide_force": 0, "turn_torque": 0})
-    np.testing.assert_array_equal(pulled, 0)  # out of its stop, faster than that pushes
+    np.testing.assert_array_equal(pulled, 0)  # it leaves the stop faster than the stop pushes
     for at, force in ((0.5 + depth, 80.0), (-0.4 - depth, -80.0), (0.2, 0.0)):
         a = m.acceleration([at, 0.0], [0.0, 0.0], u={"slide_force": force, "turn_torque": 0})
         np.testing.assert_allclose(a, 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("side", tiers([1, -1], 1))
-def test_a_stop_gives_back_less_the_harder_it_is_hit(side: int, tmp_path: Path) -> None:
-    """Hunt and Crossley: 1 - 2/3 d v of the speed v, to the first order, whatever mass and k."""
+def test_restitution_of_a_stop_decreases_with_speed(side: int, tmp_path: Path) -> None:
+    """Hunt and Crossley: 1 - 2/3 d v for the speed v, to first order, for any mass and k."""
     imported(tmp_path, URDF, "--stops")
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
     for v, d in ((0.1, 0.1), (0.1, 0.3), (0.02, 1.0)):
@@ -55,11 +58,11 @@ def test_a_stop_gives_back_less_the_harder_it_is_hit(side: int, tmp_path: Path) 
         assert back == pytest.approx(1 - 2 / 3 * d * v, abs=(d * v) ** 2)
 
 
-def test_without_an_effort_the_weight_stands_for_it(tmp_path: Path) -> None:
-    """Of 3 kg at 10 m/s^2, stretched out by 1 m: a bob at v goes in by v sqrt(I/k)."""
+def test_without_an_effort_the_weight_is_used(tmp_path: Path) -> None:
+    """3 kg at 10 m/s^2 on a lever of 1 m: at speed v a bob enters by v sqrt(I/k)."""
     motor = '<actuator><motor joint="q" gear="50"/></actuator></mujoco>'  # without limits
-    said, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
-    assert "effort is not known" in said and "from weights: q (30 N m)" in said
+    output, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
+    assert "effort is not known" in output and "from weights: q (30 N m)" in output
     assert "from weights: q (30 N m)" in scene.replace("\n#", "")
     assert 'q = "30/stop_depth_turn*(max(0, -0.5 - q)' in scene and "max(0, q - 0.7)" in scene
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
@@ -82,26 +85,26 @@ def test_without_an_effort_the_weight_stands_for_it(tmp_path: Path) -> None:
     ids=["one", "two", "joint"],
 )  # fmt: skip
 @pytest.mark.parametrize("more", [[], ["--limits"]], ids=["notes", "acting"])
-def test_what_motors_give_is_the_effort(
+def test_effort_is_the_force_of_the_motors(
     actuators: str, of_joint: str, effort: float, more: list[str], tmp_path: Path
 ) -> None:
     text = MJCF.replace("<joint ", f"<joint {of_joint} ")
     text = text.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
-    said, scene = imported(tmp_path, text, "--stops", *more)
-    assert "effort is not known" not in said
+    output, scene = imported(tmp_path, text, "--stops", *more)
+    assert "effort is not known" not in output
     assert f"{effort}/stop_depth_turn*(max(0, -0.5 - q)" in scene
 
 
-def test_of_a_servo_the_range_of_its_force_is_the_effort(tmp_path: Path) -> None:
+def test_effort_of_a_servo_is_its_force_range(tmp_path: Path) -> None:
     servo = '<position joint="q" kp="40" ctrlrange="-1 1" ctrllimited="true"/>'
     text = MJCF.replace("</mujoco>", f"<actuator>{servo}</actuator></mujoco>")
-    for more, told in (("", True), (' forcerange="-7 7" forcelimited="true"', False)):
-        said, scene = imported(tmp_path, text.replace("/></act", f"{more}/></act"), "--stops")
-        assert ("from weights: q (30 N m)" in said) == told
-        assert f"{30 if told else 7}/stop_depth_turn*(max" in scene
+    for more, weight_is_used in (("", True), (' forcerange="-7 7" forcelimited="true"', False)):
+        output, scene = imported(tmp_path, text.replace("/></act", f"{more}/></act"), "--stops")
+        assert ("from weights: q (30 N m)" in output) == weight_is_used
+        assert f"{30 if weight_is_used else 7}/stop_depth_turn*(max" in scene
         (tmp_path / "robot.toml").unlink()
 
 
 def test_stops_need_limits(tmp_path: Path) -> None:
-    said, scene = imported(tmp_path, MJCF.replace('limited="true"', 'limited="false"'), "--stops")
-    assert "no joint of this robot has limits" in said and not scene
+    output, scene = imported(tmp_path, MJCF.replace('limited="true"', 'limited="false"'), "--stops")
+    assert "no joint of this robot has limits" in output and not scene

@@ -74,7 +74,7 @@ def read(tmp_path: Path) -> Reader:
     return reads
 
 
-def test_an_arm_is_read(read: Reader) -> None:
+def test_arm_is_read(read: Reader) -> None:
     robot = read(ARM)
     assert robot.name == "crane" and robot.gravity == (0, 0, -9.81)
     base, arm, slide, tool = robot.bodies
@@ -82,7 +82,7 @@ def test_an_arm_is_read(read: Reader) -> None:
     assert arm.joint == "revolute" and arm.axes == ((0, 0.6, 0.8),) and arm.offset == (0, 0, 0.5)
     assert arm.rotation == rotations.from_rpy(0.1, 0.2, 0.3)
     assert (arm.mass, arm.center) == (2, (0.1, 0.2, 0.3))
-    # turned by a quarter about z: x' = y, y' = -x
+    # Rotated by a quarter turn about z: x' = y, y' = -x.
     assert np.allclose(arm.inertia, (0.2, 0.1, 0.25, -0.01, -0.03, 0.02), rtol=0, atol=1e-16)
     (shoulder,) = arm.motions
     assert (shoulder.name, shoulder.unit, shoulder.start) == ("shoulder", "rad", 0.2)
@@ -91,7 +91,7 @@ def test_an_arm_is_read(read: Reader) -> None:
         0.3,
         "0.2 to 1.5; at most 2 rad/s",
     )
-    assert slide.joint == "prismatic" and slide.axes == ((1, 0, 0),)  # URDF's default
+    assert slide.joint == "prismatic" and slide.axes == ((1, 0, 0),)  # default of URDF
     assert [(d.name, d.coordinate) for d in robot.drives] == [
         ("shoulder_torque", "shoulder"),
         ("extend_force", "extend"),
@@ -99,7 +99,7 @@ def test_an_arm_is_read(read: Reader) -> None:
     assert "at most 40 N m" in robot.drives[0].note
 
 
-def test_what_is_not_modelled_is_reported(read: Reader) -> None:
+def test_ignored_elements_are_reported(read: Reader) -> None:
     reported = "\n".join(preparation.prepare_for_scene(read(ARM)).left_out)
     for words in (
         "1 mesh (not opened)", "1 box",
@@ -117,8 +117,8 @@ def test_frames_without_mass_are_points(read: Reader) -> None:
     assert frames[tool.name].link == frames[tool.parent].link
 
 
-def test_attributes_that_are_not_read_are_reported(read: Reader) -> None:
-    """A stiffness in <dynamics>, a misspelt axis: without them it is another robot."""
+def test_ignored_attributes_are_reported(read: Reader) -> None:
+    """A stiffness in <dynamics>, a misspelt axis: without them the robot would be different."""
     text = ARM.replace('damping="0.4"', 'damping="0.4" K="30"').replace("<axis xyz", "<axis xzy")
     reported = read(text).left_out
     assert any('K of dynamics in joint "shoulder"' in words for words in reported)
@@ -128,7 +128,7 @@ def test_attributes_that_are_not_read_are_reported(read: Reader) -> None:
     assert "<dynamics> of floating joints: shoulder" in read(floats).left_out
 
 
-def test_no_file_that_it_names_is_opened(read: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_referenced_files_are_not_opened(read: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     plain = Path.open
     monkeypatch.setattr(
@@ -148,7 +148,7 @@ def test_continuous_and_floating_joints(read: Reader) -> None:
 
 
 @pytest.mark.parametrize("axis", ["0 0 1", "1 0 0", "1 2 -2", "0 0 -1"])
-def test_a_planar_joint_moves_across_its_axis(read: Reader, axis: str) -> None:
+def test_planar_joint_moves_perpendicular_to_its_axis(read: Reader, axis: str) -> None:
     text = ARM.replace('"revolute"', '"planar"').replace('"0 3 4"', f'"{axis}"')
     robot = read(text)
     normal = np.array([float(word) for word in axis.split()])
@@ -156,7 +156,7 @@ def test_a_planar_joint_moves_across_its_axis(read: Reader, axis: str) -> None:
     by_name = {body.name: body for body in robot.bodies}
 
     def place(q: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Of the arm's frame in the joint's frame as the file has it."""
+        """Return the pose of the arm's frame in the frame of the joint in the file."""
         at, turned, name = np.zeros(3), np.eye(3), "upper-arm"
         while name != "base":
             body = by_name[name]
@@ -173,7 +173,7 @@ def test_a_planar_joint_moves_across_its_axis(read: Reader, axis: str) -> None:
     assert np.allclose(turned, rotations.from_axis_angle(tuple(normal), 0.7), atol=1e-11)  # type: ignore[arg-type]
 
 
-def test_a_root_called_world_is_the_world(read: Reader) -> None:
+def test_root_named_world_is_the_world(read: Reader) -> None:
     text = ARM.replace(f'<link name="base">{INERTIAL}</link>', '<link name="world"/>')
     robot = read(text.replace('"base"', '"world"'))
     assert robot.bodies[0].name == "upper-arm" and robot.bodies[0].parent == "world"
@@ -224,14 +224,14 @@ def test_faults_name_the_link_or_joint_and_the_remedy(
 ) -> None:
     assert old in ARM
     text = ARM.replace(old, new, 1)
-    if "tool" in new:  # a loop beside a root
+    if "tool" in new:  # a loop in addition to a root
         text = text.replace('<parent link="tool"/>', '<parent link="slide"/>')
     with pytest.raises(EomcError) as fault:
         read(text)
     assert reported in str(fault.value)
 
 
-def test_all_faults_are_reported_at_once_with_their_lines(read: Reader) -> None:
+def test_all_faults_are_reported_with_their_lines(read: Reader) -> None:
     text = ARM.replace('"0 3 4"', '"0 0 0"').replace('value="2"', 'value="-2"')
     with pytest.raises(EomcError) as fault:
         read(text)
@@ -262,20 +262,20 @@ OUTSIDE = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a
         ("<robot><xacro:macro/></robot>", "run xacro first"),
     ],
 )
-def test_what_is_not_a_urdf(read: Reader, text: str, reported: str) -> None:
+def test_other_files_are_refused(read: Reader, text: str, reported: str) -> None:
     with pytest.raises(EomcError) as fault:
         read(text)
     assert reported in str(fault.value)
 
 
-def test_files_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_files_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "crane.urdf").write_text(ARM, encoding="utf-8")
     with pytest.raises(EomcError, match="did you mean 'crane"):
         urdf.read(tmp_path / "crain.urdf")
     with pytest.raises(EomcError, match="can't be read \\(it is a folder"):
         urdf.read(tmp_path)
     os.mkfifo(tmp_path / "pipe.urdf")
-    with pytest.raises(EomcError, match="can't be read \\(it is a pipe"):  # and is not waited for
+    with pytest.raises(EomcError, match="can't be read \\(it is a pipe"):  # without waiting for it
         urdf.read(tmp_path / "pipe.urdf")
     (tmp_path / "gone.urdf").symlink_to(tmp_path / "nothing")
     with pytest.raises(EomcError, match="no such file; did you mean 'crane"):
@@ -285,24 +285,24 @@ def test_files_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         urdf.read(tmp_path / "crane.urdf")
 
 
-def test_a_free_root_without_inertia_is_told(read: Reader) -> None:
-    """Of one joint; several, whose axes are not alike, leave D regular."""
+def test_free_root_without_inertia_is_reported(read: Reader) -> None:
+    """Only for a root with one joint: several joints with different axes make D regular."""
     robot = edit.with_base(read(ARM), free=True)
     root = robot.bodies[0]
     light = replace(root, mass=0.0, inertia=(0.0,) * 6)
     robot_of_light = replace(robot, bodies=(light, *robot.bodies[1:]))
-    told = preparation.prepare_for_scene(robot_of_light).left_out[-1]
-    assert told.startswith(f"body {root.name}: it is free and has neither mass nor inertia")
-    assert "--base fixed" in told
+    line = preparation.prepare_for_scene(robot_of_light).left_out[-1]
+    assert line.startswith(f"body {root.name}: it is free and has neither mass nor inertia")
+    assert "--base fixed" in line
     heavy = replace(root, mass=1.0)
     for bodies in ((heavy, *robot.bodies[1:]), read(ARM).bodies):
-        said = preparation.prepare_for_scene(replace(robot, bodies=bodies)).left_out
-        assert not any("free" in words for words in said)
+        lines = preparation.prepare_for_scene(replace(robot, bodies=bodies)).left_out
+        assert not any("free" in words for words in lines)
     with pytest.raises(EomcError, match=r"body\.base: D is not .* 'base' has no inertia"):
         eomc.sources(from_scene(parse(scene_text.scene_text(robot_of_light), "crane.toml")))
 
 
-def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> None:
+def test_mesh_is_refused_only_where_a_joint_needs_inertia(read: Reader) -> None:
     text = ARM.replace(
         f'<link name="slide">{INERTIAL}</link>',
         '<link name="slide"><visual><geometry><mesh filename="s.stl"/></geometry></visual></link>',
@@ -318,22 +318,22 @@ def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> Non
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "crane.urdf").write_text(ARM, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_import_writes_a_scene_that_reads_without_a_warning(here: Path) -> None:
-    done = CliRunner().invoke(main, ["import", "crane.urdf"])
-    assert done.exit_code == 0, done.output
-    assert "wrote crane.toml: bodies 3, points 1, coordinates 2, inputs 2" in done.output
-    assert "eomc dof crane.toml" in done.output
-    found = scene.read("crane.toml")
-    assert not found.warnings
-    assert [c.name for c in found.coordinates] == ["shoulder", "extend"]
-    assert found.start()[0] == [0.2, 0.0]
-    assembly = found.assembly
+def test_imported_scene_is_read_without_warnings(folder: Path) -> None:
+    result = CliRunner().invoke(main, ["import", "crane.urdf"])
+    assert result.exit_code == 0, result.output
+    assert "wrote crane.toml: bodies 3, points 1, coordinates 2, inputs 2" in result.output
+    assert "eomc dof crane.toml" in result.output
+    imported_scene = scene.read("crane.toml")
+    assert not imported_scene.warnings
+    assert [c.name for c in imported_scene.coordinates] == ["shoulder", "extend"]
+    assert imported_scene.start()[0] == [0.2, 0.0]
+    assembly = imported_scene.assembly
     assert assembly and not assembly.plane
     arm = assembly.bodies[1]
     assert arm.name == "upper_arm" and arm.joint == "revolute" and arm.axes == ((0, 0.6, 0.8),)
@@ -341,43 +341,45 @@ def test_import_writes_a_scene_that_reads_without_a_warning(here: Path) -> None:
     assert again.exit_code == 2 and "stays as it is" in again.output
 
 
-def test_import_mends_inertias_where_it_is_asked_to(here: Path) -> None:
+def test_import_replaces_invalid_inertias_on_request(folder: Path) -> None:
     text = ARM.replace('izz="0.25"', 'izz="25"')
     assert text != ARM
-    (here / "crane.urdf").write_text(text, encoding="utf-8")
-    done = CliRunner().invoke(main, ["import", "crane.urdf", "--out", "bad.toml"])
-    assert "as --mend-inertias writes" in done.output
+    (folder / "crane.urdf").write_text(text, encoding="utf-8")
+    result = CliRunner().invoke(main, ["import", "crane.urdf", "--out", "bad.toml"])
+    assert "as --mend-inertias writes" in result.output
     with pytest.raises(EomcError, match="larger than the two others"):
         scene.read("bad.toml")
     words = ["import", "crane.urdf", "--out", "good.toml", "--mend-inertias"]
-    done = CliRunner().invoke(main, words)
-    assert "body upper-arm: its inertia" in done.output and "is in its place" in done.output
+    result = CliRunner().invoke(main, words)
+    assert "body upper-arm: its inertia" in result.output and "is in its place" in result.output
     scene.read("good.toml")
 
 
-def test_import_goes_into_scenes_where_there_is_one(here: Path) -> None:
-    (here / "scenes").mkdir()
-    done = CliRunner().invoke(main, ["import", "crane.urdf", "--name", "lift"])
-    assert done.exit_code == 0 and (here / "scenes" / "lift.toml").exists()
+def test_import_writes_into_an_existing_scenes_folder(folder: Path) -> None:
+    (folder / "scenes").mkdir()
+    result = CliRunner().invoke(main, ["import", "crane.urdf", "--name", "lift"])
+    assert result.exit_code == 0 and (folder / "scenes" / "lift.toml").exists()
 
 
-def test_the_root_element_decides_which_reader_reads(here: Path) -> None:
-    (here / "swing.xml").write_text(
+def test_root_element_selects_the_reader(folder: Path) -> None:
+    (folder / "swing.xml").write_text(
         '<mujoco model="swing"><worldbody><body name="bob"><joint name="q" axis="0 1 0"/>'
         '<geom size="0.1" pos="0 0 -1" mass="1"/></body></worldbody></mujoco>',
         encoding="utf-8",
     )
-    done = CliRunner().invoke(main, ["import", "swing.xml"])
-    assert done.exit_code == 0, done.output
+    result = CliRunner().invoke(main, ["import", "swing.xml"])
+    assert result.exit_code == 0, result.output
     assert [c.name for c in scene.read("swing.toml").coordinates] == ["q"]
 
 
-def test_the_scene_has_the_mass_matrix_of_the_file(here: Path) -> None:
-    """D of the two joints by hand, from the file's numbers and the textbook's J^T M J."""
+def test_mass_matrix_of_the_scene_is_that_of_the_file(folder: Path) -> None:
+    """Compute D of the two joints by hand, as J^T M J with the numbers of the file."""
     CliRunner().invoke(main, ["import", "crane.urdf"])
-    found = scene.read("crane.toml")
-    assert found.assembly
-    at = kinematics.Kinematics(found, found.assembly).jacobian(np.array([0.7, 0.3]), 0.0)
+    imported_scene = scene.read("crane.toml")
+    assert imported_scene.assembly
+    at = kinematics.Kinematics(imported_scene, imported_scene.assembly).jacobian(
+        np.array([0.7, 0.3]), 0.0
+    )
     assert at is not None
     axis, slide = np.array([0, 0.6, 0.8]), np.array([1, 0, 0])
     turned = np.array([[0.2, -0.01, -0.03], [-0.01, 0.1, 0.02], [-0.03, 0.02, 0.25]])
@@ -388,7 +390,7 @@ def test_the_scene_has_the_mass_matrix_of_the_file(here: Path) -> None:
         D[0, 0] += mass * np.sum(np.cross(axis, center) ** 2) + axis @ inertia @ axis
     D[0, 1] = D[1, 0] = np.cross(axis, 0.3 * slide) @ slide
     D[1, 1] = 1
-    # a few roundings
+    # some rounding errors
     assert np.allclose(at.weighs.T @ at.weighs, D, rtol=0, atol=1e-14)
 
 
@@ -402,11 +404,11 @@ def test_the_scene_has_the_mass_matrix_of_the_file(here: Path) -> None:
         (["--no-drives"], 2, 0),
     ],
 )
-def test_the_options_of_import(here: Path, words: list[str], coordinates: int, inputs: int) -> None:
-    done = CliRunner().invoke(main, ["import", "crane.urdf", "--out", "made.toml", *words])
-    assert done.exit_code == 0, done.output
-    found = scene.read("made.toml")
-    assert (len(found.coordinates), len(found.inputs)) == (coordinates, inputs)
+def test_options_of_import(folder: Path, words: list[str], coordinates: int, inputs: int) -> None:
+    result = CliRunner().invoke(main, ["import", "crane.urdf", "--out", "made.toml", *words])
+    assert result.exit_code == 0, result.output
+    imported_scene = scene.read("made.toml")
+    assert (len(imported_scene.coordinates), len(imported_scene.inputs)) == (coordinates, inputs)
 
 
 @pytest.mark.parametrize(
@@ -424,13 +426,13 @@ def test_the_options_of_import(here: Path, words: list[str], coordinates: int, i
         (["--out", "no/such/folder.toml"], "can't be written"),
     ],
 )
-def test_bad_options_change_nothing(here: Path, words: list[str], reported: str) -> None:
-    done = CliRunner().invoke(main, ["import", "crane.urdf", *words])
-    assert done.exit_code == 2 and reported in done.output, done.output
-    assert not list(here.glob("*.toml"))
+def test_invalid_options_write_no_file(folder: Path, words: list[str], reported: str) -> None:
+    result = CliRunner().invoke(main, ["import", "crane.urdf", *words])
+    assert result.exit_code == 2 and reported in result.output, result.output
+    assert not list(folder.glob("*.toml"))
 
 
-def test_quarter_turns_are_written_as_such(read: Reader) -> None:
+def test_quarter_turns_are_written_exactly(read: Reader) -> None:
     text = ARM.replace('rpy="0.1 0.2 0.3"', 'rpy="1.57079632679 0 -3.14159265359"')
     written = scene_text.scene_text(read(text))
     assert 'rotation    = [["z", "pi"], ["x", "pi/2"]]' in written
