@@ -178,9 +178,9 @@ def test_a_run_in_one_call_has_its_room_whatever_others_do(
 
     def meanwhile(x0: object, name: str) -> object:
         model.integrator.room = 0
-        return type(model)._checked_half(model, x0, name)
+        return type(model.arguments).initial_half(model.arguments, x0, name)
 
-    monkeypatch.setattr(model, "_checked_half", meanwhile, raising=False)
+    monkeypatch.setattr(model.arguments, "initial_half", meanwhile, raising=False)
     assert model.integrator.room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
     assert model.integrator.room == 0  # the long way would have found it anew
 
