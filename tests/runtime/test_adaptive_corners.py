@@ -1,4 +1,4 @@
-"""Adaptive steps where forces jump or bend: the end errs by about the tolerance there too."""
+"""Adaptive steps across jumps and kinks of forces: there too the tolerance bounds the error."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SLIDING = RUBBED.replace("mu*sign(x_dot)", "30*sign(x_dot + x)").replace("rubbed
 
 @pytest.fixture(scope="module")
 def bouncing(modules: Modules) -> ModuleType:
-    """A body on a stiff spring that pushes only."""
+    """A body on a stiff spring that only pushes."""
     return modules.unoptimised(BOUNCING)
 
 
 @pytest.mark.parametrize("name", tiers(CASES, "limits", "max", "sign"))
-def test_the_end_errs_by_about_the_tolerance(name: str, modules: Modules) -> None:
+def test_error_at_end_is_about_the_tolerance(name: str, modules: Modules) -> None:
     case = CASES[name]
     module = modules.unoptimised(case.text)
     q0, _ = module.start
@@ -37,8 +37,8 @@ def test_the_end_errs_by_about_the_tolerance(name: str, modules: Modules) -> Non
             assert run.status == "ok" and abs(run.q[-1, 0] - end) < 10 * tol, (start, tol)
 
 
-def test_small_jumps_count_too(modules: Modules) -> None:
-    """The smooth force is up to 32."""
+def test_small_force_jumps_are_resolved(modules: Modules) -> None:
+    """The smooth force reaches 32."""
     module = modules.unoptimised(RUBBED)
     for start in np.random.default_rng(3).uniform(0.5, 2.0, 12):
         for mu in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
@@ -47,7 +47,7 @@ def test_small_jumps_count_too(modules: Modules) -> None:
                 assert abs(run.q[-1, 0] - rubbed(start, mu)) < 10 * tol, (start, mu, tol)
 
 
-def test_many_corners_are_no_chatter(modules: Modules) -> None:
+def test_run_with_many_kinks_is_not_taken_for_chattering(modules: Modules) -> None:
     """Six hundred periods of a spring that is stiffer on one side."""
     text = RUBBED.replace("8*x**2", "0").replace("-mu*sign(x_dot)", "-1e6*x - 3e5*abs(x)")
     module = modules.unoptimised(text.replace("rubbed", "two_sided"))
@@ -57,21 +57,21 @@ def test_many_corners_are_no_chatter(modules: Modules) -> None:
 
 
 @pytest.mark.parametrize("width", [1e-2, 1e-3])
-def test_smoothed_friction_is_a_corner_to_long_steps(width: float, modules: Modules) -> None:
-    """Beside steps that are short against its width; 0.01 is that of a joint's friction."""
+def test_smoothed_friction_is_resolved_like_a_kink(width: float, modules: Modules) -> None:
+    """Compare with steps short against the smoothing width; 0.01 suits a joint's friction."""
     text = RUBBED.replace("[energy]", "w = 0.01\n[energy]")
     text = text.replace("sign(x_dot)", "tanh(x_dot/w)").replace("rubbed", "softly_rubbed")
     module = modules.unoptimised(text)
     for start in (0.7, 1.0, 1.6):
-        way = {"q0": [start], "params": {"w": width}}
-        end = module.simulate(tol=1e-14, h_most=1e-3, **way).q[-1, 0]
+        options = {"q0": [start], "params": {"w": width}}
+        end = module.simulate(tol=1e-14, h_most=1e-3, **options).q[-1, 0]
         for tol in TOLERANCES:
-            assert abs(module.simulate(tol=tol, **way).q[-1, 0] - end) < 10 * tol, (start, tol)
+            assert abs(module.simulate(tol=tol, **options).q[-1, 0] - end) < 10 * tol, (start, tol)
 
 
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("name", tiers(CASES, "limits"))
-def test_the_plain_form_does_the_same(name: str, tmp_path: Path) -> None:
+def test_portable_form_resolves_kinks(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     module = eomc.load(from_scene(parse(case.text, "x.toml")), tmp_path, form="plain")
     for tol in TOLERANCES:
@@ -79,16 +79,18 @@ def test_the_plain_form_does_the_same(name: str, tmp_path: Path) -> None:
         assert abs(run.q[-1, 0] - case.end(module.start[0][0])) < 10 * tol, tol
 
 
-def test_each_of_many_is_as_it_is_alone(bouncing: ModuleType) -> None:
+def test_batch_equals_single_runs(bouncing: ModuleType) -> None:
     q0 = np.linspace(0.2, 1.0, 9)[:, None]
     times = [0.0, 1.3, 5.0]
     run = bouncing.simulate_batch(q0, np.zeros((9, 1)), tol=1e-9, times=times)
     for k in range(9):
-        alone = bouncing.simulate(q0[k], tol=1e-9, times=times)
-        assert np.array_equal(run.q[k], alone.q) and run.steps[k] == alone.steps
+        single = bouncing.simulate(q0[k], tol=1e-9, times=times)
+        assert np.array_equal(run.q[k], single.q) and run.steps[k] == single.steps
 
 
-def test_a_run_is_the_same_in_pieces(bouncing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_split_into_several_calls_is_identical(
+    bouncing: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = bouncing.simulate()
     module = __import__(f"{bouncing.__name__}._runtime.adaptive", fromlist=["adaptive"])
     monkeypatch.setattr(module, "_FIRST_CALL_STEPS", 1)
@@ -107,7 +109,7 @@ def test_single_precision(modules: Modules) -> None:
 @pytest.mark.parametrize(
     ("text", "mu"), tiers([(RUBBED, 3), (SLIDING, 0)], RUBBED), ids=["sticks", "slides"]
 )
-def test_forces_that_keep_jumping_end_the_run_soon(text: str, mu: float, modules: Modules) -> None:
+def test_forces_that_keep_jumping_end_the_run_early(text: str, mu: float, modules: Modules) -> None:
     module = modules.unoptimised(text)
     for tol in (1e-3, 1e-6, 1e-12):
         with pytest.warns(RuntimeWarning, match="stopped at t = "):
@@ -123,8 +125,8 @@ STRIBECK = "-(1 + exp(-(x_dot/0.05)**2))*x_dot/(1 + 20*x_dot**2)/2"
     "friction",
     ["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK],
 )
-def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) -> None:
-    """Steep in a velocity: the end erred by 1e-3 and more, whatever the tolerance."""
+def test_steep_smoothed_friction_is_resolved(friction: str, modules: Modules) -> None:
+    """Regression: the final error was 1e-3 or more at every tolerance."""
     text = RUBBED.replace("-mu*sign(x_dot)", friction).replace("rubbed", "smoothed")
     text = text.replace("[run]", '[run]\nmethod = "dp8"')
     module = modules.unoptimised(text)
@@ -143,10 +145,10 @@ def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) ->
         ("x**2/2", "0.1/(1 + exp(-(t - 2)/0.001))"),
     ],
 )
-def test_what_is_steep_in_position_or_time_is_seen(
+def test_force_steep_in_position_or_time_is_resolved(
     potential: str, force: str, modules: Modules
 ) -> None:
-    """By coefficients that hardly fall; the square law was up to 1e6 tolerances off."""
+    """Slowly decaying coefficients reveal it; a quadratic law was up to 1e6 tolerances off."""
     text = RUBBED.replace("-mu*sign(x_dot)", force).replace("8*x**2", potential)
     text = text.replace("[run]", '[run]\nmethod = "dp8"').replace("rubbed", "passing")
     module = modules.unoptimised(text)
@@ -156,13 +158,13 @@ def test_what_is_steep_in_position_or_time_is_seen(
         assert run.status == "ok" and np.abs(run.x[-1] - end).max() < 50 * tol
 
 
-def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
+def test_kink_detection_is_compiled_only_for_non_smooth_scenes(tmp_path: Path) -> None:
     smooth = PENDULUM.replace("limits", "note").replace("[-1.5, 1.5]", '"free"')
-    for text, there in ((PENDULUM, True), (smooth, False)):
+    for text, expected in ((PENDULUM, True), (smooth, False)):
         files = eomc.sources(from_scene(parse(text, "x.toml")), "_x").files
         for name in ("limited_pendulum.c", "fast/limited_pendulum.c"):
-            assert ("gauss16_kink_error" in files[name]) == there
+            assert ("gauss16_kink_error" in files[name]) == expected
         for name in ("limited_pendulum.h", "limited_pendulum.c"):
             (tmp_path / name).write_text(files[name], encoding="utf-8")
-        if there:  # without corners: tests/c
+        if expected:  # tests/c compiles scenes without kinks
             compiled(needs("gcc"), *STRICT, "-O1", "-c", "limited_pendulum.c", cwd=tmp_path)

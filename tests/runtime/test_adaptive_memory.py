@@ -1,4 +1,4 @@
-"""Runs by adaptive steps take no more memory than the machine has, also where jumps never cease."""
+"""Adaptive runs use no more memory than the machine has, also under endless jumps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Modules
 
-# the more it has jumped the sooner it jumps again: the n-th time after 0.1/(1 + n^2) s
+# jumps follow ever faster: the n-th comes 0.1/(1 + n^2) s after the one before
 ENDLESS = """eomc = 1
 name = "endless_jumps"
 [coordinates]
@@ -30,10 +30,11 @@ y_dot = "y_dot + 1"
 duration = 5.0
 tolerance = 1e-6
 """
-MEMORY = 5_000_000  # bytes, in place of the machine's
+MEMORY = 5_000_000  # bytes, replaces the machine's
 ROW = 5 * 8
 CALL = 3 * 1024 * ROW  # two rows and an event each, of one call of C
-LAST = 0.05 * (1 + np.pi / np.tanh(np.pi))  # s, which no jump comes to
+# s, the accumulation point, which no jump reaches
+ACCUMULATION_TIME = 0.05 * (1 + np.pi / np.tanh(np.pi))
 
 
 @pytest.fixture(scope="module")
@@ -42,37 +43,37 @@ def endless(modules: Modules) -> ModuleType:
 
 
 @pytest.fixture(autouse=True)
-def small(endless: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine of 5 MB."""
+def limit_memory(endless: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pretend that the machine has 5 MB."""
     memory = sys.modules[f"{endless.__name__}._runtime.adaptive"]
     monkeypatch.setattr(memory, "machine_memory", lambda: MEMORY)
 
 
-def test_a_run_of_jumps_for_ever_ends_with_what_there_is_memory_for(endless: ModuleType) -> None:
+def test_endless_jumps_end_the_run_when_memory_is_full(endless: ModuleType) -> None:
     with pytest.warns(RuntimeWarning, match=r"\d+ steps, .* 40 % .* memory.*times=.*duration="):
         run = endless.simulate()
-    found = run.events["again"]
+    events = run.events["again"]
     assert run.status == "out of memory" and run.stopped == ""
-    assert 0.39 * MEMORY < (len(run) + len(found)) * ROW < 0.4 * MEMORY + CALL
-    assert len(found) > 10_000
+    assert 0.39 * MEMORY < (len(run) + len(events)) * ROW < 0.4 * MEMORY + CALL
+    assert len(events) > 10_000
     gaps = 0.1 / (1 + np.arange(1.0, 50) ** 2)
-    np.testing.assert_allclose(np.diff(found.t[:50]), gaps, rtol=1e-9)
-    assert found.t[-1] <= run.t[-1] < LAST
+    np.testing.assert_allclose(np.diff(events.t[:50]), gaps, rtol=1e-9)
+    assert events.t[-1] <= run.t[-1] < ACCUMULATION_TIME
     with pytest.raises(MemoryError, match=r"estimate: rows and events fill 40 %.*times="):
         run.estimate()
 
 
-def test_few_rows_and_jumps_for_ever_too(endless: ModuleType) -> None:
+def test_endless_jumps_with_few_rows_end_the_run(endless: ModuleType) -> None:
     with pytest.warns(RuntimeWarning, match="duration="):
         run = endless.simulate(times=[0.1, 0.2, 0.3])
     assert run.status == "out of memory" and run.t.tolist() == [0.1, 0.2]
     assert 0.39 * MEMORY < len(run.events["again"]) * ROW < 0.4 * MEMORY + CALL
 
 
-def test_what_fits_runs_on(endless: ModuleType) -> None:
+def test_run_that_fits_into_memory_completes(endless: ModuleType) -> None:
     assert endless.simulate(duration=0.2075).status == "ok"
 
 
-def test_more_times_than_there_is_memory_for_are_refused(endless: ModuleType) -> None:
+def test_more_output_times_than_memory_are_refused(endless: ModuleType) -> None:
     with pytest.raises(MemoryError, match=r"200000 rows of 5 numbers don't fit.*fewer times="):
         endless.simulate(times=np.linspace(0.0, 0.1, 200_001))

@@ -1,4 +1,4 @@
-"""Adaptive steps under inputs that are set anew at each control period."""
+"""Adaptive steps under inputs that are held constant over each control period."""
 
 from __future__ import annotations
 
@@ -53,102 +53,100 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
 
 
 @pytest.mark.parametrize("u", [law, None])
-def test_it_ends_where_short_fixed_steps_do(sampled: ModuleType, u: Any) -> None:
+def test_end_equals_that_of_short_fixed_steps(sampled: ModuleType, u: Any) -> None:
     run = sampled.simulate(u=u, control_period=0.05, tol=1e-11)
     fixed = sampled.simulate(u=u, control_period=0.05, h=0.0025)
     np.testing.assert_allclose(run.x[-1], fixed.x[-1], atol=1e-9)
     assert run.status == "ok" and run.t[-1] == 2.0
-    calm = sampled.simulate(u=u, control_period=0.05, tol=1e-5)
-    assert calm.steps < 60 and calm.rejected < 6  # one a period, but for the first
+    loose = sampled.simulate(u=u, control_period=0.05, tol=1e-5)
+    assert loose.steps < 60 and loose.rejected < 6  # one step a period, except in the first
 
 
-def test_a_function_is_asked_at_the_start_of_each_period(sampled: ModuleType) -> None:
-    asked: list[Any] = []
+def test_feedback_law_is_called_at_each_period_start(sampled: ModuleType) -> None:
+    calls: list[Any] = []
 
-    def kept(t: float, q: Any, qd: Any) -> list[float]:
-        asked.append((t, q, qd))
+    def record(t: float, q: Any, qd: Any) -> list[float]:
+        calls.append((t, q, qd))
         return law(t, q, qd)
 
-    run = sampled.simulate(u=kept, control_period=0.3, t0=1.0)  # the last of 0.2 s
-    assert [t for t, _, _ in asked] == [1.0 + 0.3 * k for k in range(7)]
-    for t, q, qd in asked:
+    run = sampled.simulate(u=record, control_period=0.3, t0=1.0)  # the last period has 0.2 s
+    assert [t for t, _, _ in calls] == [1.0 + 0.3 * k for k in range(7)]
+    for t, q, qd in calls:
         row = int(np.flatnonzero(run.t == t)[-1])
         assert (run.q[row] == q).all() and (run.qd[row] == qd).all()
         assert run.u[row] == np.clip(law(t, q, qd), -9, 9)
-    assert (run.u[-1] == run.u[-2]).all()  # what was held last
+    assert (run.u[-1] == run.u[-2]).all()  # the input of the last period
     np.testing.assert_array_equal(run.outputs["push"], run.u[:, 0] * run.qd[:, 0])
 
 
-def test_rows_at_times_and_between_them_are_those_of_the_run(sampled: ModuleType) -> None:
+def test_rows_at_output_times_equal_interpolated_states(sampled: ModuleType) -> None:
     times = np.array([0.0, 0.11, 0.2, 0.20001, 1.0, 1.7])
     run = sampled.simulate(u=law, control_period=0.1)
     rows = sampled.simulate(u=law, control_period=0.1, times=times)
     q, qd = run(times)
     assert (rows.q[:-1] == q[:-1]).all() and (rows.qd[:-1] == qd[:-1]).all()
-    np.testing.assert_allclose(rows.q[-1], q[-1], atol=1e-13)  # a step ends there
-    whole = np.searchsorted(run.t, [0.2, 1.0])
-    assert (rows.u[[2, 4]] == run.u[whole]).all() and (rows.u[3] == rows.u[2]).all()
+    np.testing.assert_allclose(rows.q[-1], q[-1], atol=1e-13)  # there a step ends
+    period_starts = np.searchsorted(run.t, [0.2, 1.0])
+    assert (rows.u[[2, 4]] == run.u[period_starts]).all() and (rows.u[3] == rows.u[2]).all()
     assert (rows(1.7)[0] == rows.q[-1]).all()
 
 
-def test_a_table_of_what_a_function_gave_makes_the_same_run(
-    sampled: ModuleType, tmp_path: Path
-) -> None:
-    given: list[float] = []
+def test_table_of_recorded_inputs_reproduces_the_run(sampled: ModuleType, tmp_path: Path) -> None:
+    inputs: list[float] = []
 
-    def kept(t: float, q: Any, qd: Any) -> list[float]:
-        given.extend(law(t, q, qd))
-        return given[-1:]
+    def record(t: float, q: Any, qd: Any) -> list[float]:
+        inputs.extend(law(t, q, qd))
+        return inputs[-1:]
 
-    run = sampled.simulate(u=kept, control_period=0.15)
-    for u in (given, np.array(given)[:, None], {"force": given}):
-        again = sampled.simulate(u=u, control_period=0.15)
-        assert again == run and (again.u == run.u).all()
+    run = sampled.simulate(u=record, control_period=0.15)
+    for u in (inputs, np.array(inputs)[:, None], {"force": inputs}):
+        repeated = sampled.simulate(u=u, control_period=0.15)
+        assert repeated == run and (repeated.u == run.u).all()
     run.save(tmp_path / "run.npz")
-    again.save(tmp_path / "again.npz")
-    for kept_run in (
+    repeated.save(tmp_path / "again.npz")
+    for copied in (
         pickle.loads(pickle.dumps(run)),
         sampled.load_run(tmp_path / "run.npz"),
         sampled.load_run(tmp_path / "again.npz"),
     ):
-        assert kept_run == run and (kept_run.u == run.u).all()
-        assert (kept_run(1.234)[0] == run(1.234)[0]).all()
+        assert copied == run and (copied.u == run.u).all()
+        assert (copied(1.234)[0] == run(1.234)[0]).all()
     with pytest.raises(ValueError, match="u was a function"):
         sampled.load_run(tmp_path / "run.npz").estimate()
-    assert sampled.load_run(tmp_path / "again.npz").estimate().end == again.estimate().end
+    assert sampled.load_run(tmp_path / "again.npz").estimate().end == repeated.estimate().end
 
 
-def test_its_own_error_is_that_of_the_closed_loop(sampled: ModuleType) -> None:
+def test_error_estimate_is_that_of_the_closed_loop(sampled: ModuleType) -> None:
     run = sampled.simulate(u=law, control_period=0.1, tol=1e-6)
     fine = sampled.simulate(u=law, control_period=0.1, tol=1e-13)
     error = abs(run["theta"][-1] - fine["theta"][-1])
     assert 0.5 * error < run.estimate().end["theta"] < 2 * error + 1e-15
 
 
-def test_a_batch_by_tables_is_each_alone_with_its_events(sampled: ModuleType) -> None:
+def test_batch_with_input_tables_equals_single_runs(sampled: ModuleType) -> None:
     tables = 12 * np.cos(np.arange(40) * np.array([[0.3], [0.7], [1.1]]))[..., None]
     starts = [[0, 0.1], [0, 0.2], [0, 0.3]]
     run = sampled.simulate_batch(starts, u=tables, control_period=0.05)
     for k, table in enumerate(tables):
-        alone = sampled.simulate(starts[k], u=table, control_period=0.05)
-        assert (run.q[k, -1] == alone.q[-1]).all() and (run.u[k] == alone.u[[0, -1]]).all()
-        assert (run.saturated[k] == alone.saturated[[0, -1]]).all()
+        single = sampled.simulate(starts[k], u=table, control_period=0.05)
+        assert (run.q[k, -1] == single.q[-1]).all() and (run.u[k] == single.u[[0, -1]]).all()
+        assert (run.saturated[k] == single.saturated[[0, -1]]).all()
         for name in ("upright", "noon"):
-            assert run.events[name].for_instance(k).t.tolist() == alone.events[name].t.tolist()
+            assert run.events[name].for_instance(k).t.tolist() == single.events[name].t.tolist()
 
 
-def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> None:
+def test_events_at_and_between_period_starts_are_detected_once(sampled: ModuleType) -> None:
     run = sampled.simulate(u=law, control_period=0.05)
-    assert run.events["noon"].t.tolist() == [0.5]  # where the tenth period ends
+    assert run.events["noon"].t.tolist() == [0.5]  # at the end of the tenth period
     times = run.events["upright"].t
     assert len(times) > 1
     np.testing.assert_allclose(run(times)[0][:, 1], 0, atol=1e-14)
-    crossed = np.count_nonzero(np.diff(np.sign(run["theta"])))
-    assert len(times) == crossed
+    crossings = np.count_nonzero(np.diff(np.sign(run["theta"])))
+    assert len(times) == crossings
 
 
 @pytest.mark.parametrize(
-    ("how", "words"),
+    ("options", "message"),
     [
         ({"u": law}, "a function is asked once a control period, .*: give control_period="),
         ({"u": np.ones((4, 1))}, r"u: shape \(4, 1\), expected \(1,\).* take control_period="),
@@ -161,43 +159,43 @@ def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> N
         ({"u": np.full((20, 1), math.inf), "control_period": 0.1}, r"u\[0, 0\]: inf"),
     ],
 )
-def test_what_can_not_be_held_is_refused(
-    sampled: ModuleType, how: dict[str, Any], words: str
+def test_invalid_control_periods_and_inputs_are_refused(
+    sampled: ModuleType, options: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(ValueError, match=words):
-        sampled.simulate(tol=1e-9, **how)
+    with pytest.raises(ValueError, match=message):
+        sampled.simulate(tol=1e-9, **options)
 
 
-def test_what_a_function_raises_says_when(sampled: ModuleType) -> None:
-    def bad(t: float, q: Any, qd: Any) -> list[float]:
+def test_error_in_feedback_law_reports_time_and_state(sampled: ModuleType) -> None:
+    def invalid_law(t: float, q: Any, qd: Any) -> list[float]:
         return [math.nan if t > 0.25 else 0.0]
 
-    for how in ({"tol": 1e-9}, {"h": 0.0025}):
-        with pytest.raises(ValueError, match="is not finite") as raised:
-            sampled.simulate(u=bad, control_period=0.1, **how)
-        assert "u was asked at t = 0.3 s, q = [" in raised.value.__notes__[0]
+    for options in ({"tol": 1e-9}, {"h": 0.0025}):
+        with pytest.raises(ValueError, match="is not finite") as error:
+            sampled.simulate(u=invalid_law, control_period=0.1, **options)
+        assert "u was asked at t = 0.3 s, q = [" in error.value.__notes__[0]
 
 
-def test_more_periods_than_memory_has_room_for_are_refused(sampled: ModuleType) -> None:
+def test_more_control_periods_than_memory_are_refused(sampled: ModuleType) -> None:
     with pytest.raises(MemoryError, match="take a longer one, or a shorter duration"):
         sampled.simulate(u=law, control_period=1e-12, duration=1e3)
 
 
-def test_ctrl_c_in_the_function_keeps_what_was_done(sampled: ModuleType) -> None:
-    def stops(t: float, q: Any, qd: Any) -> list[float]:
+def test_interrupt_in_feedback_law_keeps_completed_rows(sampled: ModuleType) -> None:
+    def interrupting_law(t: float, q: Any, qd: Any) -> list[float]:
         if t > 0.45:
             raise KeyboardInterrupt
         return law(t, q, qd)
 
-    with pytest.raises(sampled.Interrupted) as stopped:
-        sampled.simulate(u=stops, control_period=0.1)
-    run = stopped.value.run
+    with pytest.raises(sampled.Interrupted) as interruption:
+        sampled.simulate(u=interrupting_law, control_period=0.1)
+    run = interruption.value.run
     assert run.t[-1] == 0.5 and len(run.u) == len(run)
 
 
-def test_a_period_below_a_step_and_one_beyond_the_run(sampled: ModuleType) -> None:
+def test_period_shorter_than_a_step_and_longer_than_the_run(sampled: ModuleType) -> None:
     short = sampled.simulate(u=law, control_period=1e-4, duration=0.05, tol=1e-9)
     assert 500 <= short.steps < 510 and short.rejected == 0
-    assert short.evaluations < 4 * 8 * short.steps  # some three sweeps each
-    held = sampled.simulate(u=law, control_period=1e9)
-    assert held == sampled.simulate(u=law(0.0, *sampled.start))
+    assert short.evaluations < 4 * 8 * short.steps  # about three sweeps each
+    constant = sampled.simulate(u=law, control_period=1e9)
+    assert constant == sampled.simulate(u=law(0.0, *sampled.start))

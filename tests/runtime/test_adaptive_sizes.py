@@ -1,4 +1,4 @@
-"""Adaptive steps where one coordinate is far larger than others."""
+"""Adaptive steps where one coordinate is much larger than the others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eomc.verify.check import check
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
 END = 60.0
-# an orbit in m, and two arms on a spring each, pulled by the gradient of gravity
+# an orbit in m, and two arms, each on a spring, pulled by the gravity gradient
 SATELLITE = """eomc = 1
 name = "satellite"
 [coordinates]
@@ -37,7 +37,7 @@ tolerance = 1e-9
 duration = 60
 batch = true
 """
-# a stiff and damped spring to a point FAR m away, whose force is taken from what is that large
+# a stiff, damped spring to a point FAR m away: its force is a difference of large numbers
 ANCHORED = """eomc = 1
 name = "anchored"
 [coordinates]
@@ -54,52 +54,52 @@ duration = 5
 """
 
 
-def built(text: str) -> ModuleType:
+def build(text: str) -> ModuleType:
     return eomc.load(from_scene(parse(text, "sizes.toml")), BUILDS)
 
 
 @pytest.fixture(scope="module")
 def satellite() -> ModuleType:
-    return built(SATELLITE)
+    return build(SATELLITE)
 
 
 @pytest.fixture(scope="module")
-def right(satellite: ModuleType) -> np.ndarray:
-    """Its end, by fixed steps of two lengths."""
-    one, other = (
+def reference_end(satellite: ModuleType) -> np.ndarray:
+    """Final coordinates, by fixed steps of two lengths."""
+    coarse, fine = (
         satellite.simulate(h=END / steps, steps=steps, every=steps).q[-1]
         for steps in (16000, 24000)
     )
-    assert np.max(np.abs(one - other) / [7e6, 7e6, 1, 1]) < 1e-13
-    return other
+    assert np.max(np.abs(coarse - fine) / [7e6, 7e6, 1, 1]) < 1e-13
+    return fine
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
-def test_errors_of_angles_do_not_hide_behind_metres(
-    satellite: ModuleType, right: np.ndarray, tol: float
+def test_small_angles_are_accurate_beside_large_positions(
+    satellite: ModuleType, reference_end: np.ndarray, tol: float
 ) -> None:
     run = satellite.simulate(tol=tol, duration=END)
-    many = satellite.simulate_batch(run.q[[0, 0]], run.qd[[0, 0]], tol=tol, duration=END)
-    for q in (run.q[-1], *many.q[:, -1]):
-        assert np.max(np.abs(q - right)[2:]) < 10 * tol
-        assert np.max(np.abs(q - right)[:2]) < 10 * tol * 7e6
+    batch = satellite.simulate_batch(run.q[[0, 0]], run.qd[[0, 0]], tol=tol, duration=END)
+    for q in (run.q[-1], *batch.q[:, -1]):
+        assert np.max(np.abs(q - reference_end)[2:]) < 10 * tol
+        assert np.max(np.abs(q - reference_end)[:2]) < 10 * tol * 7e6
 
 
 @pytest.mark.slow
-def test_a_module_with_metres_beside_angles_passes_its_check(satellite: ModuleType) -> None:
+def test_check_of_module_with_metres_and_angles_passes(satellite: ModuleType) -> None:
     report = check(from_scene(parse(SATELLITE, "sizes.toml")), satellite, states=20)
     assert report.passed, report.table()
 
 
 @pytest.mark.parametrize("far", ["1000", "1000000"])
-def test_rounding_of_what_is_large_takes_no_steps(far: str) -> None:
-    """What rests is 1e-13 m of 1000 m, and the stiff spring makes forces of that."""
-    near = built(ANCHORED.replace("FAR", "1").replace('"anchored"', '"anchored_1"'))
-    away = built(ANCHORED.replace("FAR", far).replace('"anchored"', f'"anchored_{far}"'))
+def test_rounding_of_large_coordinates_costs_no_steps(far: str) -> None:
+    """The residual motion is 1e-13 m of 1000 m; the stiff spring turns it into forces."""
+    small = build(ANCHORED.replace("FAR", "1").replace('"anchored"', '"anchored_1"'))
+    large = build(ANCHORED.replace("FAR", far).replace('"anchored"', f'"anchored_{far}"'))
     for tol in (1e-6, 1e-12):
-        few, many = near.simulate(tol=tol), away.simulate(tol=tol)
-        assert many.status == "ok" and many.steps < 10 * few.steps
-        assert abs(many.q[-1, 1] - few.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
+        small_run, large_run = small.simulate(tol=tol), large.simulate(tol=tol)
+        assert large_run.status == "ok" and large_run.steps < 10 * small_run.steps
+        assert abs(large_run.q[-1, 1] - small_run.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
 
 
 OSCILLATOR = """eomc = 1
@@ -115,12 +115,12 @@ batch = true
 """
 
 
-def test_a_large_time_costs_no_digits() -> None:
-    """What rounding of times leaves is kept: 2.4e-7 s at 1.7e9 s made 5e-8 of the state."""
-    late, t0 = built(OSCILLATOR), 1.7e9
-    since = np.array([0.0, 1, 5, 10.5, 20])
-    for run in (late.simulate(times=t0 + since, t0=t0), late.simulate(duration=20, t0=t0)):
+def test_large_start_time_costs_no_digits() -> None:
+    """Rounding of times is compensated: 2.4e-7 s at 1.7e9 s had changed the state by 5e-8."""
+    late, t0 = build(OSCILLATOR), 1.7e9
+    elapsed = np.array([0.0, 1, 5, 10.5, 20])
+    for run in (late.simulate(times=t0 + elapsed, t0=t0), late.simulate(duration=20, t0=t0)):
         np.testing.assert_allclose(run.q[:, 0][run.t == t0 + 20], np.cos(20), atol=1e-13)
-    runs = late.simulate_batch(times=t0 + since, t0=t0)
-    for q in (runs.q[0], late.simulate(times=t0 + since, t0=t0).q):
-        np.testing.assert_allclose(q[:, 0], np.cos(since), atol=1e-13)
+    runs = late.simulate_batch(times=t0 + elapsed, t0=t0)
+    for q in (runs.q[0], late.simulate(times=t0 + elapsed, t0=t0).q):
+        np.testing.assert_allclose(q[:, 0], np.cos(elapsed), atol=1e-13)

@@ -1,4 +1,4 @@
-"""Adaptive steps in stiff motion, found by Newton's method: beside closed forms, and each other."""
+"""Adaptive steps of stiff motion, by Newton's method, against closed forms and single runs."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ START = (0.1, 0.3, 1.0, 0.0)
 
 @pytest.fixture(scope="module")
 def train() -> ModuleType:
-    """Two masses, one on a soft spring, coupled so that they move as one after 1e-3 s."""
+    """Two masses, one on a soft spring, coupled so stiffly that they move as one after 1e-3 s."""
     return eomc.load(from_scene(parse(TRAIN, "stiff_train.toml")), BUILDS)
 
 
 @cache
-def exact(t: float) -> np.ndarray:
-    """Its state at t, (4,), in fifty digits."""
+def exact_state(t: float) -> np.ndarray:
+    """Return the state at t, (4,), from fifty digits."""
     k, c = 10**8, 10**4
     with mpmath.workdps(50):
         rates = mpmath.matrix(
@@ -63,78 +63,81 @@ def exact(t: float) -> np.ndarray:
             ]
         )
         values, vectors = mpmath.eig(rates)
-        parts = mpmath.lu_solve(vectors, mpmath.matrix([mpmath.mpf(str(x)) for x in START]))
-        ends = [parts[i] * mpmath.exp(values[i] * mpmath.mpf(t)) for i in range(4)]
-        return np.array([float(mpmath.re(x)) for x in vectors * mpmath.matrix(ends)])
+        weights = mpmath.lu_solve(vectors, mpmath.matrix([mpmath.mpf(str(x)) for x in START]))
+        modes = [weights[i] * mpmath.exp(values[i] * mpmath.mpf(t)) for i in range(4)]
+        return np.array([float(mpmath.re(x)) for x in vectors * mpmath.matrix(modes)])
 
 
 @pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9, 1e-12])
-def test_the_end_is_the_closed_form(train: ModuleType, tol: float) -> None:
+def test_end_equals_the_closed_form(train: ModuleType, tol: float) -> None:
     with warnings.catch_warnings(action="error"):
         run = train.simulate(tol=tol, duration=20.0)
     assert run.status == "ok" and run.stiff_steps > run.steps / 3 and run.steps < 120
-    assert np.abs(run.x[-1] - exact(20.0)).max() < 10 * tol
+    assert np.abs(run.x[-1] - exact_state(20.0)).max() < 10 * tol
     assert "by Newton's method" in run.message
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-4])
-def test_what_swings_on_limits_stiff_steps(train: ModuleType, tol: float) -> None:
-    """Steps grew to hundreds of periods: what the step before was continued to was their scale."""
-    how = {"duration": 300.0, "params": {"k": 10.0, "c": 0.0}}
+def test_oscillation_limits_stiff_steps(train: ModuleType, tol: float) -> None:
+    """Regression: steps grew to hundreds of periods; their scale was an extrapolated state."""
+    options = {"duration": 300.0, "params": {"k": 10.0, "c": 0.0}}
     for stiff in (False, True):
-        run = train.simulate(tol=tol, stiff=stiff, **how)
-        assert np.abs(run.q[-1] - train.simulate(tol=1e-13, **how).q[-1]).max() < 30 * tol
+        run = train.simulate(tol=tol, stiff=stiff, **options)
+        assert np.abs(run.q[-1] - train.simulate(tol=1e-13, **options).q[-1]).max() < 30 * tol
         assert np.diff(run.t).max() < 3.0
 
 
-def test_rows_within_stiff_steps_are_exact_too(train: ModuleType) -> None:
+def test_rows_within_stiff_steps_are_accurate(train: ModuleType) -> None:
     times = np.array([1e-4, 1e-3, 0.5, 3.0, 3.01, 17.7, 20.0])
     run = train.simulate(tol=1e-11, times=times)
     assert run.steps < 300
     for t, x in zip(times, run.x, strict=True):
-        assert np.abs(x - exact(t)).max() < 1e-9, t
-    again = train.simulate(tol=1e-11, duration=20.0)
-    assert np.array_equal(np.concatenate(again(3.01)), run.x[4])
+        assert np.abs(x - exact_state(t)).max() < 1e-9, t
+    repeated = train.simulate(tol=1e-11, duration=20.0)
+    assert np.array_equal(np.concatenate(repeated(3.01)), run.x[4])
 
 
-def test_events_in_stiff_steps_are_found(train: ModuleType) -> None:
-    found = train.simulate(tol=1e-12, duration=20.0).events["back"].t
-    assert len(found) == 3 and np.diff(found) == pytest.approx(np.pi * np.sqrt(3), rel=1e-7)
-    for t in found:
-        x = exact(float(t))
+def test_events_in_stiff_steps_are_detected(train: ModuleType) -> None:
+    times = train.simulate(tol=1e-12, duration=20.0).events["back"].t
+    assert len(times) == 3 and np.diff(times) == pytest.approx(np.pi * np.sqrt(3), rel=1e-7)
+    for t in times:
+        x = exact_state(float(t))
         assert abs(x[0] + 2 * x[1]) < 1e-10
 
 
-def test_a_run_may_begin_by_newtons_method(train: ModuleType, tmp_path: Path) -> None:
+def test_run_can_start_with_newtons_method(train: ModuleType, tmp_path: Path) -> None:
     run = train.simulate(tol=1e-9, duration=20.0, stiff=True)
-    own = train.simulate(tol=1e-9, duration=20.0)
-    assert run.evaluations != own.evaluations
-    assert np.abs(run.x[-1] - exact(20.0)).max() < 1e-8
+    default = train.simulate(tol=1e-9, duration=20.0)
+    assert run.evaluations != default.evaluations
+    assert np.abs(run.x[-1] - exact_state(20.0)).max() < 1e-8
     assert np.array_equal(run(3.3)[0], train.simulate(tol=1e-9, times=[3.3, 20], stiff=True).q[0])
     run.save(tmp_path / "run.npz")
-    kept = train.load_run(tmp_path / "run.npz")
-    assert kept.stiff_steps == run.stiff_steps and np.array_equal(kept(3.3)[0], run(3.3)[0])
+    loaded = train.load_run(tmp_path / "run.npz")
+    assert loaded.stiff_steps == run.stiff_steps and np.array_equal(loaded(3.3)[0], run(3.3)[0])
     assert max(run.estimate().end.values()) < 1e-8
 
 
-def test_many_take_the_steps_that_each_takes_alone(train: ModuleType) -> None:
+def test_batch_takes_the_steps_of_single_runs(train: ModuleType) -> None:
     q0 = np.column_stack([np.linspace(0, 1, 9), np.linspace(0.3, 0.31, 9)])
     c = np.geomspace(1, 1e6, 9)
     runs = train.simulate_batch(q0, params={"c": c}, tol=1e-8, times=[0.0, 2.0, 5.0])
     for k in (0, 5, 8):
-        alone = train.simulate(q0[k], params={"c": c[k]}, tol=1e-8, times=[0.0, 2.0, 5.0])
-        assert np.array_equal(runs.q[k], alone.q) and runs.steps[k] == alone.steps
-        assert runs.stiff_steps[k] == alone.stiff_steps
+        single = train.simulate(q0[k], params={"c": c[k]}, tol=1e-8, times=[0.0, 2.0, 5.0])
+        assert np.array_equal(runs.q[k], single.q) and runs.steps[k] == single.steps
+        assert runs.stiff_steps[k] == single.stiff_steps
     assert (runs.stiff_steps > 0).any() and not (runs.stiff_steps > 0).all()
-    begun = train.simulate_batch(q0, tol=1e-8, times=[0.0, 0.1], stiff=True)
-    assert (begun.stiff_steps > 0).all() and set(begun.status) == {"ok"}
-    alone = train.simulate(q0[8], tol=1e-8, times=[0.0, 0.1], stiff=True)
-    assert np.array_equal(begun.q[8], alone.q) and begun.stiff_steps[8] == alone.stiff_steps
+    stiff_batch = train.simulate_batch(q0, tol=1e-8, times=[0.0, 0.1], stiff=True)
+    assert (stiff_batch.stiff_steps > 0).all() and set(stiff_batch.status) == {"ok"}
+    single = train.simulate(q0[8], tol=1e-8, times=[0.0, 0.1], stiff=True)
+    assert (
+        np.array_equal(stiff_batch.q[8], single.q)
+        and stiff_batch.stiff_steps[8] == single.stiff_steps
+    )
 
 
-def test_calm_motion_goes_back_to_sweeps(train: ModuleType) -> None:
-    calm = train.simulate(params={"k": 1, "c": 0}, tol=1e-9, duration=200.0, stiff=True)
-    assert calm.stiff_steps == 32 and calm.steps > 64
+def test_calm_motion_returns_to_fixed_point_iteration(train: ModuleType) -> None:
+    run = train.simulate(params={"k": 1, "c": 0}, tol=1e-9, duration=200.0, stiff=True)
+    assert run.stiff_steps == 32 and run.steps > 64
     assert train.simulate(params={"k": 1, "c": 0}, tol=1e-9, duration=200.0).stiff_steps == 0
 
 
@@ -145,7 +148,8 @@ def test_single_precision() -> None:
     text = text.replace("1e-9", "1e-5").replace('[[event]]\nname = "back"\nwhen = "x + 2*y"\n', "")
     module = eomc.load(from_scene(parse(text, "stiff_single.toml")), BUILDS)
     run, fine = module.simulate(duration=20.0), module.simulate(duration=20.0, h=0.05)
-    assert run.stiff_steps > run.steps / 3 and run.steps < 100  # 4300 where sweeps converge
+    # 4300 steps where fixed-point iteration converges
+    assert run.stiff_steps > run.steps / 3 and run.steps < 100
     assert np.abs(run.x[-1] - fine.x[-1]).max() < 1e-4
 
 
@@ -182,7 +186,7 @@ method = "gauss8"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
-def test_the_governor_settles(tol: float, modules: Modules) -> None:
+def test_stiff_governor_meets_its_reference(tol: float, modules: Modules) -> None:
     text = cases.scene_text("iftomm_A05_governor").replace("[run]", "[run]\ntolerance = 1e-9")
     module = modules.of_text(text)
     run = module.simulate(tol=tol)
@@ -190,8 +194,8 @@ def test_the_governor_settles(tol: float, modules: Modules) -> None:
     assert run.stiff_steps > run.steps / 2 and run.steps < 400
 
 
-def test_a_relaxation_oscillator() -> None:
-    """Van der Pol's, mu = 1000, by the asymptotic period of Dorodnicyn."""
+def test_relaxation_oscillator_has_the_asymptotic_period() -> None:
+    """Van der Pol's, mu = 1000; asymptotic period by Dorodnicyn."""
     text = """eomc = 1
 name = "relaxation"
 [coordinates]
@@ -243,17 +247,17 @@ duration = 5
 
 
 @pytest.mark.parametrize(
-    ("at", "length", "steps"), [(0.0, 1e-3, 200), (6.4e6, 1e-3, 200), (0.0, 1e-9, 200)]
+    ("origin", "length", "steps"), [(0.0, 1e-3, 200), (6.4e6, 1e-3, 200), (0.0, 1e-9, 200)]
 )
-def test_neither_units_nor_the_origin_matter(at: float, length: float, steps: int) -> None:
-    """A contact as steep as 1/L: derivatives over a metre would be those of another."""
+def test_units_and_origin_do_not_change_the_steps(origin: float, length: float, steps: int) -> None:
+    """The contact is as steep as 1/L: difference quotients over a metre would miss it."""
     module = eomc.load(from_scene(parse(FAR, "far.toml")), BUILDS)
-    moved = (29.79659887e-3, 29.79264387e-3)  # over 1000 L; Radau of SciPy to 1e-10
-    for how in ({}, {"stiff": True}):
-        run = module.simulate([at, at], params={"L": length}, **how)
+    expected = (29.79659887e-3, 29.79264387e-3)  # over 1000 L; from SciPy's Radau, to 1e-10
+    for options in ({}, {"stiff": True}):
+        run = module.simulate([origin, origin], params={"L": length}, **options)
         assert run.status == "ok" and run.steps < steps and run.stiff_steps > run.steps / 3
-        far = (run.q[-1] - at) / (1000 * length)
-        assert far / 1000 == pytest.approx(moved, rel=1e-6 if at else 1e-8)
+        scaled = (run.q[-1] - origin) / (1000 * length)
+        assert scaled / 1000 == pytest.approx(expected, rel=1e-6 if origin else 1e-8)
 
 
 RESTS = """eomc = 1
@@ -271,31 +275,31 @@ duration = 300
 """
 
 
-@pytest.mark.parametrize("how", [{"tol": 1e-4}, {}, {"tol": 1e-12}, {"stiff": True}])
+@pytest.mark.parametrize("options", [{"tol": 1e-4}, {}, {"tol": 1e-12}, {"stiff": True}])
 @pytest.mark.parametrize(
     ("name", "potential", "force", "end", "steps"),
     tiers([
         ("sags", "9.81*x + 50*x**2", "-2*x_dot", -0.0981, 2500),
-        # at 1e-4 rounding at rest decides: 230 to 760 over nine starts
+        # at 1e-4 rounding at rest decides: 230 to 760 steps from nine starts
         ("comes_to_rest", "-9.81*cos(x - 0.2)", "-x_dot/2", 0.2, 1000),
         ("lies", "9.81*x", "max(0, -1e6*x - 1e3*x_dot)", -9.81e-6, 500),
         ("lands", "9.81*x + exp(-x/5e-4)/1000", "-10*x_dot*exp(-x/5e-4)", None, 1000),
     ], "comes_to_rest"),
 )  # fmt: skip
-def test_what_has_come_to_rest_takes_few_steps(
-    name: str, potential: str, force: str, end: float | None, steps: int, how: dict,
+def test_motion_that_comes_to_rest_takes_few_steps(
+    name: str, potential: str, force: str, end: float | None, steps: int, options: dict,
     modules: Modules,
 ) -> None:  # fmt: skip
-    """There a velocity is rounding of the position: by parts of it, steps were 1e5 and more."""
+    """Regression: at rest a velocity is rounding of the position; steps relative to it were 1e5."""
     text = RESTS.format(name=name, potential=potential, force=force)
-    run = modules.unoptimised(text).simulate(**how)
+    run = modules.unoptimised(text).simulate(**options)
     assert run.status == "ok" and run.steps + run.rejected < steps
     if end is None:  # where exp(-x/L) = 9.81 1000 L
         end = -5e-4 * np.log(9.81 * 0.5)
     assert run.q[-1, 0] == pytest.approx(end, rel=1e-12)
 
 
-def test_a_stiff_controller_with_limits_is_seen() -> None:
+def test_stiff_controller_with_saturation_takes_stiff_steps() -> None:
     text = """eomc = 1
 name = "stiffly_held"
 [coordinates]
@@ -318,13 +322,15 @@ duration = 10
 
 
 @pytest.mark.parametrize(
-    ("how", "words"),
+    ("options", "message"),
     [
         ({"stiff": "no"}, "stiff: 'no' is not True or False"),
         ({"stiff": True, "h": 0.1}, "h_most and stiff to adaptive ones"),
     ],
 )
-def test_what_stiff_is_not(train: ModuleType, how: dict, words: str) -> None:
+def test_invalid_values_of_stiff_are_refused(
+    train: ModuleType, options: dict, message: str
+) -> None:
     for simulate in (train.simulate, train.simulate_batch):
-        with pytest.raises(ValueError, match=words):
-            simulate(**how)
+        with pytest.raises(ValueError, match=message):
+            simulate(**options)

@@ -1,4 +1,4 @@
-"""Arguments that a compiled module refuses, by name."""
+"""Arguments that a compiled module refuses; the message names the argument."""
 
 from __future__ import annotations
 
@@ -91,39 +91,39 @@ BAD_VALUES = [
 ]
 
 
-def identify(value: Any) -> str | None:
+def identifier_or_none(value: Any) -> str | None:
     return value if isinstance(value, str) and value.isidentifier() else None
 
 
 @pytest.mark.filterwarnings("ignore:.*Python function")
-def test_a_control_law_of_other_arguments_is_told_what_it_is_called_with(
+def test_feedback_law_with_wrong_signature_is_refused(
     driven: ModuleType,
 ) -> None:
-    """What goes wrong within the law stays as it is."""
-    for law, why in (
+    """Errors raised inside the law stay unchanged."""
+    for law, reason in (
         (lambda t, q: [0.0], "takes 2 positional arguments but 3 were given"),
         (lambda t, q, qd, gain: [0.0], "missing 1 required positional argument: 'gain'"),
     ):
-        with pytest.raises(TypeError, match=rf"^u: is called as u\(t, q, qd\), and .* {why}"):
+        with pytest.raises(TypeError, match=rf"^u: is called as u\(t, q, qd\), and .* {reason}"):
             driven.simulate(steps=2, u=law)
     with pytest.raises(TypeError, match=r"^unsupported operand"):
         driven.simulate(steps=2, u=lambda t, q, qd: [t + "x"])
 
 
 @pytest.mark.parametrize("t", ["a", "0.001", [0.0, "a"], 1j, {}, [[0.0], [0.0, 0.0]]])
-def test_times_of_a_run_that_are_none_are_told(driven: ModuleType, t: Any) -> None:
+def test_invalid_times_of_a_run_are_refused(driven: ModuleType, t: Any) -> None:
     run = driven.simulate(steps=2)
     with pytest.raises(ValueError, match=f"^t: {re.escape(repr(t))} is not an array of numbers"):
         run(t)
     assert run(0.001)[0].shape == (2,) and run([0, 0.001])[0].shape == (2, 2)
 
 
-@pytest.mark.parametrize(("name", "place", "how", "words"), BAD_VALUES, ids=identify)
-def test_a_wrong_argument_is_named(
-    driven: ModuleType, name: str, place: Any, how: Any, words: str
+@pytest.mark.parametrize(("name", "args", "options", "message"), BAD_VALUES, ids=identifier_or_none)
+def test_invalid_argument_is_named(
+    driven: ModuleType, name: str, args: Any, options: Any, message: str
 ) -> None:
-    with pytest.raises(ValueError, match="(?s)^" + words):
-        getattr(driven, name)(*place, **how)
+    with pytest.raises(ValueError, match="(?s)^" + message):
+        getattr(driven, name)(*args, **options)
 
 
 BAD_RUNS = [
@@ -183,15 +183,15 @@ BAD_RUNS = [
 ]
 
 
-# the words as names: a function's own differ from process to process
-@pytest.mark.parametrize(("how", "words"), BAD_RUNS, ids=[words for _, words in BAD_RUNS])
-def test_a_wrong_argument_of_a_run_is_named(driven: ModuleType, how: Any, words: str) -> None:
+# the messages are the ids: the repr of a function differs between processes
+@pytest.mark.parametrize(("options", "words"), BAD_RUNS, ids=[words for _, words in BAD_RUNS])
+def test_invalid_argument_of_a_run_is_named(driven: ModuleType, options: Any, words: str) -> None:
     with pytest.raises(ValueError, match="(?s)^" + words):
-        driven.simulate(**how)
+        driven.simulate(**options)
 
 
 @pytest.mark.parametrize("u", [1.0, [], lambda t, q, qd: 0.0])
-def test_a_scene_without_inputs_takes_none(cartpole: ModuleType, u: Any) -> None:
+def test_inputs_are_refused_by_a_scene_without_inputs(cartpole: ModuleType, u: Any) -> None:
     for call in (cartpole.tau, cartpole.acceleration, cartpole.step):
         with pytest.raises(ValueError, match=r"^u: this scene has no inputs"):
             call(Q, QD, u=u)
@@ -199,7 +199,7 @@ def test_a_scene_without_inputs_takes_none(cartpole: ModuleType, u: Any) -> None
         cartpole.simulate(u=u)
 
 
-def test_a_scene_without_parameters_says_so(modules: Modules) -> None:
+def test_params_are_refused_by_a_scene_without_parameters(modules: Modules) -> None:
     text = 'eomc = 1\nname = "bare"\n[coordinates]\nx = { start = 1 }\n[energy]\n'
     m: Any = modules.unoptimised(text + 'kinetic = "x_dot**2"\n[run]\nbatch = true\n')
     for simulate in (m.simulate, m.simulate_batch):
@@ -209,41 +209,41 @@ def test_a_scene_without_parameters_says_so(modules: Modules) -> None:
             simulate(steps=1, params=[1, 2])
 
 
-def test_another_scenes_params_are_refused(cartpole: ModuleType, modules: Modules) -> None:
+def test_params_of_another_scene_are_refused(cartpole: ModuleType, modules: Modules) -> None:
     with pytest.raises(ValueError, match=r"^params: these are another scene's: m, l, g"):
         cartpole.D(Q, params=modules("simple_pendulum").Params())
 
 
-def test_velocities_left_out_are_refused_not_read_from_nowhere() -> None:
-    """In a process of its own: a null pointer would end this one."""
-    tries = "\n".join(
+def test_missing_velocities_are_refused() -> None:
+    """Run in a separate process: a null pointer would crash this one."""
+    calls = "\n".join(
         f"try: m.{name}([0.0, 1.0], None)\n"
         "except ValueError as e: assert str(e).startswith('qd:')\n"
         f"else: raise SystemExit('{name} took None')"
         for name in ("C", "bias", "tau", "kinetic_energy", "energy", "jacobi", "power", "signal")
     )
     code = f"import eomc\nm = eomc.load({str(SCENES / 'cartpole_driven.toml')!r}, {str(MODULES)!r})"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}\n{tries}"], capture_output=True, text=True
+    process = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{calls}"], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr or f"ended by signal {-done.returncode}"
+    assert process.returncode == 0, process.stderr or f"ended by signal {-process.returncode}"
 
 
-def test_too_many_rows_are_reported_before_the_run(cartpole: ModuleType) -> None:
+def test_too_many_rows_are_refused_before_the_run(cartpole: ModuleType) -> None:
     with pytest.raises(MemoryError, match=r"rows of 4 numbers don't fit in memory.*every="):
         cartpole.simulate(steps=10**15)
 
 
-def test_masks_may_be_in_the_middle_of_their_import(
+def test_partially_imported_numpy_ma_is_tolerated(
     driven: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By another thread: NumPy imports them when they are first asked for."""
+    """Another thread may be importing it: NumPy imports it on first use."""
     monkeypatch.setitem(sys.modules, "numpy.ma", ModuleType("numpy.ma"))
     assert driven.D(np.array(Q)).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("options", "message"),
     [
         ({"tols": 1e-9}, "simulate has no argument 'tols'; did you mean 'tol'?"),
         ({"t": 10}, "simulate has no argument 't'; did you mean 'duration'?"),
@@ -254,8 +254,8 @@ def test_masks_may_be_in_the_middle_of_their_import(
         ({"zzz": 1, "events": {"a": "x"}}, "'zzz': it has q0, qd0, h, "),
     ],
 )
-def test_an_argument_that_is_not_there_is_told_with_what_is_meant(
-    driven: ModuleType, given: dict[str, Any], words: str
+def test_unknown_argument_is_refused_with_a_suggestion(
+    driven: ModuleType, options: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(TypeError, match=re.escape(words)):
-        driven.simulate(**given)
+    with pytest.raises(TypeError, match=re.escape(message)):
+        driven.simulate(**options)

@@ -1,4 +1,4 @@
-"""Events that a call asks for, besides those of the scene."""
+"""Events passed to a call, in addition to those of the scene."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from eomc import pipeline
 from eomc.base.errors import EomcError
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
-TOL = 1e-9  # of a scene with events that names none
-# compiled once for all tests: two that record, and one each that stops and jumps where it is told
-BESIDE = {
+TOL = 1e-9  # default tolerance of a scene with events
+# compiled once for all tests: two record, one stops and one jumps at a threshold parameter
+EVENTS = {
     "section": {"when": "x", "direction": "rising"},
     "through": "x - 0.5",
     "wall": {"when": "x - at_wall", "action": "stop"},
@@ -63,98 +63,104 @@ def oscillator(scene: Path) -> ModuleType:
     return eomc.load(scene, scene.parent / "build")
 
 
-def test_they_stand_beside_the_scene_s(oscillator: ModuleType) -> None:
-    run = oscillator.simulate(events=BESIDE)
+def test_added_events_are_detected_with_those_of_the_scene(oscillator: ModuleType) -> None:
+    run = oscillator.simulate(events=EVENTS)
     assert run.events["section"].t == pytest.approx((np.arange(3) + 0.75) * math.pi, abs=TOL)
     assert run.events["turns"].t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
     assert "section" not in oscillator.simulate().events
 
 
-def test_a_warning_points_to_the_caller_s_line(oscillator: ModuleType) -> None:
-    """Of a run and of a batch, which another module makes; its own estimate's too."""
+def test_warning_points_to_the_line_of_the_caller(oscillator: ModuleType) -> None:
+    """Warnings of a run, of a batch and of an error estimate."""
     never = {"never": "x - 5"}
     stiff = {"params": {"k": 1e6}, "h": 0.0029, "events": never}
-    ways = (
+    calls = (
         lambda: oscillator.simulate(steps=50, **stiff),
         lambda: oscillator.simulate_batch(steps=50, **stiff | {"h": 0.003}),
         lambda: oscillator.simulate(h=0.5, duration=0.2, events=never),
         lambda: oscillator.simulate(h=0.4, duration=30, estimate=True, events=never),
     )
-    for way in ways:
-        with pytest.warns(RuntimeWarning) as said:
-            way()
-        assert {(w.filename, w.lineno) for w in said} == {(__file__, way.__code__.co_firstlineno)}
+    for call in calls:
+        with pytest.warns(RuntimeWarning) as warnings:
+            call()
+        assert {(w.filename, w.lineno) for w in warnings} == {
+            (__file__, call.__code__.co_firstlineno)
+        }
 
 
-def test_a_formula_alone_records_both_ways(oscillator: ModuleType) -> None:
-    run = oscillator.simulate(duration=math.pi, events=BESIDE)
+def test_formula_alone_records_both_directions(oscillator: ModuleType) -> None:
+    run = oscillator.simulate(duration=math.pi, events=EVENTS)
     assert run.events["through"].t == pytest.approx([math.pi / 6, 5 * math.pi / 6], abs=TOL)
-    ways = (oscillator.Params(k=15), {"k": 15})  # parameters of the module serve
-    for params in ways:
-        run = oscillator.simulate(duration=0.5, params=params, events=BESIDE)
+    # parameters of the module's own class work too
+    parameter_sets = (oscillator.Params(k=15), {"k": 15})
+    for params in parameter_sets:
+        run = oscillator.simulate(duration=0.5, params=params, events=EVENTS)
         assert run.events["through"].t == pytest.approx([math.pi / 12], abs=TOL)
 
 
-def test_they_stop_and_jump(oscillator: ModuleType) -> None:
-    stop = {"params": {"at_wall": -0.5}, "events": BESIDE}
-    run = oscillator.simulate(**stop)
+def test_added_events_can_stop_and_jump(oscillator: ModuleType) -> None:
+    options = {"params": {"at_wall": -0.5}, "events": EVENTS}
+    run = oscillator.simulate(**options)
     assert run.stopped == "wall" and run.t[-1] == pytest.approx(math.pi / 3, abs=TOL)
-    both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **stop)
-    assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
-    assert both.stopped.tolist() == ["wall", ""] and both.events["wall"].instance.tolist() == [0]
-    assert both.events["turns"].for_instance(1).t == pytest.approx(
+    batch = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **options)
+    assert batch.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
+    assert batch.stopped.tolist() == ["wall", ""] and batch.events["wall"].instance.tolist() == [0]
+    assert batch.events["turns"].for_instance(1).t == pytest.approx(
         (np.arange(3) + 0.5) * math.pi, abs=TOL
     )
-    run = oscillator.simulate(duration=3.0, params=oscillator.Params(at_drop=0), events=BESIDE)
+    run = oscillator.simulate(duration=3.0, params=oscillator.Params(at_drop=0), events=EVENTS)
     assert run["m"][-1] == 4 and run["c"][-1] == 4
 
 
-def test_they_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
-    made = scene.parent / "build" / "oscillator" / ".events"
+def test_added_events_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
+    folder = scene.parent / "build" / "oscillator" / ".events"
 
-    def dates() -> dict[Path, int]:
-        return {f: f.stat().st_mtime_ns for f in made.glob("*/oscillator/_oscillator_*")}
+    def modification_times() -> dict[Path, int]:
+        return {f: f.stat().st_mtime_ns for f in folder.glob("*/oscillator/_oscillator_*")}
 
-    oscillator.simulate(duration=1.0, events=BESIDE)
-    before = dates()
-    oscillator._model.extensions.clear()  # as in another process
-    run = oscillator.simulate(duration=1.0, events=BESIDE)
-    assert len(run.events["through"]) == 1 and dates() == before != {}
+    oscillator.simulate(duration=1.0, events=EVENTS)
+    first = modification_times()
+    oscillator._model.extensions.clear()  # simulates a new process
+    run = oscillator.simulate(duration=1.0, events=EVENTS)
+    assert len(run.events["through"]) == 1 and modification_times() == first != {}
     assert pickle.loads(pickle.dumps(run)).events["through"].t == run.events["through"].t
 
 
 @pytest.mark.usefixtures("no_warnings")
-def test_a_saved_run_is_loaded_with_them(oscillator: ModuleType, tmp_path: Path) -> None:
-    """Here, and as in another process; between rows its state jumps."""
-    how = {"params": {"at_drop": 0}, "events": BESIDE}
-    runs = oscillator.simulate(**how), oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **how)
+def test_saved_run_with_events_is_loaded(oscillator: ModuleType, tmp_path: Path) -> None:
+    """In this process and as if in another; the state jumps between rows."""
+    options = {"params": {"at_drop": 0}, "events": EVENTS}
+    runs = (
+        oscillator.simulate(**options),
+        oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **options),
+    )
     times = [1.0, 2.0, 3.0]
     for k, run in enumerate(runs):
         run.save(tmp_path / f"{k}.npz")
     for _ in range(2):
         for k, run in enumerate(runs):
-            again = oscillator.load_run(tmp_path / f"{k}.npz")
-            assert again == run and list(again.events) == ["turns", *BESIDE]
-            np.testing.assert_array_equal(again.events["drop"].t, run.events["drop"].t)
+            loaded = oscillator.load_run(tmp_path / f"{k}.npz")
+            assert loaded == run and list(loaded.events) == ["turns", *EVENTS]
+            np.testing.assert_array_equal(loaded.events["drop"].t, run.events["drop"].t)
             if not k:
-                assert np.array_equal(again(times), run(times)) and again(2.0)[0][2] == 4
+                assert np.array_equal(loaded(times), run(times)) and loaded(2.0)[0][2] == 4
         oscillator._model.extensions.clear()
 
 
-def test_a_saved_run_without_the_scene_is_told_how(
+def test_saved_run_without_its_scene_is_refused_with_advice(
     oscillator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "run.npz"
-    oscillator.simulate(duration=1.0, events=BESIDE).save(file)
+    oscillator.simulate(duration=1.0, events=EVENTS).save(file)
     oscillator._model.extensions.clear()
     monkeypatch.setattr(oscillator._model, "source", None)
-    with pytest.raises(EomcError, match=r"load it with eomc\.load") as fault:
+    with pytest.raises(EomcError, match=r"load it with eomc\.load") as error:
         oscillator.load_run(file)
-    assert "numpy.load reads its rows" in fault.value.__notes__[0]
+    assert "numpy.load reads its rows" in error.value.__notes__[0]
 
 
 @pytest.mark.parametrize(
-    ("events", "words"),
+    ("events", "message"),
     [
         ({"a": "y"}, "a.when: 'y' is not declared"),
         ({"a": "x", "b": {"when": "x", "action": "jmp"}}, "b.action: unknown action 'jmp'"),
@@ -166,40 +172,40 @@ def test_a_saved_run_without_the_scene_is_told_how(
         (["x"], "give a dict"),
     ],
 )  # fmt: skip
-def test_a_fault_is_named(oscillator: ModuleType, events: dict, words: str) -> None:
-    with pytest.raises(EomcError, match=r"simulate\(events=\)") as fault:
+def test_invalid_event_is_named(oscillator: ModuleType, events: dict, message: str) -> None:
+    with pytest.raises(EomcError, match=r"simulate\(events=\)") as error:
         oscillator.simulate(events=events)
-    assert words in str(fault.value)
+    assert message in str(error.value)
 
 
-def test_a_scene_that_is_not_there_or_another_is_told(
+def test_missing_or_changed_scene_is_reported(
     oscillator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tmp_path / "oscillator.toml"
     other.write_text(TEXT.replace("k = 3", "k = 5"))
-    for source, words in (
+    for source, message in (
         (tmp_path / "gone.toml", r"gone\.toml: can't be read \(No such file"),
         (other, "has changed since it was built: load it again"),
         (None, r"load it with eomc\.load"),
     ):
         monkeypatch.setattr(oscillator._model, "source", source)
-        with pytest.raises(EomcError, match=words):
+        with pytest.raises(EomcError, match=message):
             oscillator.simulate(events={"a": "x"})
 
 
-def test_a_folder_that_can_t_be_written_is_named(
+def test_unwritable_folder_is_named(
     oscillator: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*_: object, **__: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr(Path, "mkdir", refused)
+    monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(EomcError, match=r"oscillator\.toml: can't be written \(Read-only"):
         oscillator.simulate(events={"later": "x - 0.125"})
 
 
-def swinging() -> eomc.System:
-    """A pendulum of dynamicsymbols, whose own event is its turning."""
+def pendulum() -> eomc.System:
+    """A pendulum of dynamicsymbols with an event of its own, the turning point."""
     theta, (w, d, low, brake) = dynamicsymbols("theta"), sympy.symbols("w d low brake")
     return eomc.System.make(
         "swinging", {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
@@ -209,8 +215,8 @@ def swinging() -> eomc.System:
     )  # fmt: skip
 
 
-def beside_its_own() -> dict:
-    """Two that record, and one each that stops and jumps where it is told."""
+def pendulum_events() -> dict:
+    """Two events record, one stops and one jumps at a threshold parameter."""
     theta, d, brake = dynamicsymbols("theta"), sympy.Symbol("d"), sympy.Symbol("brake")
     return {
         "down": {"when": theta, "direction": "rising"},
@@ -222,49 +228,49 @@ def beside_its_own() -> dict:
 
 @pytest.fixture(scope="module")
 def systems(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where modules of Systems are built."""
+    """Folder for modules of Systems."""
     return tmp_path_factory.mktemp("systems")
 
 
-def test_a_system_has_them_beside_its_own(systems: Path) -> None:
-    made, beside = swinging(), beside_its_own()
-    m = eomc.load(made, systems)
-    assert made == swinging() and pickle.loads(pickle.dumps(made)) == made
-    run = m.simulate(events=beside)
+def test_added_events_of_a_system_are_detected_with_its_own(systems: Path) -> None:
+    system, events = pendulum(), pendulum_events()
+    m = eomc.load(system, systems)
+    assert system == pendulum() and pickle.loads(pickle.dumps(system)) == system
+    run = m.simulate(events=events)
     assert run.events["down"].t == pytest.approx((np.arange(3) + 0.75) * math.pi, abs=TOL)
     assert run.events["turns"].t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
     assert run.events["half"].t[0] == pytest.approx(math.pi / 6, abs=TOL)
-    run = m.simulate(duration=2.0, params={"brake": 0.0}, events=beside)
+    run = m.simulate(duration=2.0, params={"brake": 0.0}, events=events)
     assert abs(run.q[-1, 0]) < TOL and run["d"][-1] == 1
-    both = m.simulate_batch([[0.5], [0.1]], tol=1e-9, params={"low": 0.2}, events=beside)
-    assert both.reached == pytest.approx([math.acos(0.4) / 2, 10], abs=TOL)
+    batch = m.simulate_batch([[0.5], [0.1]], tol=1e-9, params={"low": 0.2}, events=events)
+    assert batch.reached == pytest.approx([math.acos(0.4) / 2, 10], abs=TOL)
 
 
 @pytest.mark.usefixtures("no_warnings")
-def test_of_a_system_a_saved_run_finds_them(systems: Path, tmp_path: Path) -> None:
-    m, file = eomc.load(swinging(), systems), tmp_path / "run.npz"
-    run = m.simulate(duration=1.0, events=beside_its_own())
+def test_saved_run_of_a_system_needs_the_events_again(systems: Path, tmp_path: Path) -> None:
+    m, file = eomc.load(pendulum(), systems), tmp_path / "run.npz"
+    run = m.simulate(duration=1.0, events=pendulum_events())
     run.save(file)
-    again = m.load_run(file)
-    assert again == run and again.events["half"].t == run.events["half"].t
+    loaded = m.load_run(file)
+    assert loaded == run and loaded.events["half"].t == run.events["half"].t
     m._model.extensions.clear()
     with pytest.raises(ValueError, match=r"which files don't keep: call swinging\.simulate\(ev"):
         m.load_run(file)
 
 
-def test_of_a_system_they_are_compiled_once(systems: Path) -> None:
-    dates = []
-    for _ in range(2):  # as in another process
-        m = eomc.load(swinging(), systems)
+def test_events_of_a_system_are_compiled_once(systems: Path) -> None:
+    modification_times = []
+    for _ in range(2):  # simulates a new process
+        m = eomc.load(pendulum(), systems)
         m._model.extensions.clear()
-        m.simulate(duration=1.0, events=beside_its_own())
+        m.simulate(duration=1.0, events=pendulum_events())
         (extension,) = systems.glob("swinging/.events/*/swinging/_swinging_*")
-        dates.append(extension.stat().st_mtime_ns)
-    assert dates[0] == dates[1]
+        modification_times.append(extension.stat().st_mtime_ns)
+    assert modification_times[0] == modification_times[1]
 
 
 @pytest.mark.parametrize(
-    ("events", "words"),
+    ("events", "message"),
     [
         ({"a": "y"}, r"simulate\(events=\): event a: y not declared"),
         ({"turns": "theta"}, "event turns: 'turns' is an event already"),
@@ -273,19 +279,21 @@ def test_of_a_system_they_are_compiled_once(systems: Path) -> None:
         (["theta"], "give a dict"),
     ],
 )  # fmt: skip
-def test_of_a_system_a_fault_is_named(events: dict, words: str, tmp_path: Path) -> None:
+def test_invalid_event_of_a_system_is_named(events: dict, message: str, tmp_path: Path) -> None:
     info = SimpleNamespace(name="swinging", events=("turns",))
-    m = SimpleNamespace(info=info, source=swinging())
-    with pytest.raises(EomcError, match=words):
+    m = SimpleNamespace(info=info, source=pendulum())
+    with pytest.raises(EomcError, match=message):
         pipeline.with_events(m, events, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_system_that_was_read_or_changed(scene: Path, tmp_path: Path) -> None:
-    own = eomc.read(scene)
-    run = eomc.load(own, tmp_path).simulate(duration=1.0, events=BESIDE)
+def test_system_read_from_a_file_works_and_changed_one_is_refused(
+    scene: Path, tmp_path: Path
+) -> None:
+    system = eomc.read(scene)
+    run = eomc.load(system, tmp_path).simulate(duration=1.0, events=EVENTS)
     assert run.events["through"].t == pytest.approx([math.pi / 6], abs=TOL)
-    for changed in (own.with_parameters({"k": 5.0}), swinging().with_parameters({"w": 1.0})):
+    for changed in (system.with_parameters({"k": 5.0}), pendulum().with_parameters({"w": 1.0})):
         m = SimpleNamespace(name=changed.name, source=changed, events=("turns",))
         with pytest.raises(EomcError, match=r"was changed since .* made it: give"):
-            pipeline.with_events(m, BESIDE, tmp_path)
+            pipeline.with_events(m, EVENTS, tmp_path)

@@ -1,4 +1,4 @@
-"""Files that are written are whole: where that fails the old one stays, and nothing else."""
+"""Files are replaced atomically: if writing fails, the old file stays and no part is left."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BEGINNINGS = {
 SCENE = '# a scene\neomc = 1\nname = "kept"\n'
 
 
-SLOW = ("run.png", "run.pdf", "run.gif")  # which write as the others do
+SLOW = ("run.png", "run.pdf", "run.gif")  # they use the same writer as the others
 WRITERS: dict[str, Callable[[Any, Path], Any]] = {
     "run.csv": lambda run, file: run.save(file),
     "run.npz": lambda run, file: run.save(file),
@@ -51,37 +51,39 @@ def _figure(run: Any, file: Path) -> None:
     plot.write_figure(system, plot.RunCurves(run.t, run.q, run.qd, run.energy), file)
 
 
-def limit() -> None:
-    """As `ulimit -f`: no file has more than 200 bytes."""
-    sys.dont_write_bytecode = True  # which Python then leaves cut
+def limit_file_size() -> None:
+    """Like `ulimit -f`: limit the size of files to 200 bytes."""
+    sys.dont_write_bytecode = True  # Python would leave truncated ones
     resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
 
 
 @pytest.fixture(scope="module")
 def run(driven: ModuleType) -> Any:
-    done = driven.simulate(Q, QD, steps=10, every=3)
-    assert len(done.outputs) == 0
-    return done
+    result = driven.simulate(Q, QD, steps=10, every=3)
+    assert len(result.outputs) == 0
+    return result
 
 
 @pytest.mark.parametrize("name", tiers(WRITERS, *(n for n in WRITERS if n not in SLOW)))
-def test_on_a_full_disk_the_old_file_stays(name: str, run: Any, tmp_path: Path) -> None:
+def test_full_disk_leaves_the_old_file(name: str, run: Any, tmp_path: Path) -> None:
     file = tmp_path / name
     old = BEGINNINGS.get(file.suffix, "") + OLD
     file.write_text(old, encoding="latin-1")
 
     def write() -> None:
-        limit()
+        limit_file_size()
         WRITERS[name](run, file)
 
-    how, words = in_a_fork(write, 60)
-    assert how == "raised" and "File too large" in str(words), words
+    outcome, error = in_a_fork(write, 60)
+    assert outcome == "raised" and "File too large" in str(error), error
     assert file.read_text(encoding="latin-1") == old
     assert [*tmp_path.iterdir()] == [file]
 
 
 @pytest.mark.parametrize("name", ["run.csv", "run.npz", "run.html", "page.json", "unit.fmu"])
-def test_what_is_whole_takes_its_place_with_its_rights(name: str, run: Any, tmp_path: Path) -> None:
+def test_new_file_replaces_the_old_one_and_keeps_its_mode(
+    name: str, run: Any, tmp_path: Path
+) -> None:
     file = tmp_path / name
     file.write_text(BEGINNINGS.get(file.suffix, "") + OLD, encoding="utf-8")
     file.chmod(0o640)
@@ -91,17 +93,15 @@ def test_what_is_whole_takes_its_place_with_its_rights(name: str, run: Any, tmp_
 
 
 @pytest.mark.parametrize("name", [n for n in WRITERS if n not in ("run.pdf", "run.gif")])
-def test_a_scene_or_a_file_of_another_kind_is_not_replaced(
-    name: str, run: Any, tmp_path: Path
-) -> None:
-    """Whatever its name says, and behind a link too; an empty file is no work of anybody."""
+def test_scene_or_file_of_another_kind_is_not_replaced(name: str, run: Any, tmp_path: Path) -> None:
+    """Whatever the suffix, and through a link too; an empty file may be replaced."""
     file, link = tmp_path / name, tmp_path / f"link{Path(name).suffix}"
     link.symlink_to(file)
     for text in (SCENE, *(["words of another kind"] if file.suffix in BEGINNINGS else [])):
         file.write_text(text, encoding="utf-8")
-        for given in (file, *([link] if name != "scene.c" else [])):
+        for target in (file, *([link] if name != "scene.c" else [])):
             with pytest.raises((EomcError, FileExistsError), match=r"stay|is there already"):
-                WRITERS[name](run, given)
+                WRITERS[name](run, target)
             assert file.read_text(encoding="utf-8") == text
     if name != "scene.c":
         file.write_text("", encoding="utf-8")
@@ -109,29 +109,29 @@ def test_a_scene_or_a_file_of_another_kind_is_not_replaced(
         assert file.stat().st_size
 
 
-def test_a_new_file_on_a_full_disk_is_not_there(run: Any, tmp_path: Path) -> None:
+def test_full_disk_leaves_no_new_file(run: Any, tmp_path: Path) -> None:
     def write() -> None:
-        limit()
+        limit_file_size()
         with pytest.raises(EomcError, match="File too large"):
             files.write_new(tmp_path / "new.toml", "x" * 500)
         cache_texts(tmp_path, "scene", "what", "digest", lambda: {"a": "x" * 500})
         run.save(tmp_path / "run.csv")
 
-    how, words = in_a_fork(write, 60)
-    assert how == "raised" and "File too large" in str(words), words
+    outcome, error = in_a_fork(write, 60)
+    assert outcome == "raised" and "File too large" in str(error), error
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
 
 
-def test_an_interrupt_leaves_the_old_file(tmp_path: Path) -> None:
+def test_interrupt_leaves_the_old_file(tmp_path: Path) -> None:
     file = tmp_path / "a.txt"
     file.write_text(OLD, encoding="utf-8")
-    with pytest.raises(KeyboardInterrupt), atomic_write(file) as new:
-        new.write_text("half", encoding="utf-8")
+    with pytest.raises(KeyboardInterrupt), atomic_write(file) as temporary:
+        temporary.write_text("half", encoding="utf-8")
         raise KeyboardInterrupt
     assert file.read_text(encoding="utf-8") == OLD and [*tmp_path.iterdir()] == [file]
 
 
-def test_a_link_stays_one(tmp_path: Path) -> None:
+def test_link_stays_a_link(tmp_path: Path) -> None:
     file, link = tmp_path / "a.txt", tmp_path / "b" / "link.txt"
     link.parent.mkdir()
     link.symlink_to(file)
@@ -141,17 +141,17 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
     assert [*link.parent.iterdir()] == [link]
 
 
-def test_a_pipe_is_written_itself(tmp_path: Path) -> None:
-    pipe, read = tmp_path / "pipe", list[str]()
+def test_pipe_is_written_directly(tmp_path: Path) -> None:
+    pipe, received = tmp_path / "pipe", list[str]()
     os.mkfifo(pipe)
-    reader = threading.Thread(target=lambda: read.append(pipe.read_text(encoding="utf-8")))
+    reader = threading.Thread(target=lambda: received.append(pipe.read_text(encoding="utf-8")))
     reader.start()
     files.write_text(pipe, "words")
     reader.join(10)
-    assert read == ["words"] and pipe.is_fifo()
+    assert received == ["words"] and pipe.is_fifo()
 
 
-def test_a_protected_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_protected_file_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.txt"
     file.write_text(OLD, encoding="utf-8")
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everything
@@ -160,10 +160,10 @@ def test_a_protected_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert file.read_text(encoding="utf-8") == OLD
 
 
-def test_an_error_names_the_file_that_was_given(run: Any, tmp_path: Path) -> None:
+def test_error_names_the_requested_file(run: Any, tmp_path: Path) -> None:
     for name in ("run.csv", "run.npz"):
         file = tmp_path / "nowhere" / name
-        with pytest.raises(FileNotFoundError) as fault:
+        with pytest.raises(FileNotFoundError) as error:
             run.save(file)
-        assert fault.value.filename == str(file)
-        assert str(fault.value) == f"[Errno 2] No such file or directory: '{file}'"
+        assert error.value.filename == str(file)
+        assert str(error.value) == f"[Errno 2] No such file or directory: '{file}'"

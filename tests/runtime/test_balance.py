@@ -1,4 +1,4 @@
-"""Where a run's energy went: against exact integrals, and honest where rows are far apart."""
+"""The energy balance of a run, against exact integrals; coarse rows leave it unresolved."""
 
 from __future__ import annotations
 
@@ -89,34 +89,34 @@ EXACT = {"h": 0.0005, "duration": 10.0}
 
 @pytest.fixture
 def pushed(modules: Modules) -> ModuleType:
-    """A mass on a damped spring, with an input and a force that moves with time."""
+    """A mass on a damped spring, with an input and a time-dependent force."""
     return modules.unoptimised(SPRING)
 
 
 @pytest.mark.slow
-def test_a_damped_spring_loses_what_is_exact(pushed: ModuleType) -> None:
-    """x = e^(-d t) (cos w t + d/w sin w t), d = c/2: all that is lost is the fall of the energy."""
+def test_dissipation_of_a_damped_spring_is_exact(pushed: ModuleType) -> None:
+    """x = e^(-d t) (cos w t + d/w sin w t), d = c/2: what is dissipated is the energy's fall."""
     d, T = 0.2, 10.0
     w = math.sqrt(4 - d**2)
     x = math.exp(-d * T) * (math.cos(w * T) + d / w * math.sin(w * T))
     v = -math.exp(-d * T) * 4 / w * math.sin(w * T)
-    lost = 2 - (v**2 / 2 + 2 * x**2)
+    dissipated = 2 - (v**2 / 2 + 2 * x**2)
     balance = pushed.simulate().balance()
     assert balance.is_resolved and balance.inputs == balance.forces == 0
-    assert abs(balance.dissipated - lost) < 1e-6
-    assert abs(pushed.simulate(**EXACT).balance().dissipated - lost) < 1e-12
-    assert balance.words.startswith(f"{lost:.3g} J were lost; numerical error 1")
+    assert abs(balance.dissipated - dissipated) < 1e-6
+    assert abs(pushed.simulate(**EXACT).balance().dissipated - dissipated) < 1e-12
+    assert balance.words.startswith(f"{dissipated:.3g} J were lost; numerical error 1")
 
 
-def test_inputs_and_forces_are_told_apart(pushed: ModuleType) -> None:
-    """A constant push does u (x(T) - x(0)); the signal's default does nothing."""
-    still = pushed.simulate(params={"a": 0.7}).balance()
+def test_work_of_inputs_and_of_forces_are_separate(pushed: ModuleType) -> None:
+    """The work of a constant force u is u (x(T) - x(0)); the default signal does none."""
+    without_input = pushed.simulate(params={"a": 0.7}).balance()
     run = pushed.simulate(params={"a": 0.7}, u=[3.0])
     balance = run.balance()
-    rows = pushed.simulate(**EXACT, params={"a": 0.7})
-    assert still.inputs == 0
-    assert still.forces == pytest.approx(
-        trapezoid(0.7 * np.cos(rows.t) * rows.qd[:, 0], rows.t), rel=1e-5
+    fine = pushed.simulate(**EXACT, params={"a": 0.7})
+    assert without_input.inputs == 0
+    assert without_input.forces == pytest.approx(
+        trapezoid(0.7 * np.cos(fine.t) * fine.qd[:, 0], fine.t), rel=1e-5
     )
     assert balance.inputs == pytest.approx(3 * (run.q[-1, 0] - run.q[0, 0]), rel=1e-6)
     change = run.energy[-1] - run.energy[0]
@@ -126,41 +126,43 @@ def test_inputs_and_forces_are_told_apart(pushed: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("params", [{}, {"c": 2.0, "a": 5.0}])
-def test_what_is_left_is_the_error_of_the_method(
+def test_balance_error_is_the_error_of_the_method(
     pushed: ModuleType, params: dict[str, float]
 ) -> None:
-    """It falls by sixteen and more where h is halved, and is that of the energy along the run."""
-    left = [pushed.simulate(h=h, duration=8.0, params=params).balance() for h in (0.04, 0.02, 0.01)]
-    assert all(b.error > 10 * b.uncertainty for b in left)
-    for one, other in pairwise(left):
-        assert 14 < one.error / other.error < 40
+    """It falls by 16 or more where h is halved and equals the energy error along the run."""
+    balances = [
+        pushed.simulate(h=h, duration=8.0, params=params).balance() for h in (0.04, 0.02, 0.01)
+    ]
+    assert all(b.error > 10 * b.uncertainty for b in balances)
+    for coarse, fine in pairwise(balances):
+        assert 14 < coarse.error / fine.error < 40
 
 
 @pytest.mark.parametrize("rows", [20, 33, 60, 100, 200, 500, 3000])
-@pytest.mark.parametrize("sharp", [1.0, 10.0, 300.0])
-def test_an_integral_is_off_by_no_more_than_is_said(rows: int, sharp: float) -> None:
-    """Of cos t tanh(sharp sin t) over ten seconds: a friction that is or is not resolved."""
+@pytest.mark.parametrize("sharpness", [1.0, 10.0, 300.0])
+def test_quadrature_error_is_bounded_by_the_uncertainty(rows: int, sharpness: float) -> None:
+    """Integrate cos t tanh(sharpness sin t) over 10 s: friction that is resolved or unresolved."""
 
-    def exact(t: np.ndarray) -> np.ndarray:
-        return np.log(np.cosh(sharp * np.sin(t))) / sharp
+    def integral(t: np.ndarray) -> np.ndarray:
+        return np.log(np.cosh(sharpness * np.sin(t))) / sharpness
 
-    t = np.minimum(np.arange(rows + 1) * 10 / (rows - 0.6), 10.0)  # the last step is a shorter one
-    sums, unsure = work(t, np.cos(t) * np.tanh(sharp * np.sin(t)))
-    assert np.max(np.abs(sums - exact(t))) <= unsure + 1e-15  # rounding
-    assert unsure < 1e-7 or sharp > 1 or rows < 200
+    t = np.minimum(np.arange(rows + 1) * 10 / (rows - 0.6), 10.0)  # the last step is shorter
+    sums, uncertainty = work(t, np.cos(t) * np.tanh(sharpness * np.sin(t)))
+    assert np.max(np.abs(sums - integral(t))) <= uncertainty + 1e-15  # rounding
+    assert uncertainty < 1e-7 or sharpness > 1 or rows < 200
 
 
-def test_of_few_steps_nothing_is_told(pushed: ModuleType) -> None:
+def test_balance_of_too_few_steps_is_unresolved(pushed: ModuleType) -> None:
     balance = pushed.simulate(h=0.9, steps=12).balance()
     assert not balance.is_resolved
     assert balance.words == "steps are too long to tell what was put in and what was lost"
 
 
-def test_rows_that_were_not_kept_are_made_again(pushed: ModuleType) -> None:
+def test_rows_that_were_not_stored_are_recomputed(pushed: ModuleType) -> None:
     assert pushed.simulate(every=50).balance() == pushed.simulate().balance()
 
 
-def test_a_conservative_run_has_its_error_only(cartpole: ModuleType) -> None:
+def test_balance_of_a_conservative_run_is_its_energy_error(cartpole: ModuleType) -> None:
     run = cartpole.simulate()
     balance = run.balance()
     assert (balance.inputs, balance.forces, balance.dissipated) == (0, 0, 0)
@@ -171,15 +173,15 @@ def test_a_conservative_run_has_its_error_only(cartpole: ModuleType) -> None:
     assert not cartpole._model.functions.has_power
 
 
-def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Modules) -> None:
+def test_balance_of_jacobis_integral_is_reported(modules: Modules) -> None:
     run = modules("kapitza_pendulum").simulate(duration=2.0)
     balance = run.balance()
     assert balance.forces == pytest.approx(run.jacobi[-1] - run.jacobi[0], abs=2 * balance.error)
     assert balance.is_resolved and balance.error < 1e-7 and balance.dissipated == 0
 
 
-def test_a_potential_that_moves_with_time_puts_in_what_it_does(modules: Modules) -> None:
-    """x'' = -cos(t): Jacobi's integral is the energy, which depends on time all the same."""
+def test_time_dependent_potential_does_work(modules: Modules) -> None:
+    """x'' = -cos(t): Jacobi's integral equals the energy, which nevertheless varies with time."""
     scene = """
 eomc = 1
 name = "swayed"
@@ -193,10 +195,10 @@ h = 0.01
 duration = 2.0
 batch = true
 """
-    swayed = modules.unoptimised(scene)
-    run = swayed.simulate()
+    module = modules.unoptimised(scene)
+    run = module.simulate()
     assert np.array_equal(run.jacobi, run.energy) and abs(run.energy[-1]) > 0.1
-    runs = swayed.simulate_batch([[0.0], [0.5]])
+    runs = module.simulate_batch([[0.0], [0.5]])
     assert np.array_equal(runs.jacobi, runs.energy)
     balance = run.balance()
     assert balance.is_resolved and balance.error < 1e-9
@@ -209,7 +211,7 @@ def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
 
 @pytest.mark.filterwarnings("ignore:.*a Python function")
 @pytest.mark.parametrize(
-    "how",
+    "options",
     [
         {"u": np.sin(np.arange(20.0) ** 2)[:, None]},
         {"u": np.sin(np.arange(20.0) ** 2)[:, None], "times": np.linspace(0, 0.4, 11)},
@@ -219,34 +221,40 @@ def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
         {"u": law, "control_period": 0.06, "times": np.linspace(0, 0.4, 8)},
     ],
 )
-def test_work_of_inputs_that_are_held_is_told(pushed: ModuleType, how: dict[str, Any]) -> None:
-    """Over a step an input does u (x' - x), but for the method's error in x."""
-    run = pushed.simulate(**{"steps": 20} if "times" not in how else {"h": 0.02}, **how)
+def test_work_of_inputs_held_constant_is_reported(
+    pushed: ModuleType, options: dict[str, Any]
+) -> None:
+    """Over a step the work of an input is u (x' - x), up to the method's error in x."""
+    run = pushed.simulate(**{"steps": 20} if "times" not in options else {"h": 0.02}, **options)
     balance, ends = run.balance(), run(0.02 * np.arange(21))[0][:, 0]
-    u = np.repeat(how["u"], 20 // len(how["u"])) if how["u"] is not law else run.u[:-1, 0]
-    if how["u"] is law and "times" in how:
-        u = pushed.simulate(steps=20, **how | {"times": None}).u[:-1, 0]
+    u = (
+        np.repeat(options["u"], 20 // len(options["u"]))
+        if options["u"] is not law
+        else run.u[:-1, 0]
+    )
+    if options["u"] is law and "times" in options:
+        u = pushed.simulate(steps=20, **options | {"times": None}).u[:-1, 0]
     assert balance.is_resolved and balance.error < 1e-7
     assert balance.inputs == pytest.approx(np.sum(u * np.diff(ends)), abs=2 * balance.error)
     assert 0 < balance.dissipated < 1 and balance.uncertainty < 1e-3 * balance.error
 
 
-def test_work_of_inputs_that_a_period_holds_is_told_by_a_tolerance(falling: ModuleType) -> None:
+def test_work_of_zero_order_hold_inputs_in_adaptive_runs(falling: ModuleType) -> None:
     periods = np.array([0.0, 0.15, 0.3, 0.4])
-    for rows in ({"duration": 0.4}, {"times": periods}):
-        run = falling.simulate(u=law, control_period=0.15, params={"c": 0.2}, **rows)
+    for options in ({"duration": 0.4}, {"times": periods}):
+        run = falling.simulate(u=law, control_period=0.15, params={"c": 0.2}, **options)
         u = run.u[np.searchsorted(run.t, periods[:-1]), 0]
         work = np.sum(u * np.diff(run(periods)[0][:, 0]))
-        balance, gained = run.balance(), run.energy[-1] - run.energy[0]
+        balance, change = run.balance(), run.energy[-1] - run.energy[0]
         assert balance.is_resolved and balance.inputs == pytest.approx(work, abs=1e-11)
-        assert balance.inputs - balance.dissipated == pytest.approx(gained, abs=1e-11)
+        assert balance.inputs - balance.dissipated == pytest.approx(change, abs=1e-11)
 
 
 @pytest.mark.parametrize("times", [None, [0.0, 0.3, 1.5]])
-def test_impacts_within_periods_are_told_too(
+def test_impacts_within_control_periods_are_balanced(
     falling: ModuleType, times: list[float] | None
 ) -> None:
-    """A force that is held does F (y' - y) also where it bounces; impacts take their part of K."""
+    """A constant force does F (y' - y) across impacts too; impacts dissipate their part of K."""
     run = falling.simulate(u=law, control_period=0.15, duration=1.5, times=times)
     balance, impacts = run.balance(), run.events["impact"]
     periods = np.array([*(0.15 * np.arange(10)), 1.5])
@@ -257,65 +265,65 @@ def test_impacts_within_periods_are_told_too(
     assert balance.jumps == pytest.approx(jumps, abs=1e-11)
 
 
-def test_that_of_a_run_that_is_cut_off_goes_no_further(falling: ModuleType) -> None:
-    def until(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
+def test_balance_of_an_interrupted_run_ends_at_its_last_row(falling: ModuleType) -> None:
+    def interrupting_law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
         if t > 1.0:
             raise KeyboardInterrupt
         return law(t, q, qd)
 
     times = np.linspace(0, 1.5, 16)
-    with pytest.raises(falling.Interrupted) as cut:
-        falling.simulate(u=until, control_period=0.15, times=times)
-    run = cut.value.run
-    whole = falling.simulate(u=law, control_period=0.15, duration=float(run.t[-1]))
+    with pytest.raises(falling.Interrupted) as interruption:
+        falling.simulate(u=interrupting_law, control_period=0.15, times=times)
+    run = interruption.value.run
+    full_run = falling.simulate(u=law, control_period=0.15, duration=float(run.t[-1]))
     assert run.t[-1] < 1.1 and len(run.events["impact"].t) > 0
-    assert run.balance().inputs == pytest.approx(whole.balance().inputs, abs=1e-9)
-    assert run.balance().jumps == pytest.approx(whole.balance().jumps, abs=1e-9)
+    assert run.balance().inputs == pytest.approx(full_run.balance().inputs, abs=1e-9)
+    assert run.balance().jumps == pytest.approx(full_run.balance().jumps, abs=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore:.*ever sooner")
 @pytest.mark.parametrize(
-    ("how", "status"),
+    ("options", "status"),
     [
-        ({"params": {"at": 0.3}, "duration": 0.4}, "ok"),  # where a period ends
-        ({"params": {"e": 0.5, "at": 1.0}, "duration": 3.0}, "accumulated"),  # and the run
+        ({"params": {"at": 0.3}, "duration": 0.4}, "ok"),  # at the end of a period
+        ({"params": {"e": 0.5, "at": 1.0}, "duration": 3.0}, "accumulated"),  # and of the run
     ],
 )
-def test_jumps_where_a_period_or_the_run_ends_count(
-    falling: ModuleType, how: dict[str, Any], status: str
+def test_jumps_at_the_end_of_a_period_or_run_are_balanced(
+    falling: ModuleType, options: dict[str, Any], status: str
 ) -> None:
-    run = falling.simulate(u=law, control_period=0.15, **how)
-    balance, gained = run.balance(), run.energy[-1] - run.energy[0]
+    run = falling.simulate(u=law, control_period=0.15, **options)
+    balance, change = run.balance(), run.energy[-1] - run.energy[0]
     assert run.status == status and len(run.events["sheds"].t) == 1 and run["m"][-1] == 0.5
-    assert balance.inputs + balance.jumps == pytest.approx(gained, abs=1e-11)
+    assert balance.inputs + balance.jumps == pytest.approx(change, abs=1e-11)
     assert balance.is_resolved and balance.error < 1e-11 and balance.jumps < -1
 
 
 @pytest.mark.filterwarnings("ignore:.*a Python function")
-def test_inputs_that_rows_do_not_tell_have_none(pushed: ModuleType) -> None:
+def test_balance_is_none_where_rows_do_not_determine_inputs(pushed: ModuleType) -> None:
     assert pushed.simulate(steps=20, u=law, every=2).balance() is None
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2, 3, 9])
-def test_short_runs_have_one(pushed: ModuleType, steps: int) -> None:
+def test_short_runs_have_a_balance(pushed: ModuleType, steps: int) -> None:
     balance = pushed.simulate(steps=steps, every=2).balance()
     assert math.isfinite(balance.error) and math.isfinite(balance.uncertainty)
 
 
-def test_a_balance_travels(pushed: ModuleType) -> None:
+def test_balance_can_be_pickled(pushed: ModuleType) -> None:
     balance = pushed.simulate(steps=30).balance()
     assert pickle.loads(pickle.dumps(balance)) == balance
 
 
 @pytest.fixture
 def falling(modules: Modules) -> ModuleType:
-    """A ball that bounces, with a drag, a force, and half of it lost at a time."""
+    """A bouncing ball with drag and a force, which sheds half of its mass at a given time."""
     return modules.unoptimised(FALLING)
 
 
 @pytest.mark.parametrize("times", [None, np.linspace(0.0, 2.0, 21)])
-def test_each_impact_takes_what_is_exact(falling: ModuleType, times: np.ndarray | None) -> None:
-    """(1 - e^2) of the kinetic energy, g e^2k before the impact k; whatever the rows are."""
+def test_energy_lost_in_each_impact_is_exact(falling: ModuleType, times: np.ndarray | None) -> None:
+    """An impact takes (1 - e^2) of the kinetic energy, g e^2k before impact k, in any rows."""
     run = falling.simulate() if times is None else falling.simulate(times=times)
     count = len(run.events["impact"])
     balance = run.balance()
@@ -326,23 +334,23 @@ def test_each_impact_takes_what_is_exact(falling: ModuleType, times: np.ndarray 
     assert pickle.loads(pickle.dumps(balance)) == balance
 
 
-def test_work_between_jumps_is_told_apart(falling: ModuleType) -> None:
-    """With drag and a push, beside SciPy's ends of each fall; the push does F (y(T) - y(0))."""
+def test_work_between_jumps_is_separate_from_jumps(falling: ModuleType) -> None:
+    """With drag and a force F, against SciPy's solution of each fall; F does F (y(T) - y(0))."""
     run = falling.simulate(u=[1.5], params={"c": 0.3, "e": 0.7})
-    balance, y, lost, jumps = run.balance(), [1.0, 0.0, 0.0], 0.0, 0.0
+    balance, y, dissipated, jumps = run.balance(), [1.0, 0.0, 0.0], 0.0, 0.0
     times = [0.0, *run.events["impact"].t, 2.0]
-    for begin, end in pairwise(times):
+    for start, end in pairwise(times):
         y[2] = 0.0
         y = solve_ivp(
-            lambda _, s: [s[1], -9.81 + 1.5 - 0.3 * s[1], 0.3 * s[1] ** 2], (begin, end), y,
+            lambda _, s: [s[1], -9.81 + 1.5 - 0.3 * s[1], 0.3 * s[1] ** 2], (start, end), y,
             method="DOP853", rtol=1e-12, atol=1e-13,
         ).y[:, -1].tolist()  # fmt: skip
-        lost += y[2]
+        dissipated += y[2]
         if end < 2.0:
             jumps -= (1 - 0.7**2) * y[1] ** 2 / 2
             y[1] *= -0.7
     assert len(times) > 4 and balance.is_resolved
-    assert balance.dissipated == pytest.approx(lost, rel=1e-9)
+    assert balance.dissipated == pytest.approx(dissipated, rel=1e-9)
     assert balance.jumps == pytest.approx(jumps, rel=1e-9)
     assert balance.inputs == pytest.approx(1.5 * (run.q[-1, 0] - 1.0), rel=1e-9)
     assert balance.forces == pytest.approx(0, abs=1e-9)
@@ -353,8 +361,8 @@ def test_work_between_jumps_is_told_apart(falling: ModuleType) -> None:
     assert "J were lost, jumps took" in balance.words
 
 
-def test_what_a_jump_sheds_is_its_own_energy(falling: ModuleType) -> None:
-    """Half of the mass at 0.2 s: of K + P = m g, which it has all the way down, half."""
+def test_jump_that_sheds_mass_takes_its_energy(falling: ModuleType) -> None:
+    """At 0.2 s half of the mass is shed, and with it half of K + P = m g."""
     balance = falling.simulate(duration=0.4, params={"at": 0.2}).balance()
     assert balance.jumps == pytest.approx(-9.81 / 2, rel=1e-12) and balance.is_resolved
     with pytest.warns(RuntimeWarning, match="ever sooner"):
@@ -366,22 +374,22 @@ def test_what_a_jump_sheds_is_its_own_energy(falling: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_friction_that_sticks_loses_all_and_its_jumps_take_nothing(modules: Modules) -> None:
-    """Amplitudes fall by 2 F/k, 0.2, each half swing, and F goes all the way: 1, .8, ..., 0."""
+def test_stick_slip_friction_dissipates_all_and_its_jumps_take_nothing(modules: Modules) -> None:
+    """Amplitudes fall by 2 F/k = 0.2 each half swing, so F acts all the way: 1, 0.8, ..., 0."""
     run = modules.unoptimised(STICKS).simulate()
     balance = run.balance()
-    fall = 5 * (1 - run.q[-1, 0] ** 2)
+    dissipated = 5 * (1 - run.q[-1, 0] ** 2)
     assert (
         balance.is_resolved
         and abs(balance.jumps) < 1e-12
         and balance.forces == pytest.approx(0, abs=1e-9)
     )
-    assert balance.dissipated == pytest.approx(fall, rel=1e-10) and run.qd[-1, 0] == 0
-    assert balance.words.startswith(f"{fall:.3g} J were lost; numerical error")
+    assert balance.dissipated == pytest.approx(dissipated, rel=1e-10) and run.qd[-1, 0] == 0
+    assert balance.words.startswith(f"{dissipated:.3g} J were lost; numerical error")
 
 
-def test_of_many_jumps_it_is_told_without_many_rows(falling: ModuleType) -> None:
-    """Thousands of them, elastic: nothing is taken, and nothing lost."""
+def test_balance_of_many_jumps_needs_few_rows(falling: ModuleType) -> None:
+    """Thousands of elastic impacts take nothing, and nothing is dissipated."""
     run = falling.simulate(duration=2500.0, params={"e": 1.0})
     balance = run.balance()
     assert len(run.events["impact"]) > 2500 and balance.is_resolved
@@ -406,25 +414,25 @@ tolerance = 1e-9
 
 
 @pytest.mark.parametrize("times", [None, np.linspace(0.0, 20.0, 41)])
-def test_short_contacts_are_seen(modules: Modules, times: np.ndarray | None) -> None:
-    """Rows equally far apart passed over them, and a right run had a numerical error of 8 %."""
+def test_short_contacts_are_resolved(modules: Modules, times: np.ndarray | None) -> None:
+    """Regression: equidistant rows missed them, which gave an error of 8 % for an accurate run."""
     run = modules.of_text(STOP).simulate(times=times)
-    found = run.balance()
-    assert found is not None and found.is_resolved
-    assert max(found.error, found.uncertainty) < 1e-8
-    assert found.dissipated == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)
+    balance = run.balance()
+    assert balance is not None and balance.is_resolved
+    assert max(balance.error, balance.uncertainty) < 1e-8
+    assert balance.dissipated == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)
 
 
 @pytest.mark.parametrize("roundings", [-2, 0, 1, 5])
-def test_jumps_within_roundings_of_an_end_count(falling: ModuleType, roundings: int) -> None:
-    """Steps of some roundings had rows between their ends that fell on the time of the jump."""
+def test_jumps_within_roundings_of_an_end_are_balanced(falling: ModuleType, roundings: int) -> None:
+    """Regression: rows between the ends of steps of a few roundings fell on the jump's time."""
     impact = float(falling.simulate(duration=1.0).events["impact"].t[0])
-    sheds = 0.3 - roundings * np.spacing(0.3)
+    shedding_time = 0.3 - roundings * np.spacing(0.3)
     for run in (
         falling.simulate(duration=impact + roundings * np.spacing(impact)),
-        falling.simulate(duration=0.3, params={"at": sheds}),
+        falling.simulate(duration=0.3, params={"at": shedding_time}),
         falling.simulate(duration=0.3, params={"at": max(0.0, -roundings)}),
     ):
-        found = run.balance()
-        assert found is not None and found.is_resolved and found.error < 1e-13
-        assert found.jumps == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-12)
+        balance = run.balance()
+        assert balance is not None and balance.is_resolved and balance.error < 1e-13
+        assert balance.jumps == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-12)

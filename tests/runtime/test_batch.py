@@ -1,4 +1,4 @@
-"""Many at once: what a scene with batch = true promises."""
+"""Batches: what `batch = true` in a scene promises."""
 
 from __future__ import annotations
 
@@ -15,72 +15,76 @@ NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, "cartpole_driven"))
-def test_each_instance_moves_as_it_would_alone(name: str) -> None:
+def test_instance_equals_single_run(name: str) -> None:
     m = module(name)
     q0, qd0 = starts(m, 130)
     runs = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
     for k in (0, 63, 64, 129):
-        alone = m.simulate(q0[k], qd0[k], steps=STEPS, every=7)
-        assert np.array_equal(runs.t, alone.t)
-        # the same operations, contracted to FMA in other places
-        scale = 1 + np.max(np.abs(alone.q))
-        assert np.max(np.abs(runs.q[k] - alone.q)) < 1e-13 * scale
-        assert np.max(np.abs(runs.qd[k] - alone.qd)) < 1e-11 * (1 + np.max(np.abs(alone.qd)))
+        single = m.simulate(q0[k], qd0[k], steps=STEPS, every=7)
+        assert np.array_equal(runs.t, single.t)
+        # the same operations, contracted to FMA at other places
+        scale = 1 + np.max(np.abs(single.q))
+        assert np.max(np.abs(runs.q[k] - single.q)) < 1e-13 * scale
+        assert np.max(np.abs(runs.qd[k] - single.qd)) < 1e-11 * (1 + np.max(np.abs(single.qd)))
     assert set(runs.status) == {"ok"} and set(runs.steps) == {STEPS}
 
 
-def test_place_and_threads_change_no_bit() -> None:
+def test_order_and_threads_change_no_bit() -> None:
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 1000)
-    one = m.simulate_batch(q0, qd0, steps=STEPS, threads=1)
-    many = m.simulate_batch(q0, qd0, steps=STEPS, threads=3)
-    assert np.array_equal(one.q, many.q) and np.array_equal(one.qd, many.qd)
+    one_thread = m.simulate_batch(q0, qd0, steps=STEPS, threads=1)
+    three_threads = m.simulate_batch(q0, qd0, steps=STEPS, threads=3)
+    assert np.array_equal(one_thread.q, three_threads.q) and np.array_equal(
+        one_thread.qd, three_threads.qd
+    )
     part = m.simulate_batch(q0[501:540], qd0[501:540], steps=STEPS)
-    assert np.array_equal(part.q, one.q[501:540])
-    turned = m.simulate_batch(q0[::-1], qd0[::-1], steps=STEPS)
-    assert np.array_equal(turned.q, one.q[::-1])
+    assert np.array_equal(part.q, one_thread.q[501:540])
+    reversed_runs = m.simulate_batch(q0[::-1], qd0[::-1], steps=STEPS)
+    assert np.array_equal(reversed_runs.q, one_thread.q[::-1])
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
 @pytest.mark.parametrize("name", tiers(("cartpole", "cartpole_driven", "tumbling_box"), "cartpole"))
-def test_how_many_there_are_changes_no_bit(name: str, real: str) -> None:
-    """Tiles that are not full are taken by blocks: any number of instances, each as among many."""
+def test_batch_size_changes_no_bit(name: str, real: str) -> None:
+    """Partly filled tiles are computed block by block; results equal those of a larger batch."""
     m = module(name, real=f'"{real}"')
     q0, qd0 = starts(m, 300)
-    all_of_them = m.simulate_batch(q0, qd0, steps=5, every=2)
-    assert (all_of_them.steps == 5).all()
+    all_runs = m.simulate_batch(q0, qd0, steps=5, every=2)
+    assert (all_runs.steps == 5).all()
     for count in (*range(1, 40), 56, 57, 63, 64, 65, 71, 127, 129):
         few = m.simulate_batch(q0[-count:], qd0[-count:], steps=5, every=2)
-        assert np.array_equal(few.q, all_of_them.q[-count:])
-        assert np.array_equal(few.qd, all_of_them.qd[-count:])
+        assert np.array_equal(few.q, all_runs.q[-count:])
+        assert np.array_equal(few.qd, all_runs.qd[-count:])
         assert (few.steps == 5).all() and set(few.status) == {"ok"}
 
 
-def test_parameters_and_inputs_of_its_own() -> None:
+def test_instances_have_their_own_parameters_and_inputs() -> None:
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 70)
     masses = np.linspace(0.5, 4.0, 70)
     table = np.random.default_rng(2).standard_normal((70, STEPS, 1))
     runs = m.simulate_batch(q0, qd0, steps=STEPS, params={"m_c": masses, "l": 1.5}, u=table)
     k = 69
-    alone = m.simulate(q0[k], qd0[k], steps=STEPS, params={"m_c": masses[k], "l": 1.5}, u=table[k])
-    assert np.max(np.abs(runs.q[k] - alone.q)) < 1e-12
+    single = m.simulate(q0[k], qd0[k], steps=STEPS, params={"m_c": masses[k], "l": 1.5}, u=table[k])
+    assert np.max(np.abs(runs.q[k] - single.q)) < 1e-12
     constant = m.simulate_batch(q0, qd0, steps=STEPS, u=[3.0])
-    alone = m.simulate(q0[k], qd0[k], steps=STEPS, u=[3.0])
-    assert np.max(np.abs(constant.q[k] - alone.q)) < 1e-12
+    single = m.simulate(q0[k], qd0[k], steps=STEPS, u=[3.0])
+    assert np.max(np.abs(constant.q[k] - single.q)) < 1e-12
 
 
-def test_equal_parameters_of_its_own_change_no_bit() -> None:
-    """What all share is compiled apart from what each has."""
+def test_equal_parameters_per_instance_change_no_bit() -> None:
+    """Shared parameters and parameters per instance are compiled separately."""
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 130)
     for u in (None, [0.5]):
         shared = m.simulate_batch(q0, qd0, steps=STEPS, params={"l": 1.5}, u=u)
-        own = m.simulate_batch(q0, qd0, steps=STEPS, params={"l": np.full(130, 1.5)}, u=u)
-        assert np.array_equal(shared.q, own.q) and np.array_equal(shared.qd, own.qd)
+        per_instance = m.simulate_batch(q0, qd0, steps=STEPS, params={"l": np.full(130, 1.5)}, u=u)
+        assert np.array_equal(shared.q, per_instance.q) and np.array_equal(
+            shared.qd, per_instance.qd
+        )
 
 
-def test_every_group_has_its_own_parameters_and_inputs() -> None:
+def test_groups_have_their_own_parameters_and_inputs() -> None:
     """One thread takes all 600 at once, three take 128 each time; one table may serve all."""
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 600)
@@ -88,63 +92,65 @@ def test_every_group_has_its_own_parameters_and_inputs() -> None:
     params[:, m.parameters.index("m_c")] = np.linspace(0.5, 4.0, 600)
     table = np.random.default_rng(4).standard_normal((600, STEPS, 1))
     for u in (table, table[:, 0], table[:1]):
-        one, many = (
+        one_thread, three_threads = (
             m.simulate_batch(q0, qd0, steps=STEPS, params=params, u=u, threads=threads)
             for threads in (1, 3)
         )
-        assert np.array_equal(one.q, many.q) and np.array_equal(one.qd, many.qd)
+        assert np.array_equal(one_thread.q, three_threads.q) and np.array_equal(
+            one_thread.qd, three_threads.qd
+        )
         k = 599
-        mine = np.broadcast_to(u if u.ndim == 3 else u[:, None], table.shape)[k]
-        alone = m.simulate(q0[k], qd0[k], steps=STEPS, params=params[k], u=mine)
-        assert np.max(np.abs(many.q[k] - alone.q)) < 1e-12
+        inputs = np.broadcast_to(u if u.ndim == 3 else u[:, None], table.shape)[k]
+        single = m.simulate(q0[k], qd0[k], steps=STEPS, params=params[k], u=inputs)
+        assert np.max(np.abs(three_threads.q[k] - single.q)) < 1e-12
 
 
-def test_a_batch_is_the_same_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A look at Ctrl-C behind each step: time, rows and inputs go on, who stopped stays there."""
+def test_batch_split_into_several_calls_is_identical(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poll Ctrl-C after each step: time, rows and inputs go on; stopped instances stay stopped."""
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 70)
     table = np.random.default_rng(5).standard_normal((70, STEPS, 1))
-    table[41, 33] = 1e300  # too much for the square of what it makes of theta_dot
+    table[41, 33] = 1e300  # too large for the square of the resulting theta_dot
 
-    def runs() -> list[Any]:
-        how = {"steps": STEPS, "every": 7, "t0": 0.5}
-        return [m.simulate_batch(q0, qd0, u=u, **how) for u in (None, table, table[:1])]
+    def simulate_all() -> list[Any]:
+        options = {"steps": STEPS, "every": 7, "t0": 0.5}
+        return [m.simulate_batch(q0, qd0, u=u, **options) for u in (None, table, table[:1])]
 
-    whole = runs()
+    reference = simulate_all()
     for name in ("_FIRST_POLL_SECONDS", "_POLL_SECONDS"):
         monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch_work"], name, 0.0)
-    for one, other in zip(whole, runs(), strict=True):
+    for expected, actual in zip(reference, simulate_all(), strict=True):
         for name in ("t", "q", "qd", "steps"):
-            assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
-        assert np.array_equal(one.status, other.status)
-    assert (whole[1].status[41], whole[1].status[40]) == ("not finite", "ok")
-    assert 33 <= whole[1].steps[41] < STEPS
-    alone = m.simulate(q0[3], qd0[3], steps=STEPS, every=7, t0=0.5)
-    assert np.array_equal(whole[0].t, alone.t) and alone.t[0] == 0.5
-    assert np.max(np.abs(whole[0].q[3] - alone.q)) < 1e-12
+            assert np.array_equal(getattr(expected, name), getattr(actual, name), equal_nan=True)
+        assert np.array_equal(expected.status, actual.status)
+    assert (reference[1].status[41], reference[1].status[40]) == ("not finite", "ok")
+    assert 33 <= reference[1].steps[41] < STEPS
+    single = m.simulate(q0[3], qd0[3], steps=STEPS, every=7, t0=0.5)
+    assert np.array_equal(reference[0].t, single.t) and single.t[0] == 0.5
+    assert np.max(np.abs(reference[0].q[3] - single.q)) < 1e-12
 
 
-def test_starts_of_any_layout_are_read_and_left_alone() -> None:
+def test_starts_of_any_memory_layout_are_read_and_unchanged() -> None:
     m = module("cartpole")
     q0, qd0 = starts(m, 300)
-    wanted = m.simulate_batch(q0, qd0, steps=STEPS)
+    expected = m.simulate_batch(q0, qd0, steps=STEPS)
     wide = np.empty((2, 2, 600))
     wide[0, :, ::2], wide[1, :, ::2] = q0.T, qd0.T
     strided = wide[0, :, ::2].T, wide[1, :, ::2].T
     runs = m.simulate_batch(*strided, steps=STEPS)
-    assert np.array_equal(runs.q, wanted.q) and np.array_equal(runs.qd, wanted.qd)
+    assert np.array_equal(runs.q, expected.q) and np.array_equal(runs.qd, expected.qd)
     assert np.array_equal(strided[0], q0) and np.array_equal(strided[1], qd0)
-    from_one = m.simulate_batch(q0[0], qd0, steps=STEPS)
-    assert np.array_equal(from_one.q[:, 0], np.tile(q0[0], (300, 1)))
-    table = np.zeros(300, [("q", float, 2), ("one", "b"), ("qd", float, 2)])  # numbers not aligned
+    broadcast = m.simulate_batch(q0[0], qd0, steps=STEPS)
+    assert np.array_equal(broadcast.q[:, 0], np.tile(q0[0], (300, 1)))
+    table = np.zeros(300, [("q", float, 2), ("one", "b"), ("qd", float, 2)])  # unaligned numbers
     table["q"], table["qd"] = q0, qd0
-    for at, moving in ((table["q"], table["qd"]), (q0[::-1].copy()[::-1], qd0.astype(">f8"))):
-        runs = m.simulate_batch(at, moving, steps=STEPS)
-        assert np.array_equal(runs.q, wanted.q) and np.array_equal(runs.qd, wanted.qd)
+    for q, qd in ((table["q"], table["qd"]), (q0[::-1].copy()[::-1], qd0.astype(">f8"))):
+        runs = m.simulate_batch(q, qd, steps=STEPS)
+        assert np.array_equal(runs.q, expected.q) and np.array_equal(runs.qd, expected.qd)
 
 
-def test_long_rows_start_where_they_should(modules: Modules) -> None:
-    """Nine masses in a row, on springs."""
+def test_rows_of_many_coordinates_start_at_the_initial_state(modules: Modules) -> None:
+    """Nine masses in a row, coupled by springs."""
     names = [f"x{k}" for k in range(9)]
     springs = " + ".join(f"({a} - {b})**2" for a, b in pairwise(["1", *names, "2"]))
     lines = ["eomc = 1", 'name = "row"', "[coordinates]", *(f"{x} = {{}}" for x in names)]
@@ -152,12 +158,12 @@ def test_long_rows_start_where_they_should(modules: Modules) -> None:
     lines += [f'potential = "{springs}"', "[run]", "batch = true"]
     m = modules.unoptimised("\n".join(lines))
     q0, qd0 = starts(m, 20)
-    for given in (q0, q0.astype(np.float32)):
-        runs = m.simulate_batch(given, qd0, h=0.01, steps=3)
-        assert np.array_equal(runs.q[:, 0], given) and np.array_equal(runs.qd[:, 0], qd0)
+    for positions in (q0, q0.astype(np.float32)):
+        runs = m.simulate_batch(positions, qd0, h=0.01, steps=3)
+        assert np.array_equal(runs.q[:, 0], positions) and np.array_equal(runs.qd[:, 0], qd0)
         for k in (0, 7, 19):
-            alone = m.simulate(given[k], qd0[k], h=0.01, steps=3)
-            np.testing.assert_allclose(runs.q[k], alone.q, rtol=0, atol=1e-15)
+            single = m.simulate(positions[k], qd0[k], h=0.01, steps=3)
+            np.testing.assert_allclose(runs.q[k], single.q, rtol=0, atol=1e-15)
 
 
 def test_step_batch_in_place_and_into_out() -> None:
@@ -176,23 +182,28 @@ def test_step_batch_in_place_and_into_out() -> None:
 
 
 @pytest.mark.parametrize("count", [5, 2500])
-def test_a_step_of_many_is_the_first_of_their_run(count: int) -> None:
-    """Parameters and inputs of each instance's own, and shared ones; C takes 1,024 at once."""
+def test_step_batch_equals_first_step_of_a_run(count: int) -> None:
+    """Parameters and inputs per instance, and shared ones; C takes 1,024 instances at once."""
     m = module("cartpole_driven")
     q0, qd0 = starts(m, count)
     masses, forces = np.linspace(1.0, 3.0, count), np.linspace(-1.0, 1.0, count)[:, None]
-    for how in ({}, {"params": {"m_c": masses}}, {"u": forces}, {"u": 0.5, "params": {"l": 1.5}}):
+    for options in (
+        {},
+        {"params": {"m_c": masses}},
+        {"u": forces},
+        {"u": 0.5, "params": {"l": 1.5}},
+    ):
         q, qd = q0.copy(), qd0.copy()
-        status = m.step_batch(q, qd, **how)
+        status = m.step_batch(q, qd, **options)
         assert status.shape == (count,) and not status.any()
-        runs = m.simulate_batch(q0, qd0, steps=1, **how)
+        runs = m.simulate_batch(q0, qd0, steps=1, **options)
         assert np.array_equal(q, runs.q[:, 1])
         assert np.array_equal(qd, runs.qd[:, 1])
 
 
 @pytest.mark.parametrize("count", [5, 2500])
-def test_several_steps_in_one_call_are_those_of_a_run(count: int) -> None:
-    """Under inputs that are held; in threads where they are many."""
+def test_several_steps_in_one_call_equal_a_run(count: int) -> None:
+    """Inputs are held constant; large batches use threads."""
     m = module("cartpole_driven")
     q, qd = starts(m, count)
     u = np.linspace(-1, 1, count)[:, None]
@@ -203,7 +214,7 @@ def test_several_steps_in_one_call_are_those_of_a_run(count: int) -> None:
     assert not m.step_batch(q, qd, steps=0).any() and np.array_equal(q, runs.q[:, 3])
 
 
-def test_of_several_steps_the_state_before_the_one_that_fails_is_left() -> None:
+def test_step_batch_leaves_the_state_before_the_failed_step() -> None:
     m = module("cartpole")
     q, qd = np.array([[0.0, 0.1], [0.0, 0.4]]), np.array([[0.0, 0.0], [0.0, 0.4]])
     with pytest.warns(RuntimeWarning):
@@ -215,12 +226,12 @@ def test_of_several_steps_the_state_before_the_one_that_fails_is_left() -> None:
 
 @pytest.mark.parametrize("count", [3, 25_000])
 @pytest.mark.parametrize("name", ["kapitza_pendulum", "cartpole"])
-def test_each_may_have_a_time_of_its_own(name: str, count: int) -> None:
-    """As a step of each by itself from its time; of scenes without an explicit time any."""
+def test_instances_can_have_their_own_times(name: str, count: int) -> None:
+    """Each is stepped from its own time; a scene without explicit time accepts any."""
     m = module(name)
     q, qd = starts(m, count)
     times = np.random.default_rng(2).uniform(0, 3, count)
-    times[1::2] = times[0]  # some share a time
+    times[1::2] = times[0]  # some instances share a time
     expected = [m.simulate(q[k], qd[k], 0.001, steps=2, t0=times[k]) for k in range(3)]
     failed = m.step_batch(q, qd, 0.001, times, steps=2)
     assert not failed.any()
@@ -235,7 +246,7 @@ def test_each_may_have_a_time_of_its_own(name: str, count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "words"),
+    ("options", "message"),
     [
         ({"t": [0.0, 1.0]}, r"t: shape \(2,\), expected one number or \(3,\)"),
         ({"t": [0.0, 1.0, np.nan]}, "t: nan is not a finite number, at .2."),
@@ -244,17 +255,17 @@ def test_each_may_have_a_time_of_its_own(name: str, count: int) -> None:
         ({"steps": 1.5}, "steps: 1.5 is not a whole number"),
     ],
 )
-def test_wrong_times_and_numbers_of_steps_are_refused(how: dict[str, Any], words: str) -> None:
+def test_invalid_times_and_step_counts_are_refused(options: dict[str, Any], message: str) -> None:
     m = module("cartpole")
     q, qd = starts(m, 3)
-    before = q.copy()
-    with pytest.raises(ValueError, match=words):
-        m.step_batch(q, qd, **how)
-    assert np.array_equal(q, before)
+    initial = q.copy()
+    with pytest.raises(ValueError, match=message):
+        m.step_batch(q, qd, **options)
+    assert np.array_equal(q, initial)
 
 
-def test_a_step_of_very_many_is_that_of_few() -> None:
-    """From 20,000 on there are threads, and looks at Ctrl-C; who can not go on stays as it was."""
+def test_step_of_a_large_batch_equals_that_of_a_part() -> None:
+    """From 20,000 instances on, threads are used and Ctrl-C is polled; failed ones do not move."""
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 20_000)
     masses = np.full(20_000, m.defaults["m_c"])
@@ -264,20 +275,20 @@ def test_a_step_of_very_many_is_that_of_few() -> None:
     assert status.nonzero()[0].tolist() == [12_345]
     assert m.STATUS[status[12_345]] == "singular" and m.STATUS[0] == "ok"
     assert np.array_equal(q[12_345], q0[12_345]) and np.array_equal(qd[12_345], qd0[12_345])
-    few = slice(12_300, 12_400)
-    some, moving = q0[few].copy(), qd0[few].copy()
+    part = slice(12_300, 12_400)
+    q_part, qd_part = q0[part].copy(), qd0[part].copy()
     assert np.array_equal(
-        m.step_batch(some, moving, t=0.5, params={"m_c": masses[few]}), status[few]
+        m.step_batch(q_part, qd_part, t=0.5, params={"m_c": masses[part]}), status[part]
     )
-    assert np.array_equal(some, q[few]) and np.array_equal(moving, qd[few])
+    assert np.array_equal(q_part, q[part]) and np.array_equal(qd_part, qd[part])
 
 
 def test_progress_reaches_the_end() -> None:
     m = module("cartpole")
-    seen: list[tuple[int, int]] = []
+    calls: list[tuple[int, int]] = []
     q0, qd0 = starts(m, 64)
-    m.simulate_batch(q0, qd0, steps=STEPS, progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1] == (64 * STEPS, 64 * STEPS)
+    m.simulate_batch(q0, qd0, steps=STEPS, progress=lambda done, total: calls.append((done, total)))
+    assert calls[-1] == (64 * STEPS, 64 * STEPS)
 
 
 def test_single_precision() -> None:
@@ -288,16 +299,16 @@ def test_single_precision() -> None:
     assert runs.q.dtype == np.float32
     exact = module("cartpole").simulate_batch(q0, qd0, steps=STEPS)
     error = np.max(np.abs(runs.q - exact.q))
-    assert 1e-9 < error < 1e-4  # that of single precision, no more and no less
+    assert 1e-9 < error < 1e-4  # the error of single precision
 
 
 @pytest.mark.parametrize("inputs", [True, False])
-def test_a_scene_without_parameters(modules: Modules, inputs: bool) -> None:
-    given = "[inputs]\nf = { signal = 0.5 }\n[forces]\nx = 'f'\n" if inputs else ""
+def test_scene_without_parameters_can_be_a_batch(modules: Modules, inputs: bool) -> None:
+    input_text = "[inputs]\nf = { signal = 0.5 }\n[forces]\nx = 'f'\n" if inputs else ""
     bare = modules.unoptimised(
         "eomc = 1\nname = 'bare'\n[coordinates]\nx = { start = 1.0 }\n"
-        f"{given}[energy]\nkinetic = 'x_dot**2/2'\npotential = 'x**2/2'\n[run]\nbatch = true\n"
+        f"{input_text}[energy]\nkinetic = 'x_dot**2/2'\npotential = 'x**2/2'\n[run]\nbatch = true\n"
     )
     runs = bare.simulate_batch([[1.0], [2.0]], [[0.0], [0.0]], h=0.01, steps=100, every=100)
-    alone = bare.simulate([2.0], [0.0], h=0.01, steps=100, every=100)
-    np.testing.assert_allclose(runs.q[1, -1], alone.q[-1], rtol=1e-14)
+    single = bare.simulate([2.0], [0.0], h=0.01, steps=100, every=100)
+    np.testing.assert_allclose(runs.q[1, -1], single.q[-1], rtol=1e-14)

@@ -1,4 +1,4 @@
-"""Arguments that a batch refuses, by name."""
+"""Arguments that a batch refuses; the message names the argument."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from batches import STEPS, module, starts
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_starts_that_are_not_finite_are_refused_before_any_moves(real: str, threads: int) -> None:
-    """Wherever they are; nobody waits for the others' hours first."""
+def test_starts_that_are_not_finite_are_refused_before_any_step(real: str, threads: int) -> None:
+    """Wherever they are in the batch: no instance is simulated before the check."""
     m = module("cartpole", real=f'"{real}"')
     calls: list[int] = []
-    for name, (row, column), number in (
+    for name, (row, column), value in (
         ("q0", (7, 1), np.nan), ("qd0", (19_999, 0), np.inf), ("q0", (12_000, 0), -np.inf),
-        *([("qd0", (3, 1), 1e300)] if real == "float" else []),  # no float is that large
+        *([("qd0", (3, 1), 1e300)] if real == "float" else []),  # beyond the range of floats
     ):  # fmt: skip
-        given = dict(zip(("q0", "qd0"), starts(m, 20_000), strict=True))
-        given[name][row, column] = number
+        starts_by_name = dict(zip(("q0", "qd0"), starts(m, 20_000), strict=True))
+        starts_by_name[name][row, column] = value
         for order in ("C", "F"):
-            given[name] = np.array(given[name], order=order)  # type: ignore[call-overload]
+            starts_by_name[name] = np.array(starts_by_name[name], order=order)  # type: ignore[call-overload]
             with pytest.raises(ValueError, match=rf"^{name}\[{row}, {column}\]: .* is not finite"):
                 m.simulate_batch(
-                    **given,
+                    **starts_by_name,
                     steps=STEPS,
                     threads=threads,
                     progress=lambda done, _: calls.append(done),
@@ -35,17 +35,17 @@ def test_starts_that_are_not_finite_are_refused_before_any_moves(real: str, thre
     assert not calls
 
 
-def test_tables_that_do_not_fit_are_refused_by_name() -> None:
-    """C would read on behind them, or compute with what is no number."""
+def test_tables_of_wrong_shape_are_refused_by_name() -> None:
+    """C would read beyond their end, or compute with values that are not numbers."""
     m = module("cartpole_driven")
     (q0, qd0), nan = starts(m, 5), np.nan
-    wrong = np.tile(list(m.defaults.values()), (5, 1))
-    wrong[3, 1] = nan
-    tries = {
+    invalid = np.tile(list(m.defaults.values()), (5, 1))
+    invalid[3, 1] = nan
+    calls = {
         "qd: 4 instances where q has 5": lambda: m.step_batch(q0, qd0[:4].copy()),
         "params: 3 instances where": lambda: m.step_batch(q0, qd0, params={"l": np.ones(3)}),
         "u: 4 instances where q has 5": lambda: m.step_batch(q0, qd0, u=np.zeros((4, 1))),
-        "params: not all numbers are": lambda: m.step_batch(q0, qd0, params=wrong),
+        "params: not all numbers are": lambda: m.step_batch(q0, qd0, params=invalid),
         "u: not all numbers are finite": lambda: m.step_batch(q0, qd0, u=[nan]),
         "u: 'push' is not an array of": lambda: m.step_batch(q0, qd0, u="push"),
         "u: 'Force' is not one of force; did you": lambda: m.step_batch(q0, qd0, u={"Force": 1}),
@@ -71,13 +71,13 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
             q0, qd0, steps=4, u=np.zeros((5, 3, 1))
         ),
     }
-    for words, call in tries.items():
-        with pytest.raises(ValueError, match=re.escape(words)):
+    for message, call in calls.items():
+        with pytest.raises(ValueError, match=re.escape(message)):
             call()
 
 
 @pytest.mark.parametrize(
-    ("given", "named"),
+    ("options", "message"),
     [
         ({"params": {"mass": [1.0, 2.0]}}, "params: 'mass'"),
         ({"params": {"m_c": [1.0, float("nan")]}}, "params: m_c"),
@@ -95,32 +95,34 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
         ({"method": "euler"}, "method"),
     ],
 )
-def test_wrong_arguments_are_named(given: dict[str, Any], named: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(named)):
-        module("cartpole").simulate_batch(steps=2, **given)
+def test_invalid_arguments_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        module("cartpole").simulate_batch(steps=2, **options)
 
 
 def test_masked_numbers_are_refused_by_name() -> None:
-    """They have no value; where nothing is masked, a masked array is as good as any."""
-    many = module("cartpole")
-    q, qd = (np.tile(x, (2, 1)) for x in many.start)
+    """Masked numbers have no value; a masked array without masked numbers is accepted."""
+    cartpole = module("cartpole")
+    q, qd = (np.tile(x, (2, 1)) for x in cartpole.start)
     masked = np.ma.array(q, mask=[[0, 1], [0, 0]])
-    tries = {
-        "q0": lambda: many.simulate_batch(masked, qd, steps=1),
-        "q": lambda: many.step_batch(masked, qd),
-        "qd": lambda: many.step_batch(q, masked, out=(q.copy(), qd.copy())),
-        "params: m_c": lambda: many.step_batch(
+    calls = {
+        "q0": lambda: cartpole.simulate_batch(masked, qd, steps=1),
+        "q": lambda: cartpole.step_batch(masked, qd),
+        "qd": lambda: cartpole.step_batch(q, masked, out=(q.copy(), qd.copy())),
+        "params: m_c": lambda: cartpole.step_batch(
             q, qd, params={"m_c": np.ma.array([1.0, 2.0], mask=[0, 1])}
         ),
-        "params": lambda: many.step_batch(q, qd, params=np.ma.array(np.ones((2, 4)), mask=True)),
+        "params": lambda: cartpole.step_batch(
+            q, qd, params=np.ma.array(np.ones((2, 4)), mask=True)
+        ),
     }
-    for name, call in tries.items():
+    for name, call in calls.items():
         with pytest.raises(ValueError, match=rf"^{name}: \d of \d numbers are masked"):
             call()
-    plain = many.simulate_batch(np.ma.array(q), qd, steps=3)
-    assert np.array_equal(plain.q, many.simulate_batch(q, qd, steps=3).q)
+    unmasked = cartpole.simulate_batch(np.ma.array(q), qd, steps=3)
+    assert np.array_equal(unmasked.q, cartpole.simulate_batch(q, qd, steps=3).q)
 
 
-def test_an_argument_that_is_not_there_is_told_with_what_is_meant() -> None:
+def test_unknown_argument_is_refused_with_a_suggestion() -> None:
     with pytest.raises(TypeError, match=r"^simulate_batch has no argument 'thread'.*'threads'\?$"):
         module("cartpole").simulate_batch(thread=2, steps=3)

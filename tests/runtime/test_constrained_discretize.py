@@ -1,4 +1,4 @@
-"""The derivatives of steps that end on constraints: by differences, and of fewer coordinates."""
+"""Derivatives of steps that end on constraints: against differences and minimal coordinates."""
 
 from __future__ import annotations
 
@@ -92,37 +92,41 @@ STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 INPUTS: dict[str, Any] = {"signals": None, "held": [0.7]}
 
 
-def apart(step: Any, x: Any, width: float = 2e-3) -> Any:
-    """The derivatives of step by differences of order 8."""
+def difference_quotients(step: Any, x: Any, width: float = 2e-3) -> Any:
+    """Return the derivatives of step by central differences of order 8."""
     return np.array(
         [
-            sum(w * (step(x + k * by) - step(x - k * by)) for k, w in STENCIL) / width
-            for by in width * np.eye(len(x))
+            sum(w * (step(x + k * offset) - step(x - k * offset)) for k, w in STENCIL) / width
+            for offset in width * np.eye(len(x))
         ]
     ).T
 
 
-@pytest.mark.parametrize("given", INPUTS)
+@pytest.mark.parametrize("inputs", INPUTS)
 @pytest.mark.parametrize(
     ("text", "method"), tiers(CASES, CASES[0], *CASES[-2:]), ids=lambda x: x[-9:].strip()
 )
-def test_against_differences_of_steps(modules: Modules, text: str, method: str, given: str) -> None:
-    """Also where the state before a step is off the rows: steps put any on them."""
+def test_derivatives_equal_differences_of_steps(
+    modules: Modules, text: str, method: str, inputs: str
+) -> None:
+    """Also where the state before the step violates the constraints: steps project it onto them."""
     m, t, h = modules.unoptimised(text), 0.4, 0.02
-    u = INPUTS[given] if m.inputs else None
+    u = INPUTS[inputs] if m.inputs else None
     q, qd = m.project(*m.start, t=t)
-    for off in (0.0, 0.01):
-        x = np.hstack([q, qd]) + off * np.arange(2 * m._model.info.nq)
+    for violation in (0.0, 0.01):
+        x = np.hstack([q, qd]) + violation * np.arange(2 * m._model.info.nq)
 
-        def end(x: Any) -> Any:
+        def final_state(x: Any) -> Any:
             return np.hstack(m.step(*np.split(x, 2), h, t, u, method=method))
 
         Phi, Gamma = m.discretize(*np.split(x, 2), h, t, u, method=method)
-        np.testing.assert_allclose(Phi, apart(end, x), rtol=0, atol=2e-11)
+        np.testing.assert_allclose(Phi, difference_quotients(final_state, x), rtol=0, atol=2e-11)
         if u is not None:
-            near = apart(lambda u: np.hstack(m.step(q, qd, h, t, u, method=method)), np.array(u))
+            expected = difference_quotients(
+                lambda u: np.hstack(m.step(q, qd, h, t, u, method=method)), np.array(u)
+            )
             _, Gamma = m.discretize(q, qd, h, t, u, method=method)
-            np.testing.assert_allclose(Gamma, near, rtol=0, atol=2e-12)
+            np.testing.assert_allclose(Gamma, expected, rtol=0, atol=2e-12)
             assert np.abs(Gamma).max() > 1e-3
 
 
@@ -134,20 +138,20 @@ def test_against_differences_of_steps(modules: Modules, text: str, method: str, 
         pytest.param(ROPE, id="rope", marks=pytest.mark.slow),
     ],
 )
-def test_it_leads_along_the_rows(modules: Modules, text: str) -> None:
-    """Whatever changes before a step, behind it changes keep the rows, to rounding."""
+def test_derivatives_stay_in_the_tangent_space(modules: Modules, text: str) -> None:
+    """Whatever changes before a step, afterwards changes satisfy the constraints, to rounding."""
     m, t, h = modules.unoptimised(text), 0.4, 0.02
     q, qd = m.project(*m.start, t=t)
     Phi, Gamma = m.discretize(q, qd, h, t)
     T = m.tangent(*m.step(q, qd, h, t), t + h)
-    across = np.eye(2 * len(q)) - T @ T.T
-    assert np.abs(across @ Phi).max() < 1e-14 * np.abs(Phi).max()
-    assert not Gamma.size or np.abs(across @ Gamma).max() < 1e-15
+    normal_projector = np.eye(2 * len(q)) - T @ T.T
+    assert np.abs(normal_projector @ Phi).max() < 1e-14 * np.abs(Phi).max()
+    assert not Gamma.size or np.abs(normal_projector @ Gamma).max() < 1e-15
     assert np.linalg.matrix_rank(Phi, 1e-9) == T.shape[1]
 
 
-def hanging(modules: Modules, form: str) -> ModuleType:
-    """A pendulum with a push, in x and y or by its angle."""
+def pendulum(modules: Modules, form: str) -> ModuleType:
+    """A pendulum with a horizontal force, in x and y or by its angle."""
     if form == "angle":
         text = '[coordinates]\na = {}\n[energy]\nkinetic = "m*(l*a_dot)**2/2"\n'
         text += 'potential = "-9.81*m*l*cos(a)"\n[forces]\na = "push*l*cos(a) - a_dot/5"\n'
@@ -161,63 +165,63 @@ def hanging(modules: Modules, form: str) -> ModuleType:
 
 
 @pytest.mark.slow
-def test_a_regulator_of_it_is_that_of_minimal_coordinates(modules: Modules) -> None:
-    """About the equilibrium T^T Phi T is the step of the angle, in steps and control periods."""
-    xy, angle = (hanging(modules, form) for form in ("xy", "angle"))
+def test_reduced_derivatives_equal_those_of_minimal_coordinates(modules: Modules) -> None:
+    """At the equilibrium T^T Phi T is the step of the angle, over steps and control periods."""
+    xy, angle = (pendulum(modules, form) for form in ("xy", "angle"))
     q, _, u = xy.equilibrium(u=[0.0])
     T = xy.tangent(q, 0 * q)
     for period in (None, 0.05):
         Phi, Gamma = xy.discretize(q, 0 * q, u=u, control_period=period)
-        right, right_u = angle.discretize([0.0], [0.0], u=[0.0], control_period=period)
-        # T is of unit vectors: arcs, up to order and sign
+        expected, expected_u = angle.discretize([0.0], [0.0], u=[0.0], control_period=period)
+        # T consists of unit vectors: arc lengths, up to order and sign
         S = T.T @ np.array([[0.5, 0], [0, 0], [0, 0.5], [0, 0]])
-        np.testing.assert_allclose(T.T @ Phi @ T @ S, S @ right, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(T.T @ Gamma, S @ right_u, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(T.T @ Phi @ T @ S, S @ expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(T.T @ Gamma, S @ expected_u, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("text", tiers([WINCH, SLEIGH], SLEIGH), ids=lambda t: t[16:22])
 @pytest.mark.usefixtures("quickly_compiled")
-def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
+def test_portable_c_has_the_same_derivatives(modules: Modules, text: str, tmp_path: Any) -> None:
     fast: Any = modules.unoptimised(text)
-    plain = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
+    portable = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
     q, qd = fast.project(*fast.start, t=0.4)
     for method in fast.methods:
-        both = [m.discretize(q, qd, t=0.4, method=method) for m in (fast, plain)]
-        for a, b in zip(*both, strict=True):
+        results = [m.discretize(q, qd, t=0.4, method=method) for m in (fast, portable)]
+        for a, b in zip(*results, strict=True):
             assert a == pytest.approx(b, rel=1e-12, abs=1e-13)
 
 
 @pytest.mark.slow
-def test_a_step_that_can_not_be_made_has_none(modules: Modules) -> None:
+def test_step_that_fails_has_no_derivative(modules: Modules) -> None:
     m = modules.unoptimised(WINCH)
-    with pytest.raises(m.MotionError, match="no derivative of a step") as caught:
+    with pytest.raises(m.MotionError, match="no derivative of a step") as error:
         m.discretize([0.6, -0.8], [1e3, 1e3], h=1.0, u=[0.0], params={"k": 1.0})
-    assert caught.value.status in ("locked", "singular", "not finite")
+    assert error.value.status in ("locked", "singular", "not finite")
 
 
 @pytest.mark.slow
-def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
-    class Wrong:
-        """Derivatives that are a little off."""
+def test_wrong_derivative_fails_the_check(modules: Modules) -> None:
+    class PerturbedModule:
+        """Wrap the module; perturb its derivatives slightly."""
 
         def __getattr__(self, name: str) -> Any:
             return getattr(m, name)
 
-        def discretize(self, *state: Any, **how: Any) -> Any:
-            Phi, Gamma = m.discretize(*state, **how)
+        def discretize(self, *state: Any, **options: Any) -> Any:
+            Phi, Gamma = m.discretize(*state, **options)
             return Phi + 1e-5 * np.abs(Phi).max(), Gamma
 
-    m, made = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
-    for module, passed in ((m, True), (Wrong(), False)):
-        of = Comparison(made, module, np.random.default_rng(0), 4)
-        checks_derivatives.report_step_derivatives(of)
-        assert [row.passed for row in of.results] == [passed], of.results
+    m, scene_system = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
+    for module, passed in ((m, True), (PerturbedModule(), False)):
+        comparison = Comparison(scene_system, module, np.random.default_rng(0), 4)
+        checks_derivatives.report_step_derivatives(comparison)
+        assert [row.passed for row in comparison.results] == [passed], comparison.results
 
 
 @pytest.mark.slow
-def test_what_is_steep_in_a_velocity_passes_the_check(modules: Modules) -> None:
-    """Friction smoothed over a small part of the speeds there are: of narrow differences."""
-    m, made = modules.unoptimised(RUBBED), from_scene(parse(RUBBED, "test.toml"))
-    of = Comparison(made, m, np.random.default_rng(0), 4)
-    checks_derivatives.report_step_derivatives(of)
-    assert [row.passed for row in of.results] == [True], of.results
+def test_steep_velocity_dependence_passes_the_check(modules: Modules) -> None:
+    """Friction is smoothed over a small part of the velocity range: narrow differences."""
+    m, scene_system = modules.unoptimised(RUBBED), from_scene(parse(RUBBED, "test.toml"))
+    comparison = Comparison(scene_system, m, np.random.default_rng(0), 4)
+    checks_derivatives.report_step_derivatives(comparison)
+    assert [row.passed for row in comparison.results] == [True], comparison.results

@@ -1,4 +1,4 @@
-"""Events under constraints: what a jump's own formulas leave, the rows then move."""
+"""Events under constraints: a jump map sets some velocities, constraint impulses the rest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "constrained_events"
-# x hits a wall and goes back half as fast, and y with it
+# x hits a wall and rebounds at half its speed, and y with it
 PULLEY = """eomc = 1
 name = "pulley"
 [coordinates]
@@ -54,7 +54,7 @@ x_dot = "-3"
 friction = "stick"
 duration = 4
 """
-# a slide that a crank moves to and fro, and that has no force on the crank at its ends
+# a slide that a crank moves to and fro; at its ends it exerts no force on the crank
 YOKE = """eomc = 1
 name = "yoke"
 [coordinates]
@@ -82,7 +82,7 @@ tolerance = 1e-11
 duration = 4
 batch = true
 """
-# two bobs on rods in x and y; the lower one hits a wall, then both are stopped where they can't be
+# two bobs on rods, in x and y; the lower hits a wall, later a jump contradicts the constraints
 BOBS = """eomc = 1
 name = "bobs"
 [coordinates]
@@ -130,113 +130,119 @@ def pulley() -> ModuleType:
     return eomc.load(from_scene(parse(PULLEY, "pulley.toml")), BUILDS)
 
 
-def test_events_are_on_the_side_where_the_rows_leave_them(pulley: ModuleType) -> None:
-    """y was thought to go on as before the jump, so where it turned was not seen."""
+def test_event_functions_use_the_state_after_projection(pulley: ModuleType) -> None:
+    """Regression: y was extrapolated from before the jump, so its turning point was missed."""
     run = pulley.simulate(u=2.0)
     speed = math.sqrt(5.0)
-    hit = 2 * (speed - 2)
-    assert run.events["wall"].t[0] == pytest.approx(hit, abs=1e-12)
-    assert run.events["turn"].t[0] == pytest.approx(hit + speed, abs=1e-12)
+    hit_time = 2 * (speed - 2)
+    assert run.events["wall"].t[0] == pytest.approx(hit_time, abs=1e-12)
+    assert run.events["turn"].t[0] == pytest.approx(hit_time + speed, abs=1e-12)
 
 
-def test_what_the_rows_turn_slides_the_other_way(pulley: ModuleType) -> None:
-    """Friction went on as before the jump, and drove what it should have braked."""
+def test_friction_reverses_where_constraints_reverse_a_velocity(pulley: ModuleType) -> None:
+    """Regression: friction kept its direction across the jump and drove the motion."""
     run = pulley.simulate(params={"rub": 4.0}, duration=3.0)
-    hit = 2 - math.sqrt(2.0)
-    assert run.events["wall"].t == pytest.approx([hit], abs=1e-12)
-    speed = (2 - hit) / 2
-    assert run.events["y_stops"].t == pytest.approx([hit + speed], abs=1e-12)
+    hit_time = 2 - math.sqrt(2.0)
+    assert run.events["wall"].t == pytest.approx([hit_time], abs=1e-12)
+    speed = (2 - hit_time) / 2
+    assert run.events["y_stops"].t == pytest.approx([hit_time + speed], abs=1e-12)
     assert run["x"][-1] == pytest.approx(1 - speed**2 / 2, abs=1e-12)
     assert run["y_slides"][-1] == 0
 
 
-def test_what_a_jump_sets_stays_and_the_rest_follows_by_one_impulse() -> None:
-    """It was shared with the rest: x2 went back slower than the scene said."""
+def test_velocity_set_by_a_jump_stays_and_the_rest_follows_by_one_impulse() -> None:
+    """Regression: the impulse also changed x2_dot, which rebounded slower than the scene says."""
     bobs = eomc.load(from_scene(parse(BOBS, "bobs.toml")), BUILDS)
     run = bobs.simulate()
-    before, behind = np.flatnonzero(run.t == run.events["wall"].t[0])
-    q, one, other = run.q[before], run.qd[before], run.qd[behind]
-    assert other[2] == pytest.approx(-0.8 * one[2], rel=1e-14)
-    A = np.vstack([bobs.constraint_jacobian(q), [0, 0, 1, 0]])  # rods, and the wall
-    impulse = bobs.D(q) @ (other - one)
-    along = A.T @ np.linalg.lstsq(A.T, impulse, rcond=None)[0]
-    assert impulse == pytest.approx(along, abs=1e-12) and np.linalg.norm(impulse) > 1
-    before, behind = np.flatnonzero(run.t == 0.5)
-    D, A, asked = bobs.D(q := run.q[before]), bobs.constraint_jacobian(q), np.array([1, 1, 1, -1])
-    share = np.linalg.solve(A @ np.linalg.solve(D, A.T), A @ asked)
-    assert run.qd[behind] == pytest.approx(asked - np.linalg.solve(D, A.T @ share), abs=1e-12)
+    row_before, row_after = np.flatnonzero(run.t == run.events["wall"].t[0])
+    q, qd_before, qd_after = run.q[row_before], run.qd[row_before], run.qd[row_after]
+    assert qd_after[2] == pytest.approx(-0.8 * qd_before[2], rel=1e-14)
+    A = np.vstack([bobs.constraint_jacobian(q), [0, 0, 1, 0]])  # rods and wall
+    impulse = bobs.D(q) @ (qd_after - qd_before)
+    expected = A.T @ np.linalg.lstsq(A.T, impulse, rcond=None)[0]
+    assert impulse == pytest.approx(expected, abs=1e-12) and np.linalg.norm(impulse) > 1
+    row_before, row_after = np.flatnonzero(run.t == 0.5)
+    D, A, qd_jump = (
+        bobs.D(q := run.q[row_before]),
+        bobs.constraint_jacobian(q),
+        np.array([1, 1, 1, -1]),
+    )
+    multipliers = np.linalg.solve(A @ np.linalg.solve(D, A.T), A @ qd_jump)
+    assert run.qd[row_after] == pytest.approx(
+        qd_jump - np.linalg.solve(D, A.T @ multipliers), abs=1e-12
+    )
     assert run.status == "ok" and max(abs(run.constraints["lower"])) < 1e-13
 
 
-def test_inputs_that_grow_in_a_table_move_what_stuck(pulley: ModuleType) -> None:
-    """It stuck for ever: that a force had jumped over what friction holds was no crossing."""
-    how = {"params": {"rub": 1.0}, "control_period": 0.5, "duration": 1.5}
-    run = pulley.simulate([0, 0], [0, 0], u=[[0.0], [3.0], [3.0]], **how)
+def test_sudden_input_moves_a_sticking_body(pulley: ModuleType) -> None:
+    """Regression: it stuck for ever: a force that steps past the friction limit is no crossing."""
+    options = {"params": {"rub": 1.0}, "control_period": 0.5, "duration": 1.5}
+    run = pulley.simulate([0, 0], [0, 0], u=[[0.0], [3.0], [3.0]], **options)
     assert run.events["y_slips"].t.tolist() == [0.5]
     assert run["x"][-1] == pytest.approx(0.25, abs=1e-12)
 
 
-def test_what_an_input_carries_over_zero_may_cross_it_later(pulley: ModuleType) -> None:
-    """The event was thought to be still on the side where it was by the input before."""
+def test_event_function_crossed_by_an_input_step_can_cross_again(pulley: ModuleType) -> None:
+    """Regression: the side of the event function was that of the previous input."""
     run = pulley.simulate([0, 0], [0, 0], u=[[4.0]] + 7 * [[-4.0]], control_period=0.5)
-    at = 1 + math.sqrt(0.25 + 2 * 1.125)
-    assert run.events["behind"].t == pytest.approx([at], abs=1e-12)
+    expected = 1 + math.sqrt(0.25 + 2 * 1.125)
+    assert run.events["behind"].t == pytest.approx([expected], abs=1e-12)
 
 
-def test_what_turns_at_a_dead_point_does_not_lock_the_rest(yoke: ModuleType) -> None:
-    """The row that held the slide came before the pin, which was left out in its place."""
+def test_sticking_at_a_dead_point_does_not_lock_the_mechanism(yoke: ModuleType) -> None:
+    """Regression: the constraint of the sticking slide displaced that of the pin."""
     run = yoke.simulate()
     assert run.stopped == "middle" and len(run.events["s_stops"]) == 1
     mass = 1 + 3 * 0.5**2
     assert run["phi_dot"][-1] == pytest.approx(math.sqrt(9 - 2 * 0.5 * 2 / mass), rel=1e-11)
 
 
-@pytest.mark.parametrize("at", [0.3, 0.8, 1.2, 2.0, 2.9])
-@pytest.mark.parametrize("how", [{"duration": 50.0}, {"h": 0.005, "steps": 800}])
-def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float, how: dict) -> None:
-    """By rounding it stopped and slipped for ever, until its jumps were said to accumulate.
+@pytest.mark.parametrize("angle", [0.3, 0.8, 1.2, 2.0, 2.9])
+@pytest.mark.parametrize("options", [{"duration": 50.0}, {"h": 0.005, "steps": 800}])
+def test_joint_held_by_another_stays_at_rest(yoke: ModuleType, angle: float, options: dict) -> None:
+    """Regression: by rounding it stopped and slipped until its jumps seemed to accumulate.
 
-    In fixed steps velocities are compared with what accelerations make of them.
+    Fixed steps compare velocities with the change that accelerations make.
     """
-    start = yoke.project([0, at, 0, 0], [0, 0, 0, 0], fixed=["phi"])
+    start = yoke.project([0, angle, 0, 0], [0, 0, 0, 0], fixed=["phi"])
     for bearing, rub, torque in ((0.1, 10.0, 1.0), (2.0, 1e-3, 1.0), (0.0, 9.0, -0.7)):
         params = {"bearing": bearing, "rub": rub}
-        run = yoke.simulate(*start, params=params, u=torque, **how)
-        assert run.status == "ok" and run["phi"][-1] == pytest.approx(at, abs=1e-14)
+        run = yoke.simulate(*start, params=params, u=torque, **options)
+        assert run.status == "ok" and run["phi"][-1] == pytest.approx(angle, abs=1e-14)
         assert len(run.events["phi_stops"]) <= 1 and len(run.events["s_stops"]) <= 1
 
 
-def test_what_stopped_before_a_rest_may_stop_behind_it(yoke: ModuleType) -> None:
-    """As it had not moved in between, its stops were said to accumulate."""
-    for at, table in ((2.0, (0, 0, 3, 0, -3)), (1.0, (1, -1, 4, 0, 2))):
+def test_joint_can_stop_before_and_after_a_rest(yoke: ModuleType) -> None:
+    """Regression: since it had not moved in between, its stops seemed to accumulate."""
+    for angle, table in ((2.0, (0, 0, 3, 0, -3)), (1.0, (1, -1, 4, 0, 2))):
         u = [[float(torque)] for torque in table]
-        how = {"params": {"bearing": 0.01, "rub": 3.0}, "control_period": 1.0, "duration": 5.0}
-        assert yoke.simulate([0, at], [0, 0.5], u=u, **how).status == "ok"
+        options = {"params": {"bearing": 0.01, "rub": 3.0}, "control_period": 1.0, "duration": 5.0}
+        assert yoke.simulate([0, angle], [0, 0.5], u=u, **options).status == "ok"
 
 
-def test_a_stroke_moves_what_sticks(pulley: ModuleType) -> None:
-    """What was held by 1 N took up all of it."""
+def test_jump_moves_a_sticking_body(pulley: ModuleType) -> None:
+    """Regression: the friction force of 1 N absorbed the whole impulse."""
     run = pulley.simulate([0, 0], [0, 0], params={"rub": 1.0}, duration=4.0)
     assert run.events["y_slips"].t.tolist() == [] and run["y_slides"][-1] == 1
     assert run["x"][-1] == pytest.approx(-3 * 0.5 + 0.5 * 0.25 / 4, abs=1e-12)
 
 
-def test_a_start_whose_rates_the_rows_give_slides(yoke: ModuleType) -> None:
-    """The slide was thought to stick, as no rate of it was given, and the start was refused."""
+def test_start_whose_velocities_follow_from_constraints_slides(yoke: ModuleType) -> None:
+    """Regression: without an initial velocity of its own the slide was taken to stick."""
     run = yoke.simulate(q0=[0, 1.0], qd0=[0, -2.0], duration=0.1)
     assert run["s_dot"][0] == pytest.approx(math.sin(1.0), rel=1e-14)
     assert run.q[0, 2:].tolist() == [1, -1] and run.status == "ok"
-    many = yoke.simulate_batch(q0=[[0, 1.0]], qd0=[[0, -2.0]], duration=0.1, tol=1e-11)
-    assert many.q[0, -1].tolist() == run.q[-1].tolist()
+    batch = yoke.simulate_batch(q0=[[0, 1.0]], qd0=[[0, -2.0]], duration=0.1, tol=1e-11)
+    assert batch.q[0, -1].tolist() == run.q[-1].tolist()
     with pytest.raises(yoke.MotionError, match="with s, phi as given"):
         yoke.project([1, 1, 1, 1], [0, 0, 0, 0], fixed=["s", "phi", "s_slides"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_c_of_joints_that_stick_gives_no_warning(tmp_path: Path, real: str) -> None:
+def test_c_of_sticking_joints_compiles_without_warnings(tmp_path: Path, real: str) -> None:
     text = YOKE.replace("tolerance = 1e-11", f'tolerance = 1e-5\nreal = "{real}"')
-    made = eomc.sources(from_scene(parse(text, "yoke.toml"))).files
+    sources = eomc.sources(from_scene(parse(text, "yoke.toml"))).files
     for name in ("yoke.h", "yoke.c"):
-        (tmp_path / name).write_text(made[name], encoding="utf-8")
+        (tmp_path / name).write_text(sources[name], encoding="utf-8")
     compiled("cc", *STRICT, "-c", "yoke.c", cwd=tmp_path)

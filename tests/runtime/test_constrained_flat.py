@@ -1,4 +1,4 @@
-"""A parallelogram goes through the position where it lies flat and its rows fade."""
+"""A parallelogram passes the flat position, where its constraint gradients vanish."""
 
 from __future__ import annotations
 
@@ -29,10 +29,8 @@ def module(request: pytest.FixtureRequest, modules: Modules, unoptimised_file: N
 
 
 @pytest.mark.parametrize("start", [0.05, 0.0503, 0.0471, 0.05 + 1e-5])
-def test_a_parallelogram_goes_on_through_the_flat_position(
-    module: ModuleType, start: float
-) -> None:
-    """Rounding in a correction is more than that of a coordinate near zero there."""
+def test_parallelogram_passes_the_flat_position(module: ModuleType, start: float) -> None:
+    """There the rounding of a correction exceeds that of a coordinate near zero."""
     run = module.simulate(q0=[start, 0.0, start], qd0=[-3.0, 0.0, -3.0], **FLAT)
     assert run.status == "ok" and run.q[-1, 0] < -0.5
     np.testing.assert_allclose(run.q[:, 0], start - 3 * run.t, rtol=0, atol=1e-9)
@@ -41,29 +39,29 @@ def test_a_parallelogram_goes_on_through_the_flat_position(
 
 
 @pytest.mark.parametrize("start", [0.3, 0.06, 0.0375])
-def test_a_stage_where_rows_have_no_slope_throws_nothing_out(
+def test_stage_with_vanishing_constraint_gradient_does_not_diverge(
     module: ModuleType, start: float
 ) -> None:
-    """At 0 to a rounding, at a step's end or amid one: a row that is rounding holds nothing."""
+    """At 0 to rounding, at a step's end or within it: a gradient of rounding is no constraint."""
     run = module.simulate(q0=[start, 0.0, start], qd0=[-3.0, 0.0, -3.0], **FLAT)
     assert run.status == "ok"
     np.testing.assert_allclose(run.q[:, 0], start - 3 * run.t, rtol=0, atol=1e-9)
     assert np.abs(run.qd[:, 0] + 3.0).max() < 1e-6
 
 
-def test_steps_near_the_flat_position_are_as_long_as_elsewhere(module: ModuleType) -> None:
-    """What leaves the rows there decays by qd/q, and each step puts it back: 200 1/s here."""
-    near = {"q0": [-0.015, 0.0, -0.015], "qd0": [-3.0, 0.0, -3.0]}
-    assert module.advice(**near, h=0.1, params=FLAT["params"]) is None
-    # two bars that turn as one, held by a spring of 2 k: w^2 = k
+def test_step_limit_near_the_flat_position_is_the_usual_one(module: ModuleType) -> None:
+    """Deviations normal to the constraints decay by qd/q = 200 1/s; steps project them away."""
+    state = {"q0": [-0.015, 0.0, -0.015], "qd0": [-3.0, 0.0, -3.0]}
+    assert module.advice(**state, h=0.1, params=FLAT["params"]) is None
+    # two bars that turn as one, on a spring of 2 k: w^2 = k
     stiff = {"q0": [0.9, 0.0, 0.9], "qd0": [0.0] * 3, "params": {**FLAT["params"], "k": 1e4}}
     assert "limit of about 0.028 s here (fastest mode 100 rad/s" in module.advice(**stiff, h=0.029)
     assert module.advice(**stiff, h=0.028) is None
 
 
 @pytest.mark.slow
-def test_rows_that_turn_with_a_fast_motion_shorten_no_step() -> None:
-    """Andrews' squeezer: by changes along its rows alone 0.6 ms, where 2.6 ms are right."""
+def test_constraints_that_rotate_with_a_fast_motion_do_not_limit_steps() -> None:
+    """Andrews' squeezer: changes within the constraints alone gave 0.6 ms; 2.6 ms are right."""
     andrews = eomc.load(SCENES / "andrews_squeezer.toml", MODULES.parent / "flat")
     run = andrews.simulate(method="rk4", h=5e-5, steps=600, every=20)
     assert all(andrews.advice(q, qd, 2e-3) is None for q, qd in zip(run.q, run.qd, strict=True))

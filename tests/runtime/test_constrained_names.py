@@ -1,4 +1,4 @@
-"""What is asked of constraints that are not there, or not so: the names that there are."""
+"""Requests for constraints that do not exist: the message lists the existing names."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ FUNCTIONS = (
 ).split()
 
 
-def rod(**asked: bool) -> System:
-    made = System.make(
+def rod(**options: bool) -> System:
+    scene_system = System.make(
         "rod_named", {"x": (0.6, 0.0), "y": (-0.8, 0.0)}, "(x_dot**2 + y_dot**2)/2", "9.81*y",
-        outputs={"rod": "x**2 + y**2 - 1"}, h=0.01, duration=0.1, **asked,
+        outputs={"rod": "x**2 + y**2 - 1"}, h=0.01, duration=0.1, **options,
     )  # fmt: skip
-    row = Constraint("rod", made.outputs[0].formula)
+    row = Constraint("rod", scene_system.outputs[0].formula)
     pull = Reaction("pull", (row.multiplier, 0 * row.multiplier, 0 * row.multiplier))
-    return replace(made, outputs=(), constraints=(row,), reactions=(pull,), plane=True)
+    return replace(scene_system, outputs=(), constraints=(row,), reactions=(pull,), plane=True)
 
 
 @pytest.fixture(scope="module")
@@ -34,64 +34,64 @@ def module(unoptimised_file: None, tmp_path_factory: pytest.TempPathFactory) -> 
     return eomc.load(rod(linearize=True), tmp_path_factory.mktemp("named"))
 
 
-def test_of_unknown_names_those_that_there_are_are_told(module: ModuleType) -> None:
+def test_unknown_names_are_refused_with_the_known_ones(module: ModuleType) -> None:
     run = module.simulate()
-    for found, name, known in (
+    for mapping, name, known in (
         (run.multipliers, "multipliers", "rod"),
         (run.constraints, "constraints", "rod"),
         (run.reactions, "reactions", "pull"),
         (module.reactions(*module.start), "reactions", "pull"),
     ):
         with pytest.raises(KeyError, match=f"{name}: 'hinge' is not one of {known}"):
-            found["hinge"]
-        assert list(found) == [known] and "hinge" not in found
-        again = pickle.loads(pickle.dumps(found))
-        assert type(again) is dict and again.keys() == found.keys()
+            mapping["hinge"]
+        assert list(mapping) == [known] and "hinge" not in mapping
+        copied = pickle.loads(pickle.dumps(mapping))
+        assert type(copied) is dict and copied.keys() == mapping.keys()
     with pytest.raises(KeyError, match="did you mean 'rod'"):
         run.multipliers["Rod"]
 
 
-def test_the_tangent_of_many_states_has_a_leading_n(module: ModuleType) -> None:
+def test_tangent_of_many_states_has_a_leading_axis(module: ModuleType) -> None:
     q, qd = np.array([[0.6, -0.8], [0.8, 0.6]]), np.array([[0.8, 0.6], [0.0, 0.0]])
-    found = module.tangent(q, qd)
-    assert found.shape == (2, 4, 2)
+    tangents = module.tangent(q, qd)
+    assert tangents.shape == (2, 4, 2)
     for k in range(2):
-        np.testing.assert_array_equal(found[k], module.tangent(q[k], qd[k]))
+        np.testing.assert_array_equal(tangents[k], module.tangent(q[k], qd[k]))
     assert module.tangent(q[:0], qd[:0]).shape == (0, 4, 0)
     with pytest.raises(ValueError, match=r"tangent: 2 changes keep .* at state 0, 4 at state 1"):
         module.tangent([[0.6, -0.8], [0.0, 0.0]], np.zeros((2, 2)))
 
 
-def test_where_something_is_not_finite_is_told(
+def test_state_with_non_finite_results_is_reported(
     module: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     q, qd = np.array([[0.6, -0.8], [1.7e308, 0.0]]), np.zeros((2, 2))
-    for at in (q[1], qd[1]), (q, qd):
+    for state in (q[1], qd[1]), (q, qd):
         with pytest.raises(module.MotionError, match=r"at q = \[1\.7e\+308 .* slope is not finite"):
-            module.tangent(*at)
+            module.tangent(*state)
     q[1] = 0.8, 0.6
     monkeypatch.setattr(
         model_of(module).constraints,
         "multipliers_or_nan",
         lambda *_: np.array([[1.0], [np.inf]]),
     )
-    words = r"at q = \[0\.8 0\.6\], qd = \[0\. 0\.\]: the multiplier of rod is not finite there"
-    with pytest.raises(module.MotionError, match=words):
+    message = r"at q = \[0\.8 0\.6\], qd = \[0\. 0\.\]: the multiplier of rod is not finite there"
+    with pytest.raises(module.MotionError, match=message):
         module.multipliers(q, qd)
 
 
-def test_what_is_held_is_a_list_of_names(module: ModuleType) -> None:
-    for held in (3, 2.5, True):
+def test_fixed_must_be_a_list_of_names(module: ModuleType) -> None:
+    for fixed in (3, 2.5, True):
         with pytest.raises(ValueError, match="no list of names: x, y, x_dot, y_dot"):
-            module.project(*module.start, fixed=held)
-    for held in ("z", ["z"], ["z", "x"], ["x", "z"]):
+            module.project(*module.start, fixed=fixed)
+    for fixed in ("z", ["z"], ["z", "x"], ["x", "z"]):
         with pytest.raises(ValueError, match="fixed: 'z'"):
-            module.project(*module.start, fixed=held)
+            module.project(*module.start, fixed=fixed)
     q, _ = module.project([0.6, 1.0], [0.0, 0.0], fixed=(name for name in ["x"]))
     np.testing.assert_allclose(q, [0.6, 0.8], rtol=1e-15)
 
 
-def test_what_a_scene_has_to_ask_for_is_told(quickly_compiled: None, tmp_path: Path) -> None:
+def test_missing_options_of_a_scene_are_named(quickly_compiled: None, tmp_path: Path) -> None:
     module = eomc.load(replace(rod(), reactions=()), tmp_path)
     with pytest.raises(ValueError, match=r"build it with System\.make\(\.\.\., linearize=True"):
         module.tangent(*module.start)
@@ -101,7 +101,7 @@ def test_what_a_scene_has_to_ask_for_is_told(quickly_compiled: None, tmp_path: P
         module.simulate().reactions["rod"]
 
 
-def test_without_constraints_their_functions_say_what_is_missing(
+def test_constraint_functions_of_a_scene_without_constraints_are_refused(
     quickly_compiled: None, tmp_path: Path
 ) -> None:
     free = replace(rod(), constraints=(), reactions=(), plane=False)
@@ -112,5 +112,5 @@ def test_without_constraints_their_functions_say_what_is_missing(
             getattr(module, name)
     with pytest.raises(AttributeError, match="has no attribute 'tangents'"):
         _ = module.tangents
-    for made in ("multipliers", "constraints", "reactions"):
-        assert getattr(module.simulate(), made) == {}
+    for attribute in ("multipliers", "constraints", "reactions"):
+        assert getattr(module.simulate(), attribute) == {}

@@ -1,4 +1,4 @@
-"""A control period: what is held over so many steps is what a row of each step holds."""
+"""Control periods: an input held over several steps equals a table with one row per step."""
 
 from __future__ import annotations
 
@@ -45,51 +45,53 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
 
 @pytest.mark.parametrize(("steps", "every"), [(40, 1), (41, 3), (43, 7), (2, 5)])
 @pytest.mark.parametrize("text", tiers([SCENE, PLAIN], SCENE))
-def test_a_function_is_called_once_a_period(
+def test_feedback_law_is_called_once_per_control_period(
     modules: Modules, text: str, steps: int, every: int
 ) -> None:
     module = modules.unoptimised(text)
     for method in module.methods:
-        how: dict[str, Any] = {"steps": steps, "method": method}
+        options: dict[str, Any] = {"steps": steps, "method": method}
         calls: list[float] = []
 
-        def counted(t: float, q: Any, qd: Any, calls: list[float] = calls) -> list[float]:
+        def counting_law(t: float, q: Any, qd: Any, calls: list[float] = calls) -> list[float]:
             calls.append(t)
             return law(t, q, qd)
 
-        run = module.simulate(u=counted, control_period=0.02, every=every, **how)
+        run = module.simulate(u=counting_law, control_period=0.02, every=every, **options)
         assert calls == pytest.approx(np.arange(-(-steps // 4)) * 0.02)
-        # by hand: a row of each step, found four steps at a time
+        # the expected table: one row per step, computed four steps at a time
         table = np.empty((steps, 2))
         for k in range(0, steps, 4):
-            table[k:] = law(k * 0.005, *(x[-1] for x in _upto(module, table[:k], method)))
-        whole = module.simulate(u=table, every=every, **how)
-        assert np.array_equal(run.x, whole.x), method
-        assert np.array_equal(run.u, whole.u) and np.array_equal(run.saturated, whole.saturated)
-        rows = module.simulate(u=table[::4], control_period=0.02, every=every, **how)
-        assert rows == whole and np.array_equal(rows.u, whole.u)
+            table[k:] = law(k * 0.005, *(x[-1] for x in state_after(module, table[:k], method)))
+        expected = module.simulate(u=table, every=every, **options)
+        assert np.array_equal(run.x, expected.x), method
+        assert np.array_equal(run.u, expected.u) and np.array_equal(
+            run.saturated, expected.saturated
+        )
+        periodic = module.simulate(u=table[::4], control_period=0.02, every=every, **options)
+        assert periodic == expected and np.array_equal(periodic.u, expected.u)
 
 
-def _upto(module: ModuleType, table: Any, method: str) -> tuple[Any, Any]:
+def state_after(module: ModuleType, table: Any, method: str) -> tuple[Any, Any]:
     run = module.simulate(u=table if len(table) else None, steps=len(table), method=method)
     return run.q, run.qd
 
 
-def test_signals_are_read_once_a_period(balanced: ModuleType) -> None:
+def test_signals_are_evaluated_once_per_control_period(balanced: ModuleType) -> None:
     params = {"k": 55.0}
     run = balanced.simulate(control_period=0.02, steps=40, params=params)
-    same = balanced.simulate(
+    expected = balanced.simulate(
         u=lambda t, q, qd: balanced.signal(q, qd, t, params), control_period=0.02, steps=40,
         params=params,
     )  # fmt: skip
-    assert np.array_equal(run.x, same.x) and np.array_equal(run.u, same.u)
+    assert np.array_equal(run.x, expected.x) and np.array_equal(run.u, expected.u)
     assert not np.array_equal(run.x, balanced.simulate(steps=40, params=params).x)
     assert balanced.simulate(u=[1, 0], control_period=0.1, steps=40) == balanced.simulate(
         u=[1, 0], steps=40
     )
 
 
-def test_batches_take_a_row_a_period(balanced: ModuleType) -> None:
+def test_batch_takes_one_input_row_per_control_period(balanced: ModuleType) -> None:
     table = np.random.default_rng(2).normal(size=(3, 11, 2))
     runs = balanced.simulate_batch(u=table, steps=41, every=3, control_period=0.02)
     for k in range(3):
@@ -100,18 +102,20 @@ def test_batches_take_a_row_a_period(balanced: ModuleType) -> None:
         balanced.simulate_batch(u=u, steps=41, control_period=0.02)
 
 
-def test_the_error_is_that_of_the_run_with_its_period(balanced: ModuleType) -> None:
-    """The finer runs ask as often: what is left is the stepper's error, of order 4."""
+def test_error_estimate_includes_the_control_period(balanced: ModuleType) -> None:
+    """Finer runs have the same control periods: the rest is the error of the method, of order 4."""
     with warnings.catch_warnings(action="error"):
         run = balanced.simulate(u=law, control_period=0.02, duration=1.0, estimate=True)
     exact = balanced.simulate(u=law, control_period=0.02, duration=1.0, h=0.02 / 64)
-    off = np.abs(run.q[-1] - exact.q[-1])
-    assert np.all(off < 3 * run.error.q[-1]) and np.all(run.error.q[-1] < 30 * off + 1e-13)
+    true_error = np.abs(run.q[-1] - exact.q[-1])
+    assert np.all(true_error < 3 * run.error.q[-1]) and np.all(
+        run.error.q[-1] < 30 * true_error + 1e-13
+    )
     assert run.error.observed == pytest.approx(4, abs=0.5)
 
 
 @pytest.mark.parametrize(
-    ("period", "words"),
+    ("period", "message"),
     [
         (0.012, r"0.012 s is 2.4 steps of h = 0.005 s: give a whole number of steps, such as 0.01"),
         (0.001, "0.2 steps.*such as 0.005"),
@@ -121,18 +125,20 @@ def test_the_error_is_that_of_the_run_with_its_period(balanced: ModuleType) -> N
         (np.inf, "not a finite number"),
     ],
 )
-def test_periods_are_whole_numbers_of_steps(balanced: ModuleType, period: Any, words: str) -> None:
+def test_control_period_must_be_a_whole_number_of_steps(
+    balanced: ModuleType, period: Any, message: str
+) -> None:
     for call in (balanced.simulate, balanced.simulate_batch):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=message):
             call(steps=8, control_period=period)
 
 
-def test_a_batch_can_not_read_signals_once_a_period(balanced: ModuleType) -> None:
+def test_batch_cannot_evaluate_signals_once_per_control_period(balanced: ModuleType) -> None:
     with pytest.raises(ValueError, match="a batch follows the signals: give u, a row a period"):
         balanced.simulate_batch(steps=40, control_period=0.02)
 
 
-def test_a_row_too_few_is_told(balanced: ModuleType) -> None:
+def test_too_few_input_rows_are_refused(balanced: ModuleType) -> None:
     with pytest.raises(ValueError, match="9 rows for 40 steps: give one row a control period of 4"):
         balanced.simulate(u=np.zeros((9, 2)), steps=40, control_period=0.02)
     with pytest.raises(ValueError, match=r"expected \(2,\), \(batch, 2\) or \(batch, 10, 2\)"):
@@ -140,7 +146,7 @@ def test_a_row_too_few_is_told(balanced: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("period", [1e12, 1e300])
-def test_a_period_may_be_longer_than_the_run(balanced: ModuleType, period: float) -> None:
+def test_control_period_can_exceed_the_run(balanced: ModuleType, period: float) -> None:
     with warnings.catch_warnings(action="ignore"):
         run = balanced.simulate(steps=7, u=law, control_period=period)
     assert np.all(run.u == run.u[0]) and run.u.shape == (8, 2)
@@ -149,15 +155,15 @@ def test_a_period_may_be_longer_than_the_run(balanced: ModuleType, period: float
     assert np.all(runs.steps == 7)
 
 
-def test_a_law_that_does_not_repeat_itself_has_no_estimate(balanced: ModuleType) -> None:
+def test_feedback_law_that_is_not_deterministic_has_no_error_estimate(balanced: ModuleType) -> None:
     draw = np.random.default_rng(3)
 
-    def noisy(t: float, q: Any, qd: Any) -> Any:
+    def noisy_law(t: float, q: Any, qd: Any) -> Any:
         return np.array(law(t, q, qd)) + 1e-3 * draw.normal(size=2)
 
-    run = balanced.simulate(u=noisy, control_period=0.02, steps=40)
+    run = balanced.simulate(u=noisy_law, control_period=0.02, steps=40)
     with pytest.raises(ValueError, match="other values at the start"):
         run.estimate()
     with pytest.warns(RuntimeWarning, match="other values at the start"):
-        again = balanced.simulate(u=noisy, control_period=0.02, steps=40, estimate=True)
-    assert again.error is None and len(again) == 41
+        estimated = balanced.simulate(u=noisy_law, control_period=0.02, steps=40, estimate=True)
+    assert estimated.error is None and len(estimated) == 41

@@ -1,4 +1,4 @@
-"""Which crossings of zero are seen, and when: pairs in one step, dips, touches, roundings."""
+"""Detection and times of zero crossings: pairs in one step, dips, tangential zeros, rounding."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def springs() -> ModuleType:
     return built(TWO)
 
 
-def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) -> None:
+def test_close_crossings_in_one_long_step_are_detected(free: ModuleType) -> None:
     for w in (0.3, 1e-2, 1e-4):
         run = free.simulate(duration=4.0, params={"first": 1.0, "second": 1 + w})
         assert run.events["pair"].t == pytest.approx([1, 1 + w], abs=1e-13)
@@ -54,12 +54,12 @@ def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) ->
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
-def test_a_dip_between_two_looks_is_seen(springs: ModuleType, tol: float) -> None:
-    """-sin(2 t)/2 + 1/2, less 1e-3; a cubic through two looks is no nearer than some percent."""
+def test_dip_between_two_evaluations_is_detected(springs: ModuleType, tol: float) -> None:
+    """-sin(2 t)/2 + 1/2 - 1e-3; a cubic through two evaluations errs by some percent."""
     run = springs.simulate(tol=tol, duration=30.0, params={"k": 1.0, "d": 1e-3 - 0.5})
-    deep = math.asin(1 - 2e-3) / 2
-    exact = [t + math.pi * k for k in range(10) for t in (deep, math.pi / 2 - deep)]
-    assert run.events["curve"].t == pytest.approx(exact, abs=100 * tol)
+    offset = math.asin(1 - 2e-3) / 2
+    expected = [t + math.pi * k for k in range(10) for t in (offset, math.pi / 2 - offset)]
+    assert run.events["curve"].t == pytest.approx(expected, abs=100 * tol)
 
 
 FAST = (
@@ -71,15 +71,15 @@ FAST = (
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-12])
-def test_events_that_change_faster_than_the_motion_are_seen(tol: float) -> None:
-    """A stroboscope lost two thirds of its flashes, in steps of a second."""
+def test_events_faster_than_the_motion_are_detected(tol: float) -> None:
+    """Regression: with steps of a second, two thirds of a stroboscope's flashes were missed."""
     fast = built(FAST)
     for w in (50.0, 7.0, 301.0):
         run = fast.simulate(tol=tol, duration=10.0, params={"w": w})
-        exact = math.pi / w * np.arange(1, int(10 * w / math.pi) + 1)
-        assert run.events["line"].t == pytest.approx(exact, abs=1e-11)
-        folds = w * np.cos(np.linspace(0, 10, 1_000_001)) - 0.1  # x = cos t, over half turns
-        crossings = np.abs(np.diff(np.floor(folds / math.pi + 0.5))).sum()
+        expected = math.pi / w * np.arange(1, int(10 * w / math.pi) + 1)
+        assert run.events["line"].t == pytest.approx(expected, abs=1e-11)
+        phase = w * np.cos(np.linspace(0, 10, 1_000_001)) - 0.1  # x = cos t, over half turns
+        crossings = np.abs(np.diff(np.floor(phase / math.pi + 0.5))).sum()
         assert len(run.events["curve"]) == crossings
     slow = fast.simulate(tol=tol, duration=10.0, params={"w": 0.1})
     assert slow.steps < 20 and slow.rejected < 5
@@ -92,33 +92,35 @@ ROUNDED = (
 )
 
 
-def test_steps_are_not_halved_for_rounding_and_corners() -> None:
-    """What is conserved is rounding alone, in steps of any size: they were halved for ever."""
+def test_steps_are_not_halved_for_rounding_and_kinks() -> None:
+    """Regression: a conserved quantity is rounding in steps of any size: endless halving."""
     module = built(ROUNDED)
     for duration in (1e-6, 1e-3, 20.0):
         run = module.simulate(tol=1e-9, duration=duration)
         assert run.status == "ok" and run.steps + run.rejected < 150
     third, turn = math.pi / 3, 2 * math.pi
-    exact = [a + turn * k for k in range(4) for a in (third, 1.5 * third, 4.5 * third, 5 * third)]
-    assert run.events["curve"].t == pytest.approx([t for t in exact if t < 20], abs=1e-8)
+    expected = [
+        a + turn * k for k in range(4) for a in (third, 1.5 * third, 4.5 * third, 5 * third)
+    ]
+    assert run.events["curve"].t == pytest.approx([t for t in expected if t < 20], abs=1e-8)
 
 
 def roots(f, t_end: float) -> list[float]:
-    """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
+    """Return all zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
     times = np.linspace(0, t_end, 4001).tolist()
     values = [f(t, math) for t in times]
-    found = []
+    zeros = []
     with mpmath.workdps(30):
         for a, b, fa, fb in zip(times, times[1:], values, values[1:], strict=False):
             if fa * fb < 0:
-                found.append(float(mpmath.findroot(f, (a, b), solver="anderson", tol=1e-40)))
-    return found
+                zeros.append(float(mpmath.findroot(f, (a, b), solver="anderson", tol=1e-40)))
+    return zeros
 
 
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 100))]
 )
-def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: int) -> None:
+def test_random_events_equal_those_of_the_exact_motion(springs: ModuleType, seed: int) -> None:
     random = np.random.default_rng(seed)
     k, a, b, c, d = random.uniform([0.5, -1, -1, -1, -1], [9, 1, 1, 1, 1])
     q0, qd0 = random.normal(size=(2, 2))
@@ -141,9 +143,9 @@ def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: 
         return x * rate - d
 
     for name, f in (("line", line), ("curve", curve)):
-        expected, found = roots(f, 12.0), run.events[name].t
-        assert len(found) == len(expected), name
-        assert found == pytest.approx(expected, abs=1e-11)
+        expected, times = roots(f, 12.0), run.events[name].t
+        assert len(times) == len(expected), name
+        assert times == pytest.approx(expected, abs=1e-11)
 
 
 PAIR = "(x - first)*(x - second)"
@@ -158,54 +160,54 @@ EVENTS = (
 
 @pytest.fixture(scope="module")
 def free() -> ModuleType:
-    """A body under a constant force, with events where the parameters say."""
+    """A body under a constant force, with events at positions given by parameters."""
     return built(FREE.format(name="free", events="\n".join(EVENTS)))
 
 
-def test_each_of_a_close_pair_has_its_own_time(free: ModuleType) -> None:
-    where = {"a": -1.0, "first": 0.3, "second": 0.3001}
-    run = free.simulate([1.0], [0.0], duration=2.0, params=where)
-    exact = [math.sqrt(2 * (1 - x)) for x in (0.3001, 0.3)]
-    assert run.events["pair"].t == pytest.approx(exact, abs=1e-12)
+def test_close_pair_has_separate_times(free: ModuleType) -> None:
+    params = {"a": -1.0, "first": 0.3, "second": 0.3001}
+    run = free.simulate([1.0], [0.0], duration=2.0, params=params)
+    expected = [math.sqrt(2 * (1 - x)) for x in (0.3001, 0.3)]
+    assert run.events["pair"].t == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_zero_that_is_touched_is_none_that_is_crossed(free: ModuleType) -> None:
-    where = {"a": 2.0, "wall": 0.0}
+def test_tangential_zero_is_no_crossing(free: ModuleType) -> None:
+    params = {"a": 2.0, "wall": 0.0}
     for tol in (1e-6, 1e-9, 1e-13):
-        run = free.simulate([1.0], [-2.0], duration=2.0, tol=tol, params=where)
+        run = free.simulate([1.0], [-2.0], duration=2.0, tol=tol, params=params)
         assert run.t[-1] == 2.0 and len(run.events["wall"]) == 0
-    low = free.simulate([1 - 1e-6], [-2.0], duration=2.0, params=where)
+    low = free.simulate([1 - 1e-6], [-2.0], duration=2.0, params=params)
     assert low.stopped == "wall" and low.t[-1] == pytest.approx(1 - 1e-3, abs=1e-9)
 
 
-def test_events_of_one_formula_see_the_same_crossings(free: ModuleType) -> None:
+def test_events_of_one_formula_have_the_same_crossings(free: ModuleType) -> None:
     run = free.simulate(duration=2.0, params={"first": 0.7, "second": 0.702})
     assert run.events["pair"].t == pytest.approx([0.7, 0.702], abs=1e-13)
     assert run.events["up"].t == pytest.approx([0.702], abs=1e-13)
 
 
-def test_at_rest_at_a_zero_it_first_has_to_leave(free: ModuleType) -> None:
+def test_event_at_zero_at_the_start_is_not_detected_at_rest(free: ModuleType) -> None:
     run = free.simulate([1.0], [0.0], duration=1, params={"a": -1.0, "wall": 1.0})
     assert run.t[-1] == 1.0 and run.stopped == ""
 
 
-def test_a_jump_to_no_state_ends_the_run_at_it_and_says_which(free: ModuleType) -> None:
+def test_jump_to_a_non_finite_state_ends_the_run_and_names_the_event(free: ModuleType) -> None:
     with pytest.warns(RuntimeWarning, match="event 'gap' jumps to no finite state"):
         run = free.simulate(duration=2.0, params={"gap": 0.5})
     assert run.status == "not finite" and run.t[-1] == pytest.approx(0.5, abs=1e-13)
     assert run.q[-1, 0] == pytest.approx(0.5) and len(run.events["gap"]) == 1
 
 
-def test_what_is_all_rounding_ends_soon() -> None:
+def test_event_function_of_pure_rounding_costs_little_time() -> None:
     events = event("noise", "sin(x)**2 + cos(x)**2 - 1", 'action = "stop"')
     module = built(FREE.format(name="noisy", events=events))
-    begun = time.perf_counter()
+    start = time.perf_counter()
     assert module.simulate(duration=20.0, h_most=0.1).steps < 2000
-    assert time.perf_counter() - begun < 1.0
+    assert time.perf_counter() - start < 1.0
 
 
 def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
-    """A wall that is met when a clock strikes: both jump, one after the other."""
+    """A wall is hit as a clock strikes: both events jump, one after the other."""
     scene = tmp_path / "walls.toml"
     scene.write_text(
         'eomc = 1\nname = "struck"\n[coordinates]\n'
@@ -227,10 +229,8 @@ def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
     tiers([("float", 1000.0, 300.0), ("double", 1e5, 1.7e9)], "double"),
     ids=["float", "double"],
 )
-def test_steps_of_few_roundings_of_the_time_keep_events_apart(
-    real: str, w: float, t0: float
-) -> None:
-    """One that never happens stands before the others."""
+def test_steps_of_few_time_roundings_separate_events(real: str, w: float, t0: float) -> None:
+    """An event that is never detected comes before the others."""
     text = f"""
     eomc = 1
     name = "late_{real}"
@@ -247,4 +247,4 @@ def test_steps_of_few_roundings_of_the_time_keep_events_apart(
     """
     text += event("never", "x + 1000", 'direction = "rising"', "") + event("zero", "x")
     run = built(text).simulate(t0=t0, duration=60 * math.pi / w)
-    assert {name: len(found.t) for name, found in run.events.items()} == {"never": 0, "zero": 60}
+    assert {name: len(events.t) for name, events in run.events.items()} == {"never": 0, "zero": 60}

@@ -1,4 +1,4 @@
-"""The derivatives of a step against differences of forty digits, and of steps one by one."""
+"""Derivatives of a step, against differences of 55 digits and sequences of single steps."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ Q, QD = np.array([0.2, 0.4]), np.array([-0.3, 0.7])
 INPUTS = {"signals": None, "held": [0.6, -0.4], "beyond": [40.0, 0.3]}
 
 
-class Exact:
-    """Steps of a scene in many digits, by the equations that the reference writes out."""
+class ExactStepper:
+    """Steps of a scene in many digits, by the equations of the reference."""
 
     def __init__(self, system: System) -> None:
         r, self.n, self.m = symbolic.derive(system), len(system.q), len(system.u)
@@ -82,36 +82,37 @@ class Exact:
         symbols = [*system.q, *system.qd, sympy.Symbol("t", real=True), *system.u, *parameters]
         modules = [{"Min": min, "Max": max}, "mpmath"]
         self.motion, self.signals = (
-            sympy.lambdify(symbols, list(found), modules=modules) for found in (r.motion, r.signals)
+            sympy.lambdify(symbols, list(expressions), modules=modules)
+            for expressions in (r.motion, r.signals)
         )
 
-    def acceleration(self, q: Any, qd: Any, t: Any, u: Any, more: Any) -> Any:
-        """u: held, or None for the signals; more: added to either."""
+    def acceleration(self, q: Any, qd: Any, t: Any, u: Any, added: Any) -> Any:
+        """Return the acceleration; u is constant, or None for the signals, plus `added`."""
         n = self.n
         if u is None:
             u = self.signals(*q, *qd, t, *[0] * self.m, *self.values)
-        found = self.motion(
-            *q, *qd, t, *(a + b for a, b in zip(u, more, strict=True)), *self.values
+        values = self.motion(
+            *q, *qd, t, *(a + b for a, b in zip(u, added, strict=True)), *self.values
         )
-        D, bias, tau = found[: n * n], found[n * n : -n], found[-n:]
+        D, bias, tau = values[: n * n], values[n * n : -n], values[-n:]
         matrix = mpmath.matrix([D[n * i : n * i + n] for i in range(n)])
         force = mpmath.matrix([a - b for a, b in zip(tau, bias, strict=True)])
         return np.array(mpmath.lu_solve(matrix, force))
 
     def step(self, method: str, z: Any, h: Any, t: Any, u: Any) -> Any:
-        """The state a step after z = [q, qd, u added]; stages by sweeps until nothing moves."""
+        """Return the state a step after z = [q, qd, added]; stages by fixed-point iteration."""
         m, n = METHODS[method], self.n
-        q, qd, more = z[:n], z[n : 2 * n], z[2 * n :]
+        q, qd, added = z[:n], z[n : 2 * n], z[2 * n :]
         number = lambda f: mpmath.mpf(f.numerator) / f.denominator  # noqa: E731
         square = [[[number(x) for x in row] for row in rows] for rows in (m.a, m.a_squared)]
         a = np.array([[mpmath.mpf(0)] * n] * m.stages)
         for _ in range(60 if m.implicit else 1):
-            before = a.copy()
+            previous = a.copy()
             for i in range(m.stages):
                 v, r = (sum((x * a[j] for j, x in enumerate(rows[i])), 0 * q) for rows in square)
                 c = number(m.c[i])
-                a[i] = self.acceleration(q + c * h * qd + h**2 * r, qd + h * v, t + c * h, u, more)
-            if m.implicit and max(abs(x) for x in (a - before).ravel()) < mpmath.mpf(10) ** -52:
+                a[i] = self.acceleration(q + c * h * qd + h**2 * r, qd + h * v, t + c * h, u, added)
+            if m.implicit and max(abs(x) for x in (a - previous).ravel()) < mpmath.mpf(10) ** -52:
                 break
         else:
             assert not m.implicit, "the stages are not found"
@@ -119,124 +120,142 @@ class Exact:
         return np.concatenate([q + h * qd + h**2 * r, qd + h * v])
 
     def derivative(self, method: str, z: Any, h: float, t: float, u: Any) -> Any:
-        """d step/dz by central differences: 55 digits, 18 of them the width's."""
+        """Return d step/dz by central differences in 55 digits, 18 of which are the width."""
         with mpmath.workdps(55):
-            z, by = np.array([mpmath.mpf(float(x)) for x in z]), mpmath.mpf(10) ** -18
+            z, width = np.array([mpmath.mpf(float(x)) for x in z]), mpmath.mpf(10) ** -18
             h, t = mpmath.mpf(h), mpmath.mpf(t)
             columns = []
             for k in range(len(z)):
                 ends = []
                 for sign in (1, -1):
-                    moved = z.copy()
-                    moved[k] += sign * by
-                    ends.append(self.step(method, moved, h, t, u))
-                columns.append([float(x) for x in (ends[0] - ends[1]) / (2 * by)])
+                    shifted = z.copy()
+                    shifted[k] += sign * width
+                    ends.append(self.step(method, shifted, h, t, u))
+                columns.append([float(x) for x in (ends[0] - ends[1]) / (2 * width)])
         return np.array(columns).T
 
 
 @cache
-def exact(text: str) -> Exact:
-    return Exact(from_scene(parse(text, "test.toml")))
+def exact_stepper(text: str) -> ExactStepper:
+    return ExactStepper(from_scene(parse(text, "test.toml")))
 
 
 def derivative(text: str, method: str, h: float, t: float, u: Any) -> Any:
-    """(Phi, Gamma) to all digits of a double."""
-    found = exact(text)
-    given = None if u is None else [mpmath.mpf(x) for x in u[: found.m]]
-    J = found.derivative(method, [*Q, *QD, *[0] * found.m], h, t, given)
+    """Return (Phi, Gamma), accurate to all digits of a double."""
+    stepper = exact_stepper(text)
+    inputs = None if u is None else [mpmath.mpf(x) for x in u[: stepper.m]]
+    J = stepper.derivative(method, [*Q, *QD, *[0] * stepper.m], h, t, inputs)
     return J[:, :4], J[:, 4:]
 
 
-def quick(method: str, given: str) -> bool:
-    """Whether that is no variant of what others show too."""
-    return method in ("rk4", "euler") or (method, given) == ("gauss4", "beyond")
+def is_quick(method: str, inputs: str) -> bool:
+    """Whether the case is no variant of others."""
+    return method in ("rk4", "euler") or (method, inputs) == ("gauss4", "beyond")
 
 
 @pytest.mark.parametrize(
-    ("text", "method", "given"),
+    ("text", "method", "inputs"),
     [
         pytest.param(
-            text, method, given, id=f"{method}-{given}",
-            marks=() if quick(method, given) else pytest.mark.slow,
+            text, method, inputs, id=f"{method}-{inputs}",
+            marks=() if is_quick(method, inputs) else pytest.mark.slow,
         )
         for text, method in CASES
-        for given in INPUTS
+        for inputs in INPUTS
     ],
 )  # fmt: skip
-def test_against_differences_of_forty_digits(
-    modules: Modules, text: str, method: str, given: str
+def test_derivatives_equal_differences_in_many_digits(
+    modules: Modules, text: str, method: str, inputs: str
 ) -> None:
-    """All digits, but for the last two of the largest entry."""
-    m, u = modules.unoptimised(text), INPUTS[given]
-    held = None if u is None else u[: len(m.inputs)]
-    Phi, Gamma = m.discretize(Q, QD, 0.03, 0.4, held, method=method)
-    right, right_u = derivative(text, method, 0.03, 0.4, u)
-    assert np.max(np.abs(Phi - right)) < 4e-15 * np.max(np.abs(right))
-    assert np.max(np.abs(Gamma - right_u)) < 4e-15 * max(np.max(np.abs(right_u)), 0.01)
-    assert np.any(right_u) or given == "beyond"
+    """All digits are right, except the last two of the largest entry."""
+    m, u = modules.unoptimised(text), INPUTS[inputs]
+    u_scene = None if u is None else u[: len(m.inputs)]
+    Phi, Gamma = m.discretize(Q, QD, 0.03, 0.4, u_scene, method=method)
+    expected, expected_u = derivative(text, method, 0.03, 0.4, u)
+    assert np.max(np.abs(Phi - expected)) < 4e-15 * np.max(np.abs(expected))
+    assert np.max(np.abs(Gamma - expected_u)) < 4e-15 * max(np.max(np.abs(expected_u)), 0.01)
+    assert np.any(expected_u) or inputs == "beyond"
 
 
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("text", tiers([EXPLICIT, IMPLICIT], EXPLICIT), ids=lambda t: t[-20:-1])
-def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
+def test_portable_c_has_the_same_derivatives(modules: Modules, text: str, tmp_path: Any) -> None:
     fast = modules.unoptimised(text)
-    plain = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
+    portable = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
     for method in fast.methods:
         for u in (None, [0.6, -0.4]):
-            both = [m.discretize(Q, QD, 0.03, 0.4, u, method=method) for m in (fast, plain)]
-            for a, b in zip(*both, strict=True):
+            results = [m.discretize(Q, QD, 0.03, 0.4, u, method=method) for m in (fast, portable)]
+            for a, b in zip(*results, strict=True):
                 assert a == pytest.approx(b, rel=1e-13, abs=1e-14)
 
 
 @pytest.mark.parametrize("t", [0.3, np.linspace(0, 1, 3)])
 @pytest.mark.parametrize("period", [None, 0.06])
-def test_many_states_are_each_of_them(modules: Modules, t: Any, period: float | None) -> None:
-    m, how = modules.unoptimised(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
+def test_derivatives_at_many_states_equal_single_ones(
+    modules: Modules, t: Any, period: float | None
+) -> None:
+    m, options = modules.unoptimised(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
     q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
-    Phi, Gamma = m.discretize(q, qd, t=t, **how)
+    Phi, Gamma = m.discretize(q, qd, t=t, **options)
     assert Phi.shape == (3, 4, 4) and Gamma.shape == (3, 4, 2)
     for k in range(3):
-        one = m.discretize(q[k], qd[k], t=float(np.broadcast_to(t, 3)[k]), **how)
-        assert np.array_equal(Phi[k], one[0]) and np.array_equal(Gamma[k], one[1])
+        single = m.discretize(q[k], qd[k], t=float(np.broadcast_to(t, 3)[k]), **options)
+        assert np.array_equal(Phi[k], single[0]) and np.array_equal(Gamma[k], single[1])
 
 
-@pytest.mark.parametrize("given", ["signals", "held"])
+@pytest.mark.parametrize("inputs", ["signals", "held"])
 @pytest.mark.parametrize("method", ["rk4", "euler"])
-def test_a_control_period_is_its_steps(modules: Modules, method: str, given: str) -> None:
-    """Against differences of runs with that period, good to 1e-10 or so."""
-    m, u = modules.unoptimised(EXPLICIT), INPUTS[given]
-    x, how = np.hstack([Q, QD]), {"h": 0.02, "control_period": 0.1, "method": method}
-    Phi, Gamma = m.discretize(Q, QD, u=u, **how)
+def test_derivative_over_a_control_period_equals_differences_of_runs(
+    modules: Modules, method: str, inputs: str
+) -> None:
+    """Against differences of runs with that period, accurate to about 1e-10."""
+    m, u = modules.unoptimised(EXPLICIT), INPUTS[inputs]
+    x, options = np.hstack([Q, QD]), {"h": 0.02, "control_period": 0.1, "method": method}
+    Phi, Gamma = m.discretize(Q, QD, u=u, **options)
 
-    def end(x: Any, u: Any) -> Any:
-        run = m.simulate(*np.split(x, 2), steps=5, u=u, **how)
+    def final_state(x: Any, u: Any) -> Any:
+        run = m.simulate(*np.split(x, 2), steps=5, u=u, **options)
         return run.x[-1]
 
     stencil, width = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)), 4e-3
-    for k, by in enumerate(width * np.eye(4)):
-        near = sum(w * (end(x + j * by, u) - end(x - j * by, u)) for j, w in stencil) / width
-        assert Phi[:, k] == pytest.approx(near, abs=1e-9)
+    for k, offset in enumerate(width * np.eye(4)):
+        expected = (
+            sum(
+                w * (final_state(x + j * offset, u) - final_state(x - j * offset, u))
+                for j, w in stencil
+            )
+            / width
+        )
+        assert Phi[:, k] == pytest.approx(expected, abs=1e-9)
     start = m.signal(Q, QD) if u is None else np.array(u)
-    for k, by in enumerate(width * np.eye(2)):
-        ends = ((w, end(x, start + j * by) - end(x, start - j * by)) for j, w in stencil)
+    for k, offset in enumerate(width * np.eye(2)):
+        ends = (
+            (w, final_state(x, start + j * offset) - final_state(x, start - j * offset))
+            for j, w in stencil
+        )
         assert Gamma[:, k] == pytest.approx(sum(w * d for w, d in ends) / width, abs=1e-9)
 
 
 @pytest.mark.parametrize("period", [None, 0.04])
-def test_inputs_and_parameters_of_each_state(modules: Modules, period: float | None) -> None:
+def test_inputs_and_parameters_per_state(modules: Modules, period: float | None) -> None:
     m = modules.unoptimised(EXPLICIT)
     q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
     u, k = np.array([[0.0, 0.1], [1.0, 0.2], [-2.0, 0.3]]), np.array([4.0, 5.0, 6.0])
-    named, t = {"force": u[:, 0], "push": 0.2}, np.array([0.0, 0.1, 0.2])
-    more: dict[str, Any] = {"discretize": {"control_period": period}, "linearize": {}}
-    for held, params in ((u, None), (u.tolist(), {"k": k}), (named, k[:, None]), (None, {"k": k})):
-        for name, how in more.items():
-            found = getattr(m, name)(q, qd, u=held, t=t, params=params, **how)
+    by_name, t = {"force": u[:, 0], "push": 0.2}, np.array([0.0, 0.1, 0.2])
+    options_by_name: dict[str, Any] = {"discretize": {"control_period": period}, "linearize": {}}
+    for u_all, params in (
+        (u, None),
+        (u.tolist(), {"k": k}),
+        (by_name, k[:, None]),
+        (None, {"k": k}),
+    ):
+        for name, options in options_by_name.items():
+            results = getattr(m, name)(q, qd, u=u_all, t=t, params=params, **options)
             for j in range(3):
-                own = [u[j, 0], 0.2] if held is named else None if held is None else u[j]
+                u_own = [u[j, 0], 0.2] if u_all is by_name else None if u_all is None else u[j]
                 p = None if params is None else {"k": k[j]}
-                one = getattr(m, name)(q[j], qd[j], u=own, t=t[j], params=p, **how)
-                assert all(np.array_equal(a[j], b) for a, b in zip(found, one, strict=True))
+                single = getattr(m, name)(q[j], qd[j], u=u_own, t=t[j], params=p, **options)
+                assert all(np.array_equal(a[j], b) for a, b in zip(results, single, strict=True))
     A, B = m.linearize(np.empty((0, 2)), np.empty((0, 2)), u=np.empty((0, 2)))
     assert A.shape == (0, 4, 4) and B.shape == (0, 4, 2)
     for name in ("discretize", "linearize"):
@@ -248,7 +267,7 @@ def test_inputs_and_parameters_of_each_state(modules: Modules, period: float | N
             getattr(m, name)(Q, QD, u=u)
 
 
-def test_what_it_refuses(modules: Modules, cartpole: ModuleType) -> None:
+def test_invalid_arguments_are_refused(modules: Modules, cartpole: ModuleType) -> None:
     m = modules.unoptimised(EXPLICIT)
     with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):
         cartpole.discretize([0, 0], [0, 0])
@@ -256,61 +275,61 @@ def test_what_it_refuses(modules: Modules, cartpole: ModuleType) -> None:
         m.discretize(Q, QD, method="gauss4")
     with pytest.raises(ValueError, match="give a whole number of steps"):
         m.discretize(Q, QD, h=0.02, control_period=0.05)
-    with pytest.raises(m.MotionError, match="not finite there") as caught:
+    with pytest.raises(m.MotionError, match="not finite there") as error:
         m.discretize([Q, Q], [QD, 1e160 * QD], u=[0, 0])
-    assert caught.value.status == "not finite" and "e+159" in str(caught.value)
+    assert error.value.status == "not finite" and "e+159" in str(error.value)
     stiff = 'eomc = 1\nname = "stiff"\n[coordinates]\nx = { start = 1 }\n[energy]\n' + (
         'kinetic = "x_dot**2/2"\npotential = "1e4*x**4"\n[run]\ndiscretize = true\n'
     )
     gauss: Any = modules.unoptimised(stiff + 'method = "gauss4"\n')
-    with pytest.raises(gauss.MotionError, match="does not converge") as caught:
+    with pytest.raises(gauss.MotionError, match="does not converge") as error:
         gauss.discretize([1.0], [0.0], h=5.0)
-    assert caught.value.status == "no convergence"
+    assert error.value.status == "no convergence"
 
 
-def test_a_scene_that_does_not_ask_has_nothing_of_it() -> None:
+def test_scene_without_discretize_has_none_of_its_code() -> None:
     for text in (LOOP, LOOP + "linearize = true\n"):
         for name, file in eomc.sources(from_scene(parse(text, "test.toml"))).files.items():
             if name.endswith((".c", ".h")):
-                for trace in ("derivative(", "Phi", "_eliminate(", "stage_slopes"):
-                    assert trace not in file, name
+                for fragment in ("derivative(", "Phi", "_eliminate(", "stage_slopes"):
+                    assert fragment not in file, name
     explicit = eomc.sources(from_scene(parse(EXPLICIT, "test.toml"))).files["stepped.c"]
     assert "rk4_derivative(" in explicit and "_eliminate(" not in explicit
 
 
 @pytest.mark.parametrize(
-    ("run", "signal", "words"),
+    ("run", "signal", "message"),
     [
         ("discretize = true", "sign(theta)", "a signal jumps.*do without discretize"),
         ("discretize = 1", "theta", "run.discretize: must be true or false"),
     ],
 )
-def test_what_can_not_be_built(run: str, signal: str, words: str) -> None:
+def test_scenes_that_cannot_be_discretized_are_refused(run: str, signal: str, message: str) -> None:
     text = LOOP.replace("k*theta + 3*lean*theta_dot - x_dot**2", signal) + run
-    with pytest.raises(EomcError, match=words):
+    with pytest.raises(EomcError, match=message):
         eomc.sources(from_scene(parse(text, "test.toml")))
 
 
-def test_a_system_made_in_python_asks_too(modules: Modules) -> None:
-    made = eomc.System.make(
+def test_system_made_in_python_can_be_discretized(modules: Modules) -> None:
+    scene_system = eomc.System.make(
         "slider", ["x"], "x_dot**2/2", "x**4", inputs={"F": 0}, forces={"x": "F"}, discretize=True
     )
-    Phi, Gamma = modules.unoptimised(made).discretize([0.0], [1.0], 0.1, u=[0.0])
+    Phi, Gamma = modules.unoptimised(scene_system).discretize([0.0], [1.0], 0.1, u=[0.0])
     assert Phi.shape == (2, 2) and Gamma == pytest.approx(np.array([[0.005], [0.1]]), rel=1e-3)
 
 
-def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
-    class Wrong:
+def test_wrong_derivative_fails_the_check(modules: Modules) -> None:
+    class PerturbedModule:
         def __getattr__(self, name: str) -> Any:
             return getattr(m, name)
 
-        def discretize(self, *state: Any, **how: Any) -> Any:
-            Phi, Gamma = m.discretize(*state, **how)
+        def discretize(self, *state: Any, **options: Any) -> Any:
+            Phi, Gamma = m.discretize(*state, **options)
             return Phi, Gamma * (1 + 1e-5)
 
-    m, made = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
-    for module, passed in ((m, True), (Wrong(), False)):
-        of = Comparison(made, module, np.random.default_rng(0), 4)
-        checks_derivatives.report_step_derivatives(of)
-        assert [row.passed for row in of.results] == [passed] * 3, of.results
-    assert [row.name for row in of.results] == [f"discretize by {x}" for x in m.methods]
+    m, scene_system = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
+    for module, passed in ((m, True), (PerturbedModule(), False)):
+        comparison = Comparison(scene_system, module, np.random.default_rng(0), 4)
+        checks_derivatives.report_step_derivatives(comparison)
+        assert [row.passed for row in comparison.results] == [passed] * 3, comparison.results
+    assert [row.name for row in comparison.results] == [f"discretize by {x}" for x in m.methods]

@@ -1,4 +1,4 @@
-"""What drives give in a motion, parted from what constraints give."""
+"""Forces of drives in a given motion, separate from the constraint forces."""
 
 from __future__ import annotations
 
@@ -21,56 +21,56 @@ def linkage(modules: Modules) -> ModuleType:
 
 
 def motion(m: ModuleType, u: Any) -> tuple[Any, Any, Any]:
-    """(q, qd, qdd) along some of a run under constant inputs."""
+    """Return (q, qd, qdd) along a run under constant inputs."""
     run = m.simulate(h=0.01, steps=20, every=5, u=u)
     return run.q, run.qd, m.acceleration(run.q, run.qd, u=u)
 
 
-def test_of_one_drive_it_is_what_has_acted(linkage: ModuleType) -> None:
+def test_force_of_a_single_drive_equals_the_applied_one(linkage: ModuleType) -> None:
     for u, drive in (([0.6, 0.0], "q1"), ([0.0, -0.7], "q3")):
         q, qd, qdd = motion(linkage, u)
         tau, multipliers = linkage.drive_forces(q, qd, qdd, [drive])
-        right = np.zeros_like(q)
-        right[:, linkage.coordinates.index(drive)] = sum(u)
-        np.testing.assert_allclose(tau, right, rtol=0, atol=1e-11)
+        expected = np.zeros_like(q)
+        expected[:, linkage.coordinates.index(drive)] = sum(u)
+        np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-11)
         np.testing.assert_allclose(multipliers, linkage.multipliers(q, qd, u=u), rtol=0, atol=1e-10)
-        one = linkage.drive_forces(q[2], qd[2], qdd[2], drive)
-        assert np.array_equal(one[0], tau[2]) and np.array_equal(one[1], multipliers[2])
+        single = linkage.drive_forces(q[2], qd[2], qdd[2], drive)
+        assert np.array_equal(single[0], tau[2]) and np.array_equal(single[1], multipliers[2])
 
 
 @pytest.mark.parametrize("drives", [None, ["q1", "q3"], ["q2", "q3"]])
-def test_of_more_drives_than_freedoms_the_least_is_taken(linkage: ModuleType, drives: Any) -> None:
+def test_force_of_redundant_drives_is_the_smallest(linkage: ModuleType, drives: Any) -> None:
     q, qd, qdd = (x[3] for x in motion(linkage, [0.6, -0.2]))
     tau, multipliers = linkage.drive_forces(q, qd, qdd, drives)
     A, D = linkage.constraint_jacobian(q), linkage.D(q)
-    whole = linkage.inverse_dynamics(q, qd, qdd)
-    np.testing.assert_allclose(whole, D @ qdd + linkage.bias(q, qd), rtol=1e-12, atol=1e-12)
+    total = linkage.inverse_dynamics(q, qd, qdd)
+    np.testing.assert_allclose(total, D @ qdd + linkage.bias(q, qd), rtol=1e-12, atol=1e-12)
     friction = linkage.tau(q, qd, u=[0.0, 0.0])
-    np.testing.assert_allclose(tau + friction + A.T @ multipliers, whole, rtol=0, atol=1e-11)
-    which = [linkage.coordinates.index(name) for name in drives or linkage.coordinates]
-    assert not np.delete(tau, which).any()
-    # any other is more: none of what drives and rows alone can hold is in it
-    held = np.linalg.svd(np.hstack([np.eye(3)[:, which], -A.T]))[2][3:]
-    for way in held:
-        other = np.zeros(3)
-        other[which] = way[: len(which)]
-        assert abs(other @ np.linalg.solve(D, tau)) < 1e-10 * np.abs(tau).max()
-        assert np.abs(other).max() > 0.1
+    np.testing.assert_allclose(tau + friction + A.T @ multipliers, total, rtol=0, atol=1e-11)
+    indices = [linkage.coordinates.index(name) for name in drives or linkage.coordinates]
+    assert not np.delete(tau, indices).any()
+    # other solutions are larger: tau has no component that drives and constraints balance alone
+    null_space = np.linalg.svd(np.hstack([np.eye(3)[:, indices], -A.T]))[2][3:]
+    for direction in null_space:
+        self_stress = np.zeros(3)
+        self_stress[indices] = direction[: len(indices)]
+        assert abs(self_stress @ np.linalg.solve(D, tau)) < 1e-10 * np.abs(tau).max()
+        assert np.abs(self_stress).max() > 0.1
 
 
-def test_forces_from_outside_are_borne_too(linkage: ModuleType) -> None:
+def test_external_forces_are_balanced_too(linkage: ModuleType) -> None:
     q, qd, qdd = (x[1] for x in motion(linkage, [0.4, 0.0]))
     push = {"coupler": [3.0, -1.0, 0.5]}
     tau, _ = linkage.drive_forces(q, qd, qdd, ["q1"], push)
-    alone, _ = linkage.drive_forces(q, qd, qdd, ["q1"])
-    way = np.linalg.svd(linkage.constraint_jacobian(q))[2][-1]
-    work = way @ linkage.frame_forces(q, push)
-    assert (tau - alone)[0] * way[0] == pytest.approx(-work, rel=1e-12)
+    without_push, _ = linkage.drive_forces(q, qd, qdd, ["q1"])
+    direction = np.linalg.svd(linkage.constraint_jacobian(q))[2][-1]
+    work = direction @ linkage.frame_forces(q, push)
+    assert (tau - without_push)[0] * direction[0] == pytest.approx(-work, rel=1e-12)
     assert abs(work) > 0.1
 
 
 @pytest.mark.slow
-def test_wheels_and_massless_ropes_have_them_too(modules: Modules) -> None:
+def test_nonholonomic_and_massless_systems_have_drive_forces(modules: Modules) -> None:
     sleigh: Any = modules.unoptimised(SLEIGH + "inverse_dynamics = true\n")
     q, qd = sleigh.start
     qdd = sleigh.acceleration(q, qd, u=[0.6])
@@ -80,20 +80,20 @@ def test_wheels_and_massless_ropes_have_them_too(modules: Modules) -> None:
     rope: Any = modules.unoptimised(ROPE + "inverse_dynamics = true\n")
     q, qd = rope.start
     qdd = rope.acceleration(q, qd)
-    tau, held = rope.drive_forces(q, qd, qdd, ["x"])
+    tau, multipliers = rope.drive_forces(q, qd, qdd, ["x"])
     np.testing.assert_allclose(tau, 0, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(held, rope.multipliers(q, qd), rtol=1e-10)
+    np.testing.assert_allclose(multipliers, rope.multipliers(q, qd), rtol=1e-10)
 
 
-def test_without_constraints_a_motion_tells_its_drives(modules: Modules) -> None:
+def test_without_constraints_drive_forces_equal_inverse_dynamics(modules: Modules) -> None:
     text = 'eomc = 1\nname = "cart_drives"\n[coordinates]\nx = {}\na = { start = 0.4 }\n[energy]\n'
     text += (
         'kinetic = "x_dot**2 + x_dot*a_dot*cos(a) + m*a_dot**2"\npotential = "9*cos(a) + x**3"\n'
     )
     m: Any = modules.unoptimised(text + "[parameters]\nm = 1\n[run]\ninverse_dynamics = true\n")
     q, qd = np.array([0.0, 0.4]), np.array([0.1, 0.2])
-    tau, none = m.drive_forces(q, qd, [1.0, 2.0])
-    assert none.shape == (0,)
+    tau, multipliers = m.drive_forces(q, qd, [1.0, 2.0])
+    assert multipliers.shape == (0,)
     np.testing.assert_allclose(tau, m.inverse_dynamics(q, qd, [1.0, 2.0]), rtol=1e-13)
     with pytest.raises(ValueError, match=r"forces along x can't give .*: name others.* 2 freedoms"):
         m.drive_forces(q, qd, [1.0, 2.0], ["x"])
@@ -103,25 +103,26 @@ def test_without_constraints_a_motion_tells_its_drives(modules: Modules) -> None
         m.drive_forces(q, qd, [1.0, 2.0], params={"m": -1.0})
 
 
-def test_what_it_refuses(linkage: ModuleType) -> None:
+def test_invalid_arguments_are_refused(linkage: ModuleType) -> None:
     q, qd, qdd = (x[1] for x in motion(linkage, [0.4, 0.0]))
     with pytest.raises(ValueError, match="drives: 'crank' is not one of q1, q2, q3"):
         linkage.drive_forces(q, qd, qdd, ["crank"])
     with pytest.raises(ValueError, match="forces along nothing can't give this motion"):
         linkage.drive_forces(q, qd, qdd, [])
-    off = qdd + np.array([0.0, 0.0, 0.5])
+    qdd_invalid = qdd + np.array([0.0, 0.0, 0.5])
     row = linkage.constraint_jacobian(q)
-    worst = r"qdd: leaves the constraint pin_[xy]: its row of A qdd, .* is .* and has to be"
-    with pytest.raises(ValueError, match=worst) as told:
-        linkage.drive_forces(q, qd, off, ["q1"])
-    k = ["pin_x" in str(told.value), "pin_y" in str(told.value)].index(True)
-    assert f"{(row @ off)[k]:.6g} and has to be {(row @ qdd)[k]:.6g}" in str(told.value)
-    along = np.linalg.svd(row)[2][-1]
-    linkage.drive_forces(q, qd, qdd + 3 * along, ["q1"])  # what rows allow is not
+    message = r"qdd: leaves the constraint pin_[xy]: its row of A qdd, .* is .* and has to be"
+    with pytest.raises(ValueError, match=message) as error:
+        linkage.drive_forces(q, qd, qdd_invalid, ["q1"])
+    k = ["pin_x" in str(error.value), "pin_y" in str(error.value)].index(True)
+    assert f"{(row @ qdd_invalid)[k]:.6g} and has to be {(row @ qdd)[k]:.6g}" in str(error.value)
+    tangent = np.linalg.svd(row)[2][-1]
+    # accelerations within the constraints are accepted
+    linkage.drive_forces(q, qd, qdd + 3 * tangent, ["q1"])
 
 
 @pytest.mark.slow
-def test_redundant_rows_give_nothing(modules: Modules) -> None:
+def test_redundant_constraints_have_zero_multipliers(modules: Modules) -> None:
     text = (SCENES / "bricard.toml").read_text(encoding="utf-8").split("[picture]")[0]
     text = text.replace('name    = "bricard"', 'name = "bricard_drives"')
     m: Any = modules.unoptimised(text.replace("[run]", ASK) if "[run]" in text else text + ASK)
@@ -129,6 +130,6 @@ def test_redundant_rows_give_nothing(modules: Modules) -> None:
     qdd = m.acceleration(q, qd)
     tau, multipliers = m.drive_forces(q, qd, qdd, [m.coordinates[0]])
     np.testing.assert_allclose(tau, 0, rtol=0, atol=1e-10)
-    right = m.multipliers(q, qd)
-    assert (right == 0).any()
-    np.testing.assert_allclose(multipliers, right, rtol=1e-9, atol=1e-10)
+    expected = m.multipliers(q, qd)
+    assert (expected == 0).any()
+    np.testing.assert_allclose(multipliers, expected, rtol=1e-9, atol=1e-10)

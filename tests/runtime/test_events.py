@@ -1,4 +1,4 @@
-"""Events in adaptive steps: where they happen, in which order, and what they do."""
+"""Events in adaptive steps: detection, order and actions."""
 
 from __future__ import annotations
 
@@ -25,45 +25,45 @@ pytestmark = pytest.mark.usefixtures("unoptimised_file")
 
 @pytest.fixture(scope="module")
 def ball() -> ModuleType:
-    """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
+    """A ball that falls from 1 m, moves along at 1 m/s, and bounces off floor and wall."""
     return built(BALL)
 
 
 @pytest.mark.parametrize("e", [0.55, 0.8, 0.95])
-def test_a_ball_bounces_at_the_right_times_and_comes_to_rest(ball: ModuleType, e: float) -> None:
+def test_ball_bounces_at_the_right_times_and_comes_to_rest(ball: ModuleType, e: float) -> None:
     with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
         run = ball.simulate(tol=1e-12, duration=1e3, params={"e": e, "wall": 1e4})
-    found = run.events["impact"]
-    times = impacts(e, len(found))
-    assert len(found) >= 50 and np.max(np.abs(found.t - times) / times) < 1e-13
+    impact_events = run.events["impact"]
+    times = impacts(e, len(impact_events))
+    assert len(impact_events) >= 50 and np.max(np.abs(impact_events.t - times) / times) < 1e-13
     assert run.status == "accumulated" and f"t = {run.limit:.15g}" in run.message
     assert run.limit == pytest.approx(times[0] * (1 + e) / (1 - e), rel=1e-10)
     tops = run.events["top"]
     assert tops.q[:20, 1] == pytest.approx(e ** (2.0 * np.arange(1, 21)), rel=1e-9)
-    assert np.array_equal(run.events["impact"].q[:, 0] > 0, np.ones(len(found), bool))
-    assert pickle.loads(pickle.dumps(run)).events["impact"].t.tolist() == found.t.tolist()
+    assert np.array_equal(run.events["impact"].q[:, 0] > 0, np.ones(len(impact_events), bool))
+    assert pickle.loads(pickle.dumps(run)).events["impact"].t.tolist() == impact_events.t.tolist()
 
 
-def test_rows_stand_before_and_behind_a_jump(ball: ModuleType) -> None:
+def test_rows_exist_on_both_sides_of_a_jump(ball: ModuleType) -> None:
     run = ball.simulate(duration=1.0)
-    at = int(np.flatnonzero(np.diff(run.t) == 0)[0])
-    assert run.qd[at, 1] < 0 < run.qd[at + 1, 1] == pytest.approx(-0.8 * run.qd[at, 1])
-    assert np.array_equal(run.q[at], run.q[at + 1]) and run.t[at] == run.events["impact"].t[0]
+    row = int(np.flatnonzero(np.diff(run.t) == 0)[0])
+    assert run.qd[row, 1] < 0 < run.qd[row + 1, 1] == pytest.approx(-0.8 * run.qd[row, 1])
+    assert np.array_equal(run.q[row], run.q[row + 1]) and run.t[row] == run.events["impact"].t[0]
 
 
-def test_rows_at_times_follow_the_jumps(ball: ModuleType) -> None:
+def test_rows_at_output_times_follow_the_jumps(ball: ModuleType) -> None:
     times = np.linspace(0, 2.5, 41)
     run = ball.simulate(times=times, tol=1e-12)
-    hits = impacts(0.8, 9)
-    k = np.searchsorted(hits, times)
+    impact_times = impacts(0.8, 9)
+    k = np.searchsorted(impact_times, times)
     speed = math.sqrt(2 * G) * 0.8**k
-    since = times - np.where(k > 0, hits[k - 1], 0)
-    y = np.where(k > 0, speed * since, 1) - G * since**2 / 2
+    elapsed = times - np.where(k > 0, impact_times[k - 1], 0)
+    y = np.where(k > 0, speed * elapsed, 1) - G * elapsed**2 / 2
     assert run.q[:, 1] == pytest.approx(y, abs=1e-12)
-    assert len(run.events["impact"]) == np.sum(hits < 2.5)
+    assert len(run.events["impact"]) == np.sum(impact_times < 2.5)
 
 
-def test_a_stop_ends_the_run_at_it(ball: ModuleType) -> None:
+def test_stop_event_ends_the_run(ball: ModuleType) -> None:
     run = ball.simulate(params={"far": 0.7}, duration=5.0)
     assert run.status == "ok" and run.stopped == "away"
     assert run.t[-1] == pytest.approx(0.7, abs=1e-14) and run.q[-1, 0] == pytest.approx(0.7)
@@ -71,7 +71,7 @@ def test_a_stop_ends_the_run_at_it(ball: ModuleType) -> None:
     assert ball.simulate(params={"far": 7.0}, duration=1.0).stopped == ""
 
 
-def test_two_at_once_both_happen(ball: ModuleType) -> None:
+def test_simultaneous_events_are_both_detected(ball: ModuleType) -> None:
     corner = math.sqrt(2 / G)
     run = ball.simulate(params={"wall": corner}, duration=0.6)
     assert run.events["impact"].t == pytest.approx([corner], abs=1e-14)
@@ -80,29 +80,29 @@ def test_two_at_once_both_happen(ball: ModuleType) -> None:
     assert run.qd[-1] == pytest.approx([-1, up])
 
 
-def test_several_at_once_happen_in_the_order_of_the_scene(ball: ModuleType) -> None:
-    """A rounding apart: the other came first as often, and here and there one was lost."""
+def test_simultaneous_events_act_in_the_order_of_the_scene(ball: ModuleType) -> None:
+    """Regression: a rounding apart, the other came first as often, and some were lost."""
     rng = np.random.default_rng(3)
     for height, speed in rng.uniform(0.1, 3.0, (200, 2)):
-        end = math.sqrt(2 * height / G)
+        time = math.sqrt(2 * height / G)
         run = ball.simulate(
-            [0, height], [speed, 0], params={"wall": speed * end}, duration=1.2 * end
+            [0, height], [speed, 0], params={"wall": speed * time}, duration=1.2 * time
         )
-        which, rows = run.event_data
-        assert which.tolist() == [0, 2], (height, speed)
-        assert rows[:, 0] == pytest.approx([end, end], abs=1e-14)
+        indices, rows = run.event_data
+        assert indices.tolist() == [0, 2], (height, speed)
+        assert rows[:, 0] == pytest.approx([time, time], abs=1e-14)
 
 
-def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None:
+def test_event_at_zero_at_the_start_is_not_detected(ball: ModuleType) -> None:
     up = ball.simulate(q0=[0, 0], qd0=[0, 2.0], duration=0.5)
     assert up.events["impact"].t == pytest.approx([4 / G], abs=1e-14)
     assert up.events["top"].t == pytest.approx([2 / G], abs=1e-14)
-    down = ball.simulate(q0=[0, 0], qd0=[0, -1.0], duration=0.5)  # it is below already
+    down = ball.simulate(q0=[0, 0], qd0=[0, -1.0], duration=0.5)  # it is below the floor already
     assert len(down.events["impact"]) == 0 and down.q[-1, 1] < 0
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ('when = "y"', 'when = "z"', "'z' is not declared"),
         ('when = "y"', 'when = "1"', "never crosses zero: it has no names"),
@@ -116,20 +116,20 @@ def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None
         ('name = "away"', 'nam = "away"', "nam"),
     ],
 )
-def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> None:
-    with pytest.raises(SceneError) as fault:
+def test_invalid_event_is_refused(old: str, new: str, message: str) -> None:
+    with pytest.raises(SceneError) as error:
         parse(BALL.replace(old, new, 1), "events.toml")
-    assert words in str(fault.value)
+    assert message in str(error.value)
 
 
-def test_what_a_jump_may_set_is_told_as_part_of_many() -> None:
-    many = "".join(f"p{k} = 1.0\n" for k in range(9))
-    text = BALL.replace("[parameters]\n", f"[parameters]\n{many}", 1)
+def test_names_that_a_jump_may_set_are_listed_in_part() -> None:
+    parameters = "".join(f"p{k} = 1.0\n" for k in range(9))
+    text = BALL.replace("[parameters]\n", f"[parameters]\n{parameters}", 1)
     with pytest.raises(SceneError, match=r": a jump sets x, x_dot, .*, p\d and \d+ more"):
         parse(text.replace('y_dot = "-e*y_dot"', 'zzz = "1"', 1), "events.toml")
 
 
-def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType) -> None:
+def test_stopped_run_has_an_error_and_jumping_run_a_balance(ball: ModuleType) -> None:
     run = ball.simulate(params={"far": 0.7}, duration=5.0, estimate=True)
     assert run.stopped == "away" and max(run.error.end.values()) < 1e-9 and run.error.resolved
     assert ball.simulate(duration=1.0).balance().jumps == pytest.approx(-0.36 * G, rel=1e-8)
@@ -139,13 +139,13 @@ def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType
     assert resting.estimate().resolved
 
 
-def test_no_argument_belongs_to_fixed_and_to_adaptive_steps(ball: ModuleType) -> None:
+def test_arguments_of_fixed_and_adaptive_steps_exclude_each_other(ball: ModuleType) -> None:
     with pytest.raises(ValueError, match="h: belongs to fixed steps"):
         ball.simulate(h=0.01, h_most=0.1)
 
 
 @pytest.mark.slow
-def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
+def test_single_precision_has_a_reachable_tolerance() -> None:
     text = BALL.replace("bouncing", "float_ball").replace("[run]", '[run]\nreal = "float"')
     text = text.replace("batch = true", "")
     run = built(text).simulate(duration=1.0)
@@ -156,17 +156,17 @@ def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_the_c_compiles_without_a_word_and_does_as_python(
+def test_c_compiles_without_warnings_and_agrees_with_python(
     ball: ModuleType, real: str, tmp_path: Path
 ) -> None:
     text = BALL.replace("bouncing", f"ball_{real}").replace("[run]", f'[run]\nreal = "{real}"')
-    made = eomc.sources(from_scene(parse(text, "c.toml")))
-    name, P = made.name, made.name.upper()
+    sources = eomc.sources(from_scene(parse(text, "c.toml")))
+    name, P = sources.name, sources.name.upper()
     for folder in ("", "fast"):
         (tmp_path / folder).mkdir(exist_ok=True)
-        for end in "hc":
-            file = f"{folder}/{name}.{end}".lstrip("/")
-            (tmp_path / file).write_text(made.files[file], encoding="utf-8")
+        for suffix in "hc":
+            file = f"{folder}/{name}.{suffix}".lstrip("/")
+            (tmp_path / file).write_text(sources.files[file], encoding="utf-8")
     (tmp_path / "main.c").write_text(
         f"""#include "{name}.h"
 #include <stdio.h>
@@ -194,33 +194,33 @@ int main(void)
         options = ["-O1", f"-I{tmp_path / folder}", "-o", f"a{folder}"]
         compiled("cc", *flags, "-O1", "-c", str(source), "-o", "scene.o", cwd=tmp_path)
         compiled("cc", "main.c", "scene.o", *options, "-lm", cwd=tmp_path)
-        said = subprocess.run([str(tmp_path / f"a{folder}")], capture_output=True, text=True)
-        lines = [line.split() for line in said.stdout.splitlines()]
-        assert said.returncode == 0
-        for k, named in enumerate(("impact", "top")):
+        process = subprocess.run([str(tmp_path / f"a{folder}")], capture_output=True, text=True)
+        lines = [line.split() for line in process.stdout.splitlines()]
+        assert process.returncode == 0
+        for k, event_name in enumerate(("impact", "top")):
             times = [float(t) for number, t in lines if int(number) == k]
-            near = 1e-12 if real == "double" else 1e-4
-            assert times == pytest.approx(run.events[named].t, rel=near)
+            tolerance = 1e-12 if real == "double" else 1e-4
+            assert times == pytest.approx(run.events[event_name].t, rel=tolerance)
 
 
 @pytest.mark.parametrize("action", tiers(["record", "stop"], "record"))
-def test_c_without_jumps_gives_no_warning(tmp_path: Path, action: str) -> None:
+def test_c_without_jumps_compiles_without_warnings(tmp_path: Path, action: str) -> None:
     events = event("top", "x", f'action = "{action}"')
     text = FREE.format(name="no_jumps", events=events)
-    made = eomc.sources(from_scene(parse(text, "no_jumps.toml"))).files
+    sources = eomc.sources(from_scene(parse(text, "no_jumps.toml"))).files
     for folder, flags in (("", STRICT), ("fast", ["-Wall", "-Wextra", "-Werror"])):
-        at = tmp_path / folder
-        at.mkdir(exist_ok=True)
+        path = tmp_path / folder
+        path.mkdir(exist_ok=True)
         for name in ("no_jumps.h", "no_jumps.c"):
-            (at / name).write_text(made[f"{folder}/{name}".lstrip("/")], encoding="utf-8")
-        compiled("cc", *flags, "-c", "no_jumps.c", cwd=at)
+            (path / name).write_text(sources[f"{folder}/{name}".lstrip("/")], encoding="utf-8")
+        compiled("cc", *flags, "-c", "no_jumps.c", cwd=path)
 
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_events_and_tolerance_of_a_system_made_in_python() -> None:
-    """As in a scene; what a jump sets is named by symbols, dynamicsymbols or texts."""
+    """As in a scene; the targets of a jump are symbols, dynamicsymbols or strings."""
     x, y = sympy.physics.vector.dynamicsymbols("x y")
-    made = eomc.System.make(
+    system = eomc.System.make(
         "thrown", {x: (0, 1), y: 1.0}, (x.diff() ** 2 + y.diff() ** 2) / 2, G * y,
         parameters={"e": 0.8}, duration=1.5,
         events={
@@ -232,10 +232,10 @@ def test_events_and_tolerance_of_a_system_made_in_python() -> None:
             "middle": x - 0.25,
         },
     )  # fmt: skip
-    assert made.run.tolerance == 1e-9
-    run = eomc.load(made, BUILDS / "made").simulate(tol=1e-13)
-    fall = math.sqrt(2 / G)
-    np.testing.assert_allclose(run.events["impact"].t[0], fall, rtol=1e-13)
-    np.testing.assert_allclose(run.events["top"].t[0], fall * 1.8, rtol=1e-12)
+    assert system.run.tolerance == 1e-9
+    run = eomc.load(system, BUILDS / "made").simulate(tol=1e-13)
+    fall_time = math.sqrt(2 / G)
+    np.testing.assert_allclose(run.events["impact"].t[0], fall_time, rtol=1e-13)
+    np.testing.assert_allclose(run.events["top"].t[0], fall_time * 1.8, rtol=1e-12)
     np.testing.assert_allclose(run.events["middle"].t, [0.25], rtol=1e-13)
     assert run.q[-1, 0] == pytest.approx(1.5 + len(run.events["impact"]))

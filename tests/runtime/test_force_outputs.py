@@ -1,4 +1,4 @@
-"""Outputs over multipliers and reactions: lambda_rod, pin_force_x, lambda_x_sticks."""
+"""Outputs from multipliers and reactions: lambda_rod, pin_force_x, lambda_x_sticks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ duration = 1.0
 """
 
 
-def with_outputs(scene: str, outputs: str, run: str = "") -> str:
+def scene_with_outputs(scene: str, outputs: str, run: str = "") -> str:
     text = (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
     text = text.replace(f'"{scene}"', f'"{scene}_forces"', 1).replace(
         "\n[run]\n", f"\n[run]\n{run}\n"
@@ -57,51 +57,53 @@ def with_outputs(scene: str, outputs: str, run: str = "") -> str:
 
 
 @pytest.mark.slow
-def test_a_tension_is_that_of_the_multiplier(modules: Modules) -> None:
+def test_tension_equals_that_of_the_multiplier(modules: Modules) -> None:
     m = modules.unoptimised(BALL.replace("[run]", "[run]\nbatch = true"))
     run = m.simulate(h=0.001)
-    pull, rod = run.outputs["tension"], run.multipliers["rod"]
-    np.testing.assert_allclose(pull, -2 * rod, rtol=1e-14)
+    tension, rod = run.outputs["tension"], run.multipliers["rod"]
+    np.testing.assert_allclose(tension, -2 * rod, rtol=1e-14)
     np.testing.assert_allclose(run.outputs["apart"], 0, atol=1e-13)
-    v2 = np.sum(run.qd**2, axis=1)  # towards the bearing, and the weight and the drive along
+    v2 = np.sum(run.qd**2, axis=1)  # centripetal force, weight and drive along the rod
     F = np.clip(np.sin(3 * run.t), -0.5, 0.5)
-    exact = 1.5 * v2 - 9.81 * 1.5 * run.q[:, 1] + F * run.q[:, 0]
-    np.testing.assert_allclose(pull, exact, rtol=1e-12)
+    expected = 1.5 * v2 - 9.81 * 1.5 * run.q[:, 1] + F * run.q[:, 0]
+    np.testing.assert_allclose(tension, expected, rtol=1e-12)
     runs = m.simulate_batch([[0.6, -0.8], [0.5, -0.7]], h=0.001, steps=50, every=10)
     np.testing.assert_allclose(runs.outputs["tension"], -2 * runs.multipliers["rod"], rtol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_the_check_compares_both_forms_and_slopes(real: str, tmp_path: Path) -> None:
+def test_check_compares_both_forms_and_derivatives(real: str, tmp_path: Path) -> None:
     system = from_scene(parse(BALL + f'linearize = true\nreal = "{real}"\n', "test.toml"))
-    fast, plain_form = (eomc.load(system, tmp_path, form=form) for form in ("fast", "plain"))
-    report = check(system, fast, plain=plain_form, states=4)
+    fast, portable = (eomc.load(system, tmp_path, form=form) for form in ("fast", "plain"))
+    report = check(system, fast, plain=portable, states=4)
     rows = {row.name: row for row in report.results if "outputs" in row.name}
-    assert {*rows} == {f"{form}outputs{of}" for form in ("", "plain C: ") for of in ("", ": C, D")}
+    assert {*rows} == {
+        f"{form}outputs{part}" for form in ("", "plain C: ") for part in ("", ": C, D")
+    }
     assert all(row.passed for row in rows.values()), rows
 
 
 @pytest.mark.slow
 def test_reactions_in_the_plane(modules: Modules) -> None:
     outputs = 'h = "pin_force_x"\nv = "pin_force_y"\nturn = "pin_moment + q1"\none = "lambda_pin_y"'
-    run = modules.unoptimised(with_outputs("four_bar", outputs)).simulate(steps=50)
-    found = np.stack([run.outputs[name] for name in ("h", "v", "turn")], axis=1)
-    exact = run.reactions["pin"] + np.outer(run.q[:, 0], [0, 0, 1])
-    np.testing.assert_allclose(found, exact, rtol=1e-13, atol=1e-13)
+    run = modules.unoptimised(scene_with_outputs("four_bar", outputs)).simulate(steps=50)
+    outputs_by_row = np.stack([run.outputs[name] for name in ("h", "v", "turn")], axis=1)
+    expected = run.reactions["pin"] + np.outer(run.q[:, 0], [0, 0, 1])
+    np.testing.assert_allclose(outputs_by_row, expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(run.outputs["one"], run.multipliers["pin_y"], rtol=1e-13)
 
 
 @pytest.mark.slow
-def test_reactions_in_space_and_redundant_rows(modules: Modules) -> None:
-    names = [f"hinge_{of}_{k}" for of in ("force", "moment") for k in "xyz"]
+def test_reactions_in_space_and_of_redundant_constraints(modules: Modules) -> None:
+    names = [f"hinge_{kind}_{k}" for kind in ("force", "moment") for k in "xyz"]
     outputs = "\n".join(f'o{k} = "{name}"' for k, name in enumerate(names))
     rows = [f'{k} = "lambda_hinge_{k}"' for k in ("ru", "rv")]
-    run = modules.unoptimised(with_outputs("bricard", "\n".join([outputs, *rows]))).simulate(
+    run = modules.unoptimised(scene_with_outputs("bricard", "\n".join([outputs, *rows]))).simulate(
         steps=20
     )
-    found = np.stack([run.outputs[f"o{k}"] for k in range(6)], axis=1)
-    np.testing.assert_allclose(found, run.reactions["hinge"], rtol=1e-11, atol=1e-11)
+    outputs_by_row = np.stack([run.outputs[f"o{k}"] for k in range(6)], axis=1)
+    np.testing.assert_allclose(outputs_by_row, run.reactions["hinge"], rtol=1e-11, atol=1e-11)
     for k in ("ru", "rv"):
         np.testing.assert_allclose(run.outputs[k], run.multipliers[f"hinge_{k}"], atol=1e-11)
 
@@ -122,7 +124,7 @@ duration = 5.0
 """
 
 
-def test_what_holds_where_it_sticks(modules: Modules) -> None:
+def test_multiplier_of_sticking_friction_is_an_output(modules: Modules) -> None:
     run = modules.unoptimised(STICKS).simulate()
     assert run.q[-1, 2] == 0 and abs(run.outputs["holds"][-1]) > 0.1
     np.testing.assert_allclose(run.outputs["holds"], run.multipliers["x_sticks"], atol=1e-13)
@@ -131,16 +133,16 @@ def test_what_holds_where_it_sticks(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_systems_of_python_have_them(modules: Modules) -> None:
+def test_systems_made_in_python_have_force_outputs(modules: Modules) -> None:
     x, y = (symbol(name) for name in "xy")
     for pull in ("-2*lambda_rod", -2 * sympy.Symbol("lambda_rod")):
-        made = System.make(
+        system = System.make(
             "ball_in_python", {x: 0.6, y: -0.8}, "(x_dot**2 + y_dot**2)/2", 9.81 * y,
             constraints={"rod": x**2 + y**2 - 1}, outputs={"pull": pull},
         )  # fmt: skip
-        run = modules.unoptimised(made).simulate(steps=9)
+        run = modules.unoptimised(system).simulate(steps=9)
         np.testing.assert_allclose(run.outputs["pull"], -2 * run.multipliers["rod"], rtol=1e-14)
-    made = System.make(
+    system = System.make(
         "rubbed",
         {x: 1.0},
         "x_dot**2/2",
@@ -148,50 +150,50 @@ def test_systems_of_python_have_them(modules: Modules) -> None:
         friction={x: 2},
         outputs={"h": "lambda_x_sticks"},
     )
-    run = modules.unoptimised(made).simulate()
+    run = modules.unoptimised(system).simulate()
     np.testing.assert_array_equal(run.outputs["h"], run.multipliers["x_sticks"])
 
 
-def test_a_name_of_the_scene_s_own_stands() -> None:
+def test_name_declared_in_the_scene_has_precedence() -> None:
     text = BALL.replace("[parameters]\n", "[parameters]\nlambda_rod = 4.0\n")
     (tension, *_) = from_scene(parse(text, "test.toml")).outputs
     assert {s.name for s in tension.formula.free_symbols} == {"l", "lambda_rod"}
 
 
 @pytest.mark.parametrize(
-    ("formula", "words"),
+    ("formula", "message"),
     [
         ("dot(lambda_rod)", "it holds forces of constraints, whose rate is not computed"),
         ("lambda_pin", "multipliers and reactions are called lambda_rod"),
         ("2*rod", "'rod' can't be used here: multipliers and reactions are called lambda_rod"),
     ],
 )
-def test_faults(formula: str, words: str) -> None:
-    with pytest.raises(SceneError) as fault:
+def test_invalid_formula_is_refused(formula: str, message: str) -> None:
+    with pytest.raises(SceneError) as error:
         parse(BALL.replace('"-2*l*lambda_rod"', f'"{formula}"'), "test.toml")
-    assert words in str(fault.value)
+    assert message in str(error.value)
 
 
-def test_no_other_formula_has_them() -> None:
+def test_other_formulas_cannot_use_multipliers() -> None:
     with pytest.raises(SceneError, match="'lambda_rod' is not declared"):
         parse(BALL.replace('x = "F"', 'x = "F - lambda_rod"'), "test.toml")
     x = symbol("x")
-    made = {"constraints": {"rod": x - 1}, "outputs": {"rate": "dot(lambda_rod)"}}
+    options = {"constraints": {"rod": x - 1}, "outputs": {"rate": "dot(lambda_rod)"}}
     with pytest.raises(EomcError, match="lambda_rod, the multiplier of a constraint"):
-        eomc.sources(System.make("rate", {x: 1.0}, "x_dot**2/2", **made))
+        eomc.sources(System.make("rate", {x: 1.0}, "x_dot**2/2", **options))
 
 
-def test_equations_show_them() -> None:
+def test_equations_show_multipliers() -> None:
     system = from_scene(parse(BALL, "test.toml"))
     assert "tension = -2⋅λ_rod⋅l" in equations.write_text(equations.derive(system))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
-def test_units_of_fmi_have_them(version: int) -> None:
+def test_fmus_have_force_outputs(version: int) -> None:
     needs_fmpy()
     host = Host(exported(BALL, version))
     host.start()
-    run = plain(BALL).simulate(steps=30, u=[0.0])  # an importer gives the inputs
-    found = rows(host, ["tension"], 3 * run.h, 10)
-    assert np.array_equal(found[:, 0], run.outputs["tension"][::3])
+    run = plain(BALL).simulate(steps=30, u=[0.0])  # an importer supplies the inputs
+    values = rows(host, ["tension"], 3 * run.h, 10)
+    assert np.array_equal(values[:, 0], run.outputs["tension"][::3])

@@ -114,122 +114,129 @@ def space(modules: Modules) -> ModuleType:
     return modules.unoptimised(SPACE)
 
 
-def tip(q: np.ndarray, length: float = 0.7) -> np.ndarray:
+def tip_position(q: np.ndarray, length: float = 0.7) -> np.ndarray:
     a, c = q[0], q[0] + q[1]
     return length * np.array([np.cos(a) + np.cos(c), np.sin(a) + np.sin(c)])
 
 
-def test_two_links_as_on_paper(plane: ModuleType) -> None:
+def test_two_link_arm_equals_closed_form(plane: ModuleType) -> None:
     m, length, c = plane, 0.7, Q[0] + Q[1]
     position, angle = m.pose(Q, "tip")
-    assert position == pytest.approx(tip(Q), rel=1e-14)
+    assert position == pytest.approx(tip_position(Q), rel=1e-14)
     assert angle == pytest.approx(c + np.pi / 2, rel=1e-14)
     sa, ca, sc, cc = np.sin(Q[0]), np.cos(Q[0]), np.sin(c), np.cos(c)
     J = length * np.array([[-sa - sc, -sc], [ca + cc, cc], [1 / length, 1 / length]])
     assert m.jacobian(Q, "tip") == pytest.approx(J, rel=1e-14)
     assert m.frame_velocity(Q, QD, "tip") == pytest.approx(J @ QD, rel=1e-13)
     drift = m.frame_acceleration(Q, QD, frame="tip")
-    both = QD[0] + QD[1]
-    centripetal = -length * (QD[0] ** 2 * np.array([ca, sa]) + both**2 * np.array([cc, sc]))
+    total_rate = QD[0] + QD[1]
+    centripetal = -length * (QD[0] ** 2 * np.array([ca, sa]) + total_rate**2 * np.array([cc, sc]))
     assert drift == pytest.approx([*centripetal, 0.0], rel=1e-13)
     assert m.frame_acceleration(Q, QD, QDD, "tip") == pytest.approx(J @ QDD + drift, rel=1e-13)
-    long = m.pose(Q, "tip", params={"l": 1.4}).position
-    assert long == pytest.approx(tip(Q, 1.4), rel=1e-14)
+    longer = m.pose(Q, "tip", params={"l": 1.4}).position
+    assert longer == pytest.approx(tip_position(Q, 1.4), rel=1e-14)
 
 
-def test_forces_of_a_motion(plane: ModuleType) -> None:
+def test_inverse_dynamics_equals_forces_of_a_motion(plane: ModuleType) -> None:
     m, wrench = plane, [3.0, -1.0, 0.2]
     tau = m.D(Q) @ QDD + m.bias(Q, QD)
     assert m.inverse_dynamics(Q, QD, QDD) == pytest.approx(tau, rel=1e-13)
     J = m.jacobian(Q, "tip")
     assert m.frame_forces(Q, {"tip": wrench}) == pytest.approx(J.T @ wrench, rel=1e-13)
-    found = m.inverse_dynamics(Q, QD, QDD, {"tip": wrench})
-    assert found == pytest.approx(tau - J.T @ wrench, rel=1e-13)
-    # what moves it like that is what it moves like
-    alone = m.acceleration(Q, QD)
-    assert m.inverse_dynamics(Q, QD, alone) == pytest.approx(m.tau(Q, QD), abs=1e-12)
+    result = m.inverse_dynamics(Q, QD, QDD, {"tip": wrench})
+    assert result == pytest.approx(tau - J.T @ wrench, rel=1e-13)
+    # the inverse of the acceleration yields the applied forces
+    qdd = m.acceleration(Q, QD)
+    assert m.inverse_dynamics(Q, QD, qdd) == pytest.approx(m.tau(Q, QD), abs=1e-12)
 
 
-def test_momenta_as_on_paper(plane: ModuleType) -> None:
-    found = plane.momentum(Q, QD)
+def test_momenta_equal_closed_form(plane: ModuleType) -> None:
+    momentum = plane.momentum(Q, QD)
     c, half = Q[0] + Q[1], 0.35
-    one = half * np.array([np.cos(Q[0]), np.sin(Q[0])])
-    two = tip(Q) - half * np.array([np.cos(c), np.sin(c)])
-    assert found.mass == pytest.approx(2.4)
-    assert found.center == pytest.approx((one + two) / 2, rel=1e-14)
+    center_1 = half * np.array([np.cos(Q[0]), np.sin(Q[0])])
+    center_2 = tip_position(Q) - half * np.array([np.cos(c), np.sin(c)])
+    assert momentum.mass == pytest.approx(2.4)
+    assert momentum.center == pytest.approx((center_1 + center_2) / 2, rel=1e-14)
     h = 1e-6
     ends = [plane.momentum(Q + s * h * QD, QD).center for s in (1, -1)]
-    assert found.linear / found.mass == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-8)
-    v1 = QD[0] * np.array([-one[1], one[0]])
-    v2 = 2 * found.linear / found.mass - v1
+    assert momentum.linear / momentum.mass == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-8)
+    v1 = QD[0] * np.array([-center_1[1], center_1[0]])
+    v2 = 2 * momentum.linear / momentum.mass - v1
     spin = 1.2 * 0.7**2 / 12 * (2 * QD[0] + QD[1])
-    about = sum(1.2 * (r[0] * v[1] - r[1] * v[0]) for r, v in ((one - two, v1), (two - one, v2)))
-    assert found.angular == pytest.approx(spin + about / 2, rel=1e-13)
+    orbital = sum(
+        1.2 * (r[0] * v[1] - r[1] * v[0])
+        for r, v in ((center_1 - center_2, v1), (center_2 - center_1, v2))
+    )
+    assert momentum.angular == pytest.approx(spin + orbital / 2, rel=1e-13)
 
 
-def test_poses_and_momenta_are_read_where_the_module_was_not_loaded(
+def test_poses_and_momenta_are_unpickled_without_the_module(
     plane: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     values = plane.pose([0.3, 0.2]), plane.momentum([0.3, 0.2], [0.1, 0.4])
     pickled = pickle.dumps(values)
     for name in [m for m in sys.modules if m.startswith("_eomc_")]:
         monkeypatch.delitem(sys.modules, name)
-    for read, value in zip(pickle.loads(pickled), values, strict=True):
-        assert repr(read) == repr(value)
+    for loaded, value in zip(pickle.loads(pickled), values, strict=True):
+        assert repr(loaded) == repr(value)
 
 
-def test_many_states_are_rows(space: ModuleType) -> None:
+def test_many_states_equal_single_states(space: ModuleType) -> None:
     m, random = space, np.random.default_rng(0)
     assert m.frames == ("cart", "arm", "bob", "tip", "base")
     q, qd, qdd = random.normal(size=(3, 7, 3))
     t = np.linspace(0, 1, 7)
     w = random.normal(size=(7, 5, 6))
     for k in range(7):
-        one, at = (q[k], qd[k]), {"t": t[k]}
+        state, options = (q[k], qd[k]), {"t": t[k]}
         for name in ("position", "rotation"):
             assert np.array_equal(
-                getattr(m.pose(q, t=t), name)[k], getattr(m.pose(q[k], **at), name)
+                getattr(m.pose(q, t=t), name)[k], getattr(m.pose(q[k], **options), name)
             )
-        assert np.array_equal(m.jacobian(q, t=t)[k], m.jacobian(q[k], **at))
-        assert np.array_equal(m.jacobian(q, "tip", t=t)[k], m.jacobian(q[k], **at)[3])
-        assert np.array_equal(m.frame_velocity(q, qd, t=t)[k], m.frame_velocity(*one, **at))
-        found = m.frame_acceleration(q, qd, qdd, t=t)[k]
-        assert np.array_equal(found, m.frame_acceleration(*one, qdd[k], **at))
-        found = m.inverse_dynamics(q, qd, qdd, w, t=t)[k]
-        assert np.array_equal(found, m.inverse_dynamics(*one, qdd[k], w[k], **at))
-        assert np.array_equal(m.momentum(q, qd, t=t).angular[k], m.momentum(*one, **at).angular)
-    same = m.inverse_dynamics(q, qd, qdd[0], {"tip": w[0, 0]}, t=0.5)
-    each = m.inverse_dynamics(q[3], qd[3], qdd[0], {"tip": w[0, 0]}, t=0.5)
-    assert np.array_equal(same[3], each)
+        assert np.array_equal(m.jacobian(q, t=t)[k], m.jacobian(q[k], **options))
+        assert np.array_equal(m.jacobian(q, "tip", t=t)[k], m.jacobian(q[k], **options)[3])
+        assert np.array_equal(m.frame_velocity(q, qd, t=t)[k], m.frame_velocity(*state, **options))
+        row = m.frame_acceleration(q, qd, qdd, t=t)[k]
+        assert np.array_equal(row, m.frame_acceleration(*state, qdd[k], **options))
+        row = m.inverse_dynamics(q, qd, qdd, w, t=t)[k]
+        assert np.array_equal(row, m.inverse_dynamics(*state, qdd[k], w[k], **options))
+        assert np.array_equal(
+            m.momentum(q, qd, t=t).angular[k], m.momentum(*state, **options).angular
+        )
+    shared = m.inverse_dynamics(q, qd, qdd[0], {"tip": w[0, 0]}, t=0.5)
+    single = m.inverse_dynamics(q[3], qd[3], qdd[0], {"tip": w[0, 0]}, t=0.5)
+    assert np.array_equal(shared[3], single)
 
 
-def test_many_more_rows_than_one_call_takes(space: ModuleType) -> None:
+def test_more_rows_than_one_call_computes(space: ModuleType) -> None:
     q = np.random.default_rng(1).normal(size=(5000, 3))
-    found = space.inverse_dynamics(q, q, q)
-    assert np.array_equal(found[4321], space.inverse_dynamics(*[q[4321]] * 3))
+    forces = space.inverse_dynamics(q, q, q)
+    assert np.array_equal(forces[4321], space.inverse_dynamics(*[q[4321]] * 3))
 
 
 @pytest.mark.slow
-def test_accelerations_are_second_derivatives(modules: Modules) -> None:
-    """In eighty digits: of a point's place, and so of all rates in them, dJ/dt qd at qdd = 0."""
+def test_frame_accelerations_are_second_derivatives(modules: Modules) -> None:
+    """In eighty digits: of a point's position, thus of all velocity terms, dJ/dt qd at qdd = 0."""
     places = [f"tip_{x}" for x in "xyz"] + [f"arm_{x}" for x in "xyz"]
-    wanted = "\n".join(f'a_{name} = "dot(dot({name}))"' for name in places)
+    outputs = "\n".join(f'a_{name} = "dot(dot({name}))"' for name in places)
     center = '\n[[point]]\nname = "middle"\nbody = "arm"\nplace = [0, 0, -0.5]\n'
-    text = SPACE.replace("crane3", "crane5").replace("[run]", f"{center}[outputs]\n{wanted}\n[run]")
+    text = SPACE.replace("crane3", "crane5").replace(
+        "[run]", f"{center}[outputs]\n{outputs}\n[run]"
+    )
     module, formulas = modules.unoptimised(text), Formulas(from_scene(parse(text, "test.toml")))
     random = np.random.default_rng(3)
     for _ in range(3):
         q, qd, qdd = random.uniform(-1, 1, (3, 3))
         for accelerations in (qdd, 0 * qdd):
-            exact = formulas.evaluate(State(q, qd, 0.4), accelerations)
-            found = [
+            expected = formulas.evaluate(State(q, qd, 0.4), accelerations)
+            result = [
                 module.frame_acceleration(q, qd, accelerations, name, t=0.4)[:3]
                 for name in ("tip", "middle")
             ]
-            assert np.hstack(found) == pytest.approx(exact, abs=1e-14)
+            assert np.hstack(result) == pytest.approx(expected, abs=1e-14)
 
 
-def test_what_does_not_move(space: ModuleType) -> None:
+def test_frame_fixed_to_the_world(space: ModuleType) -> None:
     pose = space.pose([1.0, 2.0, 3.0], "base")
     assert pose.position.tolist() == [0.3, 0, 0.1]
     assert pose.rotation.tolist() == np.eye(3).tolist()
@@ -237,7 +244,7 @@ def test_what_does_not_move(space: ModuleType) -> None:
 
 
 @pytest.mark.parametrize(
-    ("call", "words"),
+    ("call", "message"),
     [
         (lambda m: m.pose(Q, "tipp"), "frame: 'tipp' is not one of tip; did you mean 'tip'?"),
         (lambda m: m.pose(Q, "upper"), "frame: 'upper' is not one of tip"),
@@ -248,12 +255,12 @@ def test_what_does_not_move(space: ModuleType) -> None:
         (lambda m: m.inverse_dynamics(Q, [1.0], QDD), "qd: shape"),
     ],
 )
-def test_wrong_arguments(plane: ModuleType, call, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+def test_invalid_arguments_are_refused(plane: ModuleType, call, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         call(plane)
 
 
-def test_what_was_not_asked_for_is_told(cartpole: ModuleType) -> None:
+def test_functions_that_were_not_built_are_refused_with_advice(cartpole: ModuleType) -> None:
     with pytest.raises(AttributeError, match=r"pose: not built: build it with \[run\] frames"):
         _ = cartpole.pose
     with pytest.raises(AttributeError, match=r"\[run\] inverse_dynamics = true"):
@@ -261,17 +268,17 @@ def test_what_was_not_asked_for_is_told(cartpole: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_a_rounding_of_a_sum_is_no_wrong_sine(modules: Modules, monkeypatch) -> None:
-    """Of a body placed by formulas entries cancel; other states tell that from a sine.
+def test_rounding_of_a_sum_is_not_taken_for_a_wrong_sine(modules: Modules, monkeypatch) -> None:
+    """Entries of a body placed by formulas cancel; other states tell this from a wrong sine.
 
-    Of a module that is not optimised they cancel better.
+    They cancel better in a module that is not optimised.
     """
-    made = from_scene(parse(SPACE, "crane3.toml"))
-    of = Comparison(made, modules.of_text(SPACE), np.random.default_rng(0), None)
-    assert checks_runs.largest_error_near_zeros(of) <= checks_runs.VANISHING_LIMIT
+    system = from_scene(parse(SPACE, "crane3.toml"))
+    comparison = Comparison(system, modules.of_text(SPACE), np.random.default_rng(0), None)
+    assert checks_runs.largest_error_near_zeros(comparison) <= checks_runs.VANISHING_LIMIT
     monkeypatch.setattr(checks_runs, "MOVES", ())
     monkeypatch.setattr(checks_runs, "NEIGHBOURS", range(-2, 3))
-    assert checks_runs.largest_error_near_zeros(of) > checks_runs.VANISHING_LIMIT
+    assert checks_runs.largest_error_near_zeros(comparison) > checks_runs.VANISHING_LIMIT
 
 
 def test_wrenches_without_frames_are_refused(modules: Modules) -> None:
@@ -280,10 +287,10 @@ def test_wrenches_without_frames_are_refused(modules: Modules) -> None:
         module.inverse_dynamics(Q, QD, QDD, {"tip": [1.0, 2.0, 3.0]})
 
 
-def test_nothing_of_it_in_scenes_that_do_not_ask() -> None:
+def test_scenes_without_these_options_have_none_of_their_code() -> None:
     bare = eomc.sources(from_scene(parse(PLANE.partition("[run]")[0], "bare.toml")))
-    some = eomc.sources(from_scene(parse(PLANE, "some.toml")))
-    words = ("frame_", "_NF", "momentum", "inverse_dynamics")
+    full = eomc.sources(from_scene(parse(PLANE, "some.toml")))
+    fragments = ("frame_", "_NF", "momentum", "inverse_dynamics")
     for name in ("twolink.h", "twolink.c"):
-        assert not any(word in bare.files[name] for word in words)
-        assert all(word in some.files[name] for word in words)
+        assert not any(fragment in bare.files[name] for fragment in fragments)
+        assert all(fragment in full.files[name] for fragment in fragments)

@@ -1,4 +1,4 @@
-"""Parameters that jumps set: discrete variables, beside SciPy between the jumps."""
+"""Parameters that jumps set (discrete variables), against SciPy between the jumps."""
 
 from __future__ import annotations
 
@@ -78,39 +78,43 @@ def gripper(modules: Modules) -> ModuleType:
     return modules.unoptimised(GRIPPER)
 
 
-def rates(t: float, x: np.ndarray, m: float, rod: float, k: float, on: float) -> list[float]:
-    """Of the gripper, written out by hand."""
-    far, angle, v, w = x
+def state_derivative(
+    t: float, x: np.ndarray, m: float, rod: float, k: float, on: float
+) -> list[float]:
+    """Equations of the gripper, derived by hand."""
+    x_cart, angle, v, w = x
     c, s = np.cos(angle), np.sin(angle)
     D = np.array([[m + 0.3, 0.3 * rod * c], [0.3 * rod * c, 0.3 * rod * rod]])
-    b = [on * 2 * np.sin(3 * t) - k * far + 0.3 * rod * s * w * w, -0.3 * 9.81 * rod * s]
+    b = [on * 2 * np.sin(3 * t) - k * x_cart + 0.3 * rod * s * w * w, -0.3 * 9.81 * rod * s]
     return [v, w, *np.linalg.solve(D, b)]
 
 
-def grips(t: float, x: np.ndarray, *_: float) -> float:
+def gripping_event(t: float, x: np.ndarray, *_: float) -> float:
     return float(x[0] - 0.2)
 
 
-grips.direction, grips.terminal = 1, True  # type: ignore[attr-defined]
+gripping_event.direction, gripping_event.terminal = 1, True  # type: ignore[attr-defined]
 
 
-def by_scipy(m: float) -> tuple[np.ndarray, list[float]]:
-    """(x, theta, and their rates) at 5 s, and when it gripped."""
+def solve_with_scipy(m: float) -> tuple[np.ndarray, list[float]]:
+    """Return x, theta and their velocities at 5 s, and the times of gripping."""
     t, x, times = 0.0, np.array([0.0, 0.3, 1.0, 0.0]), list[float]()
     values = [m, 0.5, 4.0, 1.0]
 
-    def go(end: float, **more: object) -> object:
-        return solve_ivp(rates, (t, end), x, "DOP853", args=values, rtol=1e-12, atol=1e-13, **more)
+    def integrate(end: float, **options: object) -> object:
+        return solve_ivp(
+            state_derivative, (t, end), x, "DOP853", args=values, rtol=1e-12, atol=1e-13, **options
+        )
 
     while t < 5:
-        done = go(CUTOFF if t < CUTOFF else 5.0, events=grips)
-        t, x = done.t[-1], done.y[:, -1]
-        if done.status == 1:
+        solution = integrate(CUTOFF if t < CUTOFF else 5.0, events=gripping_event)
+        t, x = solution.t[-1], solution.y[:, -1]
+        if solution.status == 1:
             times.append(t)
             x = x * [1, 1, values[0] / (values[0] + 0.5), 1]
             values[0] += 0.5
-            done = go(t + 1e-3)  # off the zero
-            t, x = done.t[-1], done.y[:, -1]
+            solution = integrate(t + 1e-3)  # off the zero
+            t, x = solution.t[-1], solution.y[:, -1]
         elif t == CUTOFF:
             values[1:] = [0.9 * 0.5, 8.0, 0.0]
     return x, times
@@ -118,44 +122,44 @@ def by_scipy(m: float) -> tuple[np.ndarray, list[float]]:
 
 @pytest.mark.parametrize("m", [1.0, 2.3])
 def test_mass_length_stiffness_and_drive_change_as_in_scipy(gripper: ModuleType, m: float) -> None:
-    x, times = by_scipy(m)
+    x, times = solve_with_scipy(m)
     run = gripper.simulate(q0=[0, 0.3, m, 0.5, 4, 1])
-    own = [0, 1, 6, 7]
+    indices = [0, 1, 6, 7]
     assert run.status == "ok" and len(times) >= 1
-    np.testing.assert_allclose(run.x[-1][own], x, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(run.x[-1][indices], x, rtol=0, atol=1e-10)
     np.testing.assert_allclose(run.events["grips"].t, times, rtol=0, atol=1e-11)
     assert run.q[-1, 2:].tolist() == [m + 0.5 * len(times), 0.45, 8, 0]
     assert not run.qd[:, 2:].any()
 
 
-def test_values_stand_beside_the_rows(gripper: ModuleType) -> None:
+def test_discrete_values_are_columns_of_the_run(gripper: ModuleType) -> None:
     run = gripper.simulate()
     assert gripper.coordinates == ("x", "theta", "m", "l", "k", "on")
     assert gripper._model.info.discrete_coordinates == ("m", "l", "k", "on")
     assert gripper.parameters == ("m_p", "g") and gripper.units["m"] == "kg"
-    before = run.t < CUTOFF
-    assert set(run["k"][before]) == {4.0} and run["k"][-1] == 8.0
+    before_cutoff = run.t < CUTOFF
+    assert set(run["k"][before_cutoff]) == {4.0} and run["k"][-1] == 8.0
     np.testing.assert_allclose(run["stored"], run["k"] * run["x"] ** 2 / 2, rtol=1e-15)
     times = np.array([0, 2.0, 4.0])
     assert gripper.simulate(times=times)["on"].tolist() == [1, 1, 0]
 
 
-def test_starts_without_them_have_the_scenes(gripper: ModuleType) -> None:
+def test_starts_without_discrete_values_use_those_of_the_scene(gripper: ModuleType) -> None:
     run = gripper.simulate(q0=[0, 0.3], qd0=[1, 0])
     assert np.array_equal(run.q, gripper.simulate().q)
     q0 = np.tile([0, 0.3], (3, 1))
-    many = gripper.simulate_batch(q0, np.tile([1.0, 0], (3, 1)), tol=1e-12)
-    assert np.array_equal(many.q[:, -1], np.tile(run.q[-1], (3, 1)))
-    told = r"a jump sets 'm', so it is a state .*: give it in q0, \[x, theta, m, l, k, on\], or"
-    for calls in (gripper.simulate, gripper.simulate_batch):
-        with pytest.raises(ValueError, match=f"params: {told}"):
-            calls(params={"m": 2.0})
-    with pytest.raises(TypeError, match=f"no argument 'm': {told}"):
+    batch = gripper.simulate_batch(q0, np.tile([1.0, 0], (3, 1)), tol=1e-12)
+    assert np.array_equal(batch.q[:, -1], np.tile(run.q[-1], (3, 1)))
+    message = r"a jump sets 'm', so it is a state .*: give it in q0, \[x, theta, m, l, k, on\], or"
+    for simulate in (gripper.simulate, gripper.simulate_batch):
+        with pytest.raises(ValueError, match=f"params: {message}"):
+            simulate(params={"m": 2.0})
+    with pytest.raises(TypeError, match=f"no argument 'm': {message}"):
         gripper.simulate(m=2.0)
 
 
-def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
-    """D, C, g and accelerations are those of a system in which they are parameters."""
+def test_discrete_values_have_no_dynamics(gripper: ModuleType) -> None:
+    """D, C, g and accelerations equal those of a system in which they are parameters."""
     random = np.random.default_rng(5)
     system = from_scene(parse(GRIPPER, "gripper.toml"))
     q, qd = random.uniform(0.5, 1.5, (2, 6))
@@ -164,7 +168,7 @@ def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
     assert not C[2:].any() and not C[:, 2:].any() and not gripper.g(q)[2:].any()
     assert not gripper.acceleration(q, qd)[2:].any()
     A = gripper.linearize(q, qd)[0]
-    assert A[6, 2] != 0 and not A[8:].any()  # they move others, and nothing moves them
+    assert A[6, 2] != 0 and not A[8:].any()  # they affect others, and nothing affects them
     core = with_constant_parameters(system)
     assert [c.name for c in core.coordinates] == ["x", "theta"]
     assert {p.name: p.value for p in core.parameters}["l"] == 0.5
@@ -264,57 +268,63 @@ duration = 3.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [GRIPPER, MARKED, ROD, GREASED], ids=lambda x: x.split('"')[1])
-def test_check_compares_them_with_constants(text: str, tmp_path: Path) -> None:
+def test_check_compares_discrete_values_with_constants(text: str, tmp_path: Path) -> None:
     system = assembled(from_scene(parse(text, "test.toml")))
-    plain = eomc.load(system, tmp_path, form="plain")
-    report = check(system, eomc.load(system, tmp_path), plain=plain)
+    portable = eomc.load(system, tmp_path, form="plain")
+    report = check(system, eomc.load(system, tmp_path), plain=portable)
     assert report.passed, str(report)
 
 
 @pytest.mark.parametrize("text", tiers([MARKED, ROD], ROD), ids=["arm_drop", "reeled"])
-def test_both_references_have_them_as_constants(text: str) -> None:
+def test_both_references_treat_discrete_values_as_constants(text: str) -> None:
     system = assembled(from_scene(parse(text, "test.toml")))
     n = len(system.q)
     q, qd = np.random.default_rng(2).uniform(0.3, 0.9, (2, 5, n))
-    one, other = (
+    expected_reference, discrete_reference = (
         reference_for(system),
         DiscreteReference(system, TaylorReference(with_constant_parameters(system))),
     )
     names = ["D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "power"]
     names += ["constraint_jacobian", "gamma"] if system.constraints else []
     for name in names:
-        found, expected = (x.evaluate(name, q, qd) for x in (other, one))
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(other.acceleration(q, qd), one.acceleration(q, qd), rtol=1e-9)
+        result, expected = (
+            x.evaluate(name, q, qd) for x in (discrete_reference, expected_reference)
+        )
+        np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(
+        discrete_reference.acceleration(q, qd), expected_reference.acceleration(q, qd), rtol=1e-9
+    )
     state = {"q": q[0], "qd": qd[0]}
-    assert one.terms("energy", state) >= abs(one.evaluate("kinetic", q[0], qd[0])) * (1 - 1e-12)
+    assert expected_reference.terms("energy", state) >= abs(
+        expected_reference.evaluate("kinetic", q[0], qd[0])
+    ) * (1 - 1e-12)
 
 
 @pytest.mark.slow
-def test_a_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
+def test_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
     run = modules.unoptimised(ROD).simulate()
-    far = np.hypot(run["x"], run["y"])
-    np.testing.assert_allclose(far, run["l"], rtol=1e-14)
+    distance = np.hypot(run["x"], run["y"])
+    np.testing.assert_allclose(distance, run["l"], rtol=1e-14)
     assert run["l"][-1] == 0.9 * 0.8 and run.status == "ok"
 
 
 @pytest.mark.slow
-def test_friction_that_sticks_eases_where_it_is_greased(modules: Modules) -> None:
+def test_stick_friction_changes_with_a_discrete_coefficient(modules: Modules) -> None:
     module = modules.unoptimised(GREASED)
     run = module.simulate(q0=[0, 0.5], qd0=[1, 0])
     assert run["mu"][-1] == 0.075 and run.status == "ok"
     q, qd = (x[run.t == 0.7][-1].copy() for x in (run.q, run.qd))
     assert q[2] == 0.075
-    rest = module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3)
-    np.testing.assert_allclose(rest.q[-1], run.q[-1], rtol=0, atol=1e-8)
-    q[2] = 0.3  # as if it had not been greased
+    continued = module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3)
+    np.testing.assert_allclose(continued.q[-1], run.q[-1], rtol=0, atol=1e-8)
+    q[2] = 0.3  # without the grease
     assert abs(module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3).q[-1] - run.q[-1])[0] > 1e-3
 
 
 @pytest.mark.slow
-def test_a_system_made_in_python_has_them(tmp_path: Path) -> None:
+def test_system_made_in_python_has_discrete_values(tmp_path: Path) -> None:
     x, m, k, factor = sympy.symbols("x m k lambda")
-    made = System.make(
+    system = System.make(
         "osc", {x: (0, 1.0)}, "m*x_dot**2/2", k * x**2 / 2,
         parameters={m: 1, k: 4, factor: 0.5}, tolerance=1e-10,
         events={"soft": {
@@ -322,15 +332,16 @@ def test_a_system_made_in_python_has_them(tmp_path: Path) -> None:
             k: factor * k, "lambda": 1,
         }},
     )  # fmt: skip
-    run = eomc.load(made, tmp_path).simulate(duration=3)
+    run = eomc.load(system, tmp_path).simulate(duration=3)
     assert run["k"][-1] == 2 and run.q[-1].tolist()[1:] == [2, 1]
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("k_dot", "needs the name 'k_dot'"), ("k_ddot", "needs the name 'k_ddot'")]
+    ("name", "message"),
+    [("k_dot", "needs the name 'k_dot'"), ("k_ddot", "needs the name 'k_ddot'")],
 )
-def test_names_that_their_rates_need_are_taken(name: str, words: str) -> None:
-    with pytest.raises(SceneError, match=words):
+def test_names_of_velocities_of_discrete_values_are_reserved(name: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         System.make(
             "osc", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 4, name: 3},
             events={"soft": {"when": "x - 0.3", "action": "jump", "k": "k/2"}},
@@ -338,8 +349,8 @@ def test_names_that_their_rates_need_are_taken(name: str, words: str) -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_run_ends_at_the_third_impact_by_a_time_that_it_sets(tmp_path: Path) -> None:
-    made = System.make(
+def test_stop_event_can_depend_on_a_time_set_by_jumps(tmp_path: Path) -> None:
+    system = System.make(
         "counted", {"y": 1.0}, "y_dot**2/2", "9.81*y",
         parameters={"e": 0.8, "count": 0, "until": 1e9}, tolerance=1e-10,
         events={
@@ -350,27 +361,27 @@ def test_a_run_ends_at_the_third_impact_by_a_time_that_it_sets(tmp_path: Path) -
             "third": {"when": "t - until", "action": "stop"},
         },
     )  # fmt: skip
-    run = eomc.load(made, tmp_path).simulate(duration=10)
-    fall = (2 / 9.81) ** 0.5
+    run = eomc.load(system, tmp_path).simulate(duration=10)
+    fall_time = (2 / 9.81) ** 0.5
     assert run.stopped == "third" and run["count"][-1] == 3
-    assert run.t[-1] == pytest.approx(fall * (1 + 2 * 0.8 + 2 * 0.64) + 1e-6, rel=1e-12)
+    assert run.t[-1] == pytest.approx(fall_time * (1 + 2 * 0.8 + 2 * 0.64) + 1e-6, rel=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_mass_that_is_no_number_may_lock_the_rows(tmp_path: Path) -> None:
-    """Accelerations on a rod don't depend on it, and corrections refuse it by the status LOCKED."""
-    made = System.make(
+def test_mass_that_is_not_finite_can_lock_the_constraints(tmp_path: Path) -> None:
+    """Accelerations on a rod don't depend on it; projections refuse it with the status LOCKED."""
+    system = System.make(
         "rod", {"x": 0.6, "y": -0.8}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
         constraints={"rod": "x**2 + y**2 - 1"}, parameters={"m": 1.0}, tolerance=1e-9, h=0.01,
         events={"drops": {"when": "x", "action": "jump", "m": "m/2"}},
     )  # fmt: skip
-    report = check(made, eomc.load(made, tmp_path))
+    report = check(system, eomc.load(system, tmp_path))
     assert report.passed, str(report)
 
 
-def test_an_equilibrium_leaves_them_as_they_are(gripper: ModuleType) -> None:
-    """Where a force is missing no stiffness is invented; what is left out is the scene's."""
+def test_equilibrium_leaves_discrete_values_unchanged(gripper: ModuleType) -> None:
+    """Where a force is missing, no stiffness is changed; others keep the scene's values."""
     q, _, u = gripper.equilibrium([0.1, 0.2], [0.0, 0.0], u=1.0)
     set_by_jumps = gripper.start[0][2:]
     assert q[:2] == pytest.approx([0.25, 0.0], abs=1e-12) and (q[2:] == set_by_jumps).all()
@@ -399,16 +410,16 @@ batch = true
 """
 
 
-def test_how_large_they_are_is_nothing_to_steps_and_errors(modules: Modules) -> None:
-    """A time far away was the largest of all coordinates, and errors of others were beside it."""
-    near, far = (
+def test_size_of_discrete_values_does_not_affect_steps_and_errors(modules: Modules) -> None:
+    """Regression: a distant time was the largest coordinate, relative to which errors counted."""
+    small, large = (
         modules.unoptimised(from_scene(parse(FAR.format(*x)))) for x in (("3", "1e3"), ("9", "1e9"))
     )
-    one, other = near.simulate(), far.simulate()
-    assert np.array_equal(one.q[:, :2], other.q[:, :2])
-    a, b = (m.simulate_batch(np.tile([1.0, 0.5], (9, 1))).q[0, -1, :2] for m in (near, far))
+    small_run, large_run = small.simulate(), large.simulate()
+    assert np.array_equal(small_run.q[:, :2], large_run.q[:, :2])
+    a, b = (m.simulate_batch(np.tile([1.0, 0.5], (9, 1))).q[0, -1, :2] for m in (small, large))
     assert np.array_equal(a, b)
-    found = [run.estimate() for run in (one, other)]
-    assert found[0].amplification == pytest.approx(found[1].amplification, rel=1e-6)
-    fixed = [m.simulate(h=0.01, steps=500).estimate() for m in (near, far)]
-    assert fixed[0].digits == pytest.approx(fixed[1].digits, rel=1e-6)
+    estimates = [run.estimate() for run in (small_run, large_run)]
+    assert estimates[0].amplification == pytest.approx(estimates[1].amplification, rel=1e-6)
+    fixed_estimates = [m.simulate(h=0.01, steps=500).estimate() for m in (small, large)]
+    assert fixed_estimates[0].digits == pytest.approx(fixed_estimates[1].digits, rel=1e-6)

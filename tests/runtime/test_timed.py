@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import MODULES, Modules
-from test_ends import escape, fader
+from test_ends import finite_time_escape, vanishing_mass
 
 import eomc
 
@@ -116,14 +116,14 @@ def test_its_error_is_estimated(cartpole: ModuleType) -> None:
 
 
 def test_one_that_cannot_go_on_ends_with_its_last_good_state() -> None:
-    module = eomc.load(escape(), MODULES)
+    module = eomc.load(finite_time_escape(), MODULES)
     with pytest.warns(RuntimeWarning, match=r"escape: stopped at t = 1\.\d+ after 1\d\d steps"):
         run = module.simulate(times=[0.5, 0.905, 1.5, 1.9])
     assert run.status == "not finite" and len(run) == 3 and run.t.tolist()[:2] == [0.5, 0.905]
     with pytest.warns(RuntimeWarning):
         whole = module.simulate()
     assert run.t[-1] == whole.t[-1] and np.array_equal(run.q[-1], whole.q[-1])
-    faded = eomc.load(fader(), MODULES)
+    faded = eomc.load(vanishing_mass(), MODULES)
     with pytest.warns(RuntimeWarning, match="D is not positive definite"):
         run = faded.simulate(q0=[0.0], times=[1.0])
     assert (run.status, run.steps, run.t.tolist(), run.q.tolist()) == (
