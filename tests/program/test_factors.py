@@ -1,4 +1,4 @@
-"""Rows that are powers written out, seen without factoring them."""
+"""Expanded powers in constraint rows are recognised without factorisation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ x, y, length = symbols("x y l")
         (sin(x) - cos(y)) ** 2,
     ],
 )
-def test_a_product_of_powers_is_seen_written_out(formula: Expr) -> None:
+def test_expanded_product_of_powers_is_recognised(formula: Expr) -> None:
     assert has_only_repeated_factors(expand(formula), {x, y})
 
 
@@ -36,6 +36,6 @@ def test_a_product_of_powers_is_seen_written_out(formula: Expr) -> None:
         (x**50 + y) ** 50,
     ],
 )
-def test_others_are_left_alone(formula: Expr) -> None:
-    """Where one factor is there once, or a parameter is squared; what is long is not looked at."""
+def test_other_rows_are_unchanged(formula: Expr) -> None:
+    """A factor occurs once, or a parameter is squared; long rows are not examined."""
     assert not has_only_repeated_factors(formula, {x, y})

@@ -1,4 +1,4 @@
-"""Long functions come in pieces: the same values, bearable for compilers, clean."""
+"""Long functions are split into pieces with the same values, suitable for strict compilers."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ STEPS = 40
 
 
 def chain(links: int) -> System:
-    """A hanging chain of point masses in relative angles, its definitions one over the other."""
+    """Write a hanging chain of point masses in relative angles, with nested definitions."""
     lines = ["eomc = 1", f'name = "chain_{links}"', "[coordinates]"]
     lines += [f"q{k} = {{ start = 0.{k % 9 + 1} }}" for k in range(links)]
     lines += ["[parameters]", "m = 1.2", "l = 0.7", "g = 9.81", "[definitions]"]
@@ -62,18 +62,18 @@ def chain(links: int) -> System:
     return system.from_scene(scene.parse("\n".join(lines), "chain.toml"))
 
 
-def derived(made: System) -> Program:
-    return program.build(lagrange.derive(made))
+def build_program(system: System) -> Program:
+    return program.build(lagrange.derive(system))
 
 
 @pytest.fixture(scope="module")
 def chain_program() -> Program:
-    return derived(chain(5))
+    return build_program(chain(5))
 
 
 @pytest.fixture
 def in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nearly every function is long."""
+    """Nearly every function counts as long."""
     monkeypatch.setattr(outline, "LARGE", 20)
     monkeypatch.setattr(outline, "PIECE", 25)
 
@@ -83,44 +83,44 @@ def in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", ["acceleration", "C", "energy"])
 @pytest.mark.parametrize("size", [1, 20, 100, 10**6])
-def test_pieces_compute_what_the_whole_computes(
+def test_pieces_compute_the_values_of_the_whole_function(
     chain_program: Program, name: str, size: int
 ) -> None:
-    """To the last bit, each from nothing but what it says that it reads."""
+    """To the last bit, each from only the values that it declares as read."""
     whole = chain_program[name]
     state = nearby(chain_program.system, 1)
     parts = outline.split(whole, size)
     assert (len(parts) == 1) == (size == 10**6)
     crossing: dict[str, float] = {}
-    found: dict[int, float] = {}
+    values_by_output: dict[int, float] = {}
     good = True
     for part in parts:
-        kept = tuple(Operand(S.One, n) for n in part.keeps)
-        open_ended = replace(part.function, outputs=(*kept, *part.function.outputs))
+        output_operands = tuple(Operand(S.One, n) for n in part.keeps)
+        open_ended = replace(part.function, outputs=(*output_operands, *part.function.outputs))
         read = {n: crossing[n] for n in part.reads}
         values, regular = evaluate(open_ended, {**state, **read})
         crossing |= dict(zip(part.keeps, values, strict=False))
-        found |= dict(zip(part.outputs, values[len(kept) :], strict=True))
+        values_by_output |= dict(zip(part.outputs, values[len(output_operands) :], strict=True))
         good &= regular
     expected, regular = evaluate(whole, state)
-    assert [found[k] for k in range(len(expected))] == expected
+    assert [values_by_output[k] for k in range(len(expected))] == expected
     assert good == regular
 
 
-def test_only_what_is_read_further_on_crosses(chain_program: Program) -> None:
+def test_only_values_read_later_are_passed_on(chain_program: Program) -> None:
     parts = outline.split(chain_program["acceleration"], 60)
     for k, part in enumerate(parts):
-        made = {a.name for a in (*part.function.early, *part.function.body)}
-        behind = {n for later in parts[k + 1 :] for n in later.reads}
-        assert set(part.keeps) == made & behind
-        assert not made & set(part.reads)
+        assigned = {a.name for a in (*part.function.early, *part.function.body)}
+        read_later = {n for later in parts[k + 1 :] for n in later.reads}
+        assert set(part.keeps) == assigned & read_later
+        assert not assigned & set(part.reads)
     total = sum(map(outline.weight, (part.function for part in parts)))
     assert total == outline.weight(chain_program["acceleration"])
     heaviest = max(outline.weight(part.function) for part in parts)
     assert heaviest <= 60 * 4 // 3 + 15
 
 
-def test_sine_and_cosine_of_one_angle_stay_together(chain_program: Program) -> None:
+def test_sine_and_cosine_of_an_angle_are_in_one_piece(chain_program: Program) -> None:
     for size in (1, 7, 30, 90):
         where: dict[tuple[Operand, ...], set[int]] = {}
         for k, part in enumerate(outline.split(chain_program["acceleration"], size)):
@@ -131,13 +131,13 @@ def test_sine_and_cosine_of_one_angle_stay_together(chain_program: Program) -> N
         assert all(len(places) == 1 for places in where.values())
 
 
-def straight(count: int, wide: int) -> Function:
-    """A function of `count` products and sums, each of two of the `wide` values before it."""
+def random_function(count: int, width: int) -> Function:
+    """Return `count` products and sums, each of two of the `width` values before it."""
     pick = random.Random(1)
     names = ["x", "x_dot"]
     body = []
     for k in range(count):
-        one, other = pick.choice(names[-wide:]), pick.choice(names[-wide:])
+        one, other = pick.choice(names[-width:]), pick.choice(names[-width:])
         value: Sum | Product = Product(S.Half, (one, other))
         if k % 2:
             value = Sum(((S.One, one), (S.NegativeOne, other)), S.Half)
@@ -148,11 +148,12 @@ def straight(count: int, wide: int) -> Function:
     return Function("bias", (), tuple(body), (end,), (), cost, "program", ())
 
 
-def test_the_cut_is_where_few_values_cross() -> None:
-    """Two tangles joined by one value: at that value."""
-    one = straight(60, 20)
+def test_function_is_split_where_few_values_cross() -> None:
+    """Two groups of values joined by one value are split at that value."""
+    one = random_function(60, 20)
     other = rename(
-        straight(60, 20), {"x": "w60", "x_dot": "w60"} | {f"w{k}": f"v{k}" for k in range(61)}
+        random_function(60, 20),
+        {"x": "w60", "x_dot": "w60"} | {f"w{k}": f"v{k}" for k in range(61)},
     )
     both = replace(one, body=one.body + other.body, outputs=other.outputs)
     first, second = outline.split(both, 65)
@@ -162,14 +163,14 @@ def test_the_cut_is_where_few_values_cross() -> None:
 # --- what compilers say --------------------------------------------------------------------------
 
 
-def written(made: Sources, folder: Path) -> str:
+def write_sources(sources: Sources, folder: Path) -> str:
     folder.mkdir(exist_ok=True)
-    write_files(fast_kit(made), folder)
-    return f"{made.name}.c"
+    write_files(fast_kit(sources), folder)
+    return f"{sources.name}.c"
 
 
-def everything(run: str, name: str = "everything") -> System:
-    """The scene with all that a scene can say, with more under [run]."""
+def system_with_everything(run: str, name: str = "everything") -> System:
+    """Return the scene with all features, with further options under [run]."""
     text = EVERYTHING.replace("[run]", f"[run]\n{run}").replace('"everything"', f'"{name}"')
     return system.from_scene(scene.parse(text, "everything.toml"))
 
@@ -179,19 +180,17 @@ def everything(run: str, name: str = "everything") -> System:
     "run",
     ["", 'method = "dp8"', 'batch = true\nmethod = ["rk4", "dp8"]', 'real = "float"\nbatch = true'],
 )
-def test_pieces_are_clean_for_strict_compilers(
-    in_small_pieces: None, tmp_path: Path, run: str
-) -> None:
-    """As C with gcc and clang, and as C++; the self-test passes.
+def test_pieces_compile_without_warnings(in_small_pieces: None, tmp_path: Path, run: str) -> None:
+    """Compile as C with gcc and clang and as C++; run the self-test.
 
-    RK4 in doubles has its accelerations in two parts, places in pairs.
+    RK4 in doubles has its accelerations in two parts, with configurations in pairs.
     """
-    made = render(derived(everything(run)), "_everything")
-    source = written(made, tmp_path)
+    sources = render(build_program(system_with_everything(run)), "_everything")
+    source = write_sources(sources, tmp_path)
     paired = "float" not in run and run != 'method = "dp8"'
     parts = ("_configurations_2_two(", "_velocities_2(") if paired else ("_rates_4(",)
-    assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
-    assert ("_rates_4_wide(" in fast_kit(made)[source]) == ("batch" in run)
+    assert all(part in fast_kit(sources)[source] for part in (*parts, "_C_4("))
+    assert ("_rates_4_wide(" in fast_kit(sources)[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
         compiled(
             needs(command),
@@ -214,7 +213,7 @@ def test_pieces_are_clean_for_strict_compilers(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", ["1", "77"])
-def test_the_hash_seed_decides_nothing(tmp_path: Path, seed: str) -> None:
+def test_hash_seed_does_not_affect_the_pieces(tmp_path: Path, seed: str) -> None:
     code = """
 import sys
 from eomc import read
@@ -239,18 +238,23 @@ for name in sys.argv[1:]:
 
 
 @pytest.mark.slow
-def test_compile_time_grows_with_the_size_and_no_faster(tmp_path: Path) -> None:
-    """Eight times the operations, in pieces, take at most twice eight times as long."""
-    made = derived(eomc.read(SCENES / "mass_spring.toml"))
+def test_compile_time_grows_linearly_with_the_size(tmp_path: Path) -> None:
+    """Eight times the operations, in pieces, take at most sixteen times as long."""
+    whole_program = build_program(eomc.read(SCENES / "mass_spring.toml"))
 
     def seconds(count: int) -> float:
-        long = Program(made.system, {**made.functions, "bias": straight(count, 60)}, (), made.order)
-        source = written(render(long, "_x"), tmp_path)
+        long = Program(
+            whole_program.system,
+            {**whole_program.functions, "bias": random_function(count, 60)},
+            (),
+            whole_program.order,
+        )
+        source = write_sources(render(long, "_x"), tmp_path)
         least = float("inf")
         for _ in range(3):
-            begun = os.times().children_user  # of the compiler alone, whoever else is at work
+            start = os.times().children_user  # of the compiler only, whatever other processes run
             compiled(needs("gcc"), "-O3", "-c", source, cwd=tmp_path)
-            least = min(least, os.times().children_user - begun)
+            least = min(least, os.times().children_user - start)
         return least
 
     nothing, small, large = seconds(1), seconds(1000), seconds(8000)
@@ -262,28 +266,28 @@ def test_compile_time_grows_with_the_size_and_no_faster(tmp_path: Path) -> None:
 
 @pytest.fixture
 def root(request: pytest.FixtureRequest) -> Path:
-    """Where the modules of a test are kept from run to run, as long as this file stays as it is."""
+    """Return the cache folder for modules of a test, valid while this file is unchanged."""
     return KEPT / "outline" / re.sub(r"\W+", "_", request.node.name)
 
 
-def module(made: Program, root: Path) -> ModuleType:
-    """A program compiled under `root`."""
-    name, mine = made.system.name, Path(__file__).read_text(encoding="utf-8")
-    key = cache.key(made.system.digest, f"{root} {mine}")
-    return cache.load(cache.build(name, key, lambda extension: render(made, extension), root))
+def load_program(program: Program, root: Path) -> ModuleType:
+    """Compile a program under `root` and load it."""
+    name, mine = program.system.name, Path(__file__).read_text(encoding="utf-8")
+    key = cache.key(program.system.digest, f"{root} {mine}")
+    return cache.load(cache.build(name, key, lambda extension: render(program, extension), root))
 
 
 @pytest.mark.slow
-def test_a_system_in_pieces_moves_as_it_does_whole(
+def test_system_in_pieces_moves_as_the_whole_system(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every function, single runs and batches; the operations are contracted in other places."""
+    """Test every function, single runs and batches; operations are fused at other places."""
     run = 'batch = true\nmethod = ["rk4", "dp8"]'
-    plain = derived(everything(run))
-    whole = module(plain, root / "whole")
+    plain = build_program(system_with_everything(run))
+    whole = load_program(plain, root / "whole")
     monkeypatch.setattr(outline, "LARGE", 20)
     monkeypatch.setattr(outline, "PIECE", 25)
-    cut = module(plain, root / "cut")
+    cut = load_program(plain, root / "cut")
     random_state = np.random.default_rng(3)
     q0, qd0 = (x + 0.1 * random_state.standard_normal((75, 3)) for x in whole.start)
     for name in ("D", "g"):
@@ -291,8 +295,8 @@ def test_a_system_in_pieces_moves_as_it_does_whole(
             getattr(cut, name)(q0), getattr(whole, name)(q0), rtol=1e-12, atol=1e-13
         )
     for name in ("C", "bias", "tau", "energy", "power", "acceleration"):
-        found, expected = (getattr(m, name)(q0, qd0) for m in (cut, whole))
-        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
+        result, expected = (getattr(m, name)(q0, qd0) for m in (cut, whole))
+        np.testing.assert_allclose(result, expected, rtol=1e-11, atol=1e-12)
     for method in ("rk4", "dp8"):
         for u in (None, [0.3, -0.2]):
             one, other = (
@@ -307,11 +311,11 @@ def test_a_system_in_pieces_moves_as_it_does_whole(
                 np.testing.assert_allclose(many.qd[k], alone.qd, rtol=0, atol=1e-11)
 
 
-def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
+def test_failed_instance_does_not_affect_others_in_pieces(
     in_small_pieces: None, root: Path
 ) -> None:
-    made = eomc.read(SCENES / "kepler_orbit.toml")
-    m = module(derived(replace(made, run=replace(made.run, batch=True))), root)
+    system = eomc.read(SCENES / "kepler_orbit.toml")
+    m = load_program(build_program(replace(system, run=replace(system.run, batch=True))), root)
     q0, qd0 = np.tile(m.start[0], (70, 1)), np.tile(m.start[1], (70, 1))
     good = m.simulate_batch(q0, qd0, steps=STEPS)
     q0[41] = 0.0  # at the centre, where the force is infinite
@@ -321,31 +325,31 @@ def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
     assert np.array_equal(runs.q[others], good.q[others])
 
 
-def test_signals_and_held_inputs_reach_a_batch_in_pieces(
+def test_signals_and_constant_inputs_in_a_batch_in_pieces(
     monkeypatch: pytest.MonkeyPatch, root: Path
 ) -> None:
     monkeypatch.setattr(outline, "LARGE", 8)
     monkeypatch.setattr(outline, "PIECE", 8)
-    made = scene_system("cartpole_driven")
-    m = module(derived(replace(made, run=replace(made.run, batch=True))), root)
-    source = root / made.name / "fast" / f"{made.name}.c"
+    system = scene_system("cartpole_driven")
+    m = load_program(build_program(replace(system, run=replace(system.run, batch=True))), root)
+    source = root / system.name / "fast" / f"{system.name}.c"
     assert "_rates_2_wide(" in source.read_text(encoding="utf-8")
     q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
     q0[:, 1] += np.linspace(-1, 1, 9)
     for u in (None, [0.5]):
         runs = m.simulate_batch(q0, qd0, steps=STEPS, u=u)
         alone = m.simulate(q0[7], qd0[7], steps=STEPS, u=u)
-        # the same operations, contracted to FMA in other places
+        # the same operations, fused to FMA at other places
         np.testing.assert_allclose(runs.q[7], alone.q, rtol=0, atol=1e-12)
 
 
 # --- matrices by columns -------------------------------------------------------------------------
 
 
-def by_columns(made: Program) -> Program:
-    """The program with D e and C e for a direction e in place of D and C."""
-    functions = dict(made.functions)
-    names = [c.name for c in made.system.coordinates]
+def with_matrices_by_columns(program: Program) -> Program:
+    """Return the program with D e and C e for a direction e in place of D and C."""
+    functions = dict(program.functions)
+    names = [c.name for c in program.system.coordinates]
     for name in ("D", "C"):
         whole = functions.pop(name)
         body, outputs = list(whole.body), []
@@ -362,34 +366,34 @@ def by_columns(made: Program) -> Program:
         functions[f"{name}_column"] = replace(
             whole, name=f"{name}_column", body=tuple(body), outputs=tuple(outputs)
         )
-    return replace(made, functions=functions)
+    return replace(program, functions=functions)
 
 
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "furuta_pendulum", "kapitza_pendulum"), "furuta_pendulum")
 )
 @pytest.mark.parametrize("small", tiers([False, True], True))
-def test_matrices_by_columns_are_the_matrices(
+def test_matrices_by_columns_agree_with_whole_matrices(
     name: str, small: bool, tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain = derived(eomc.read(SCENES / f"{name}.toml"))
-    whole = module(plain, root / "whole")
+    plain = build_program(eomc.read(SCENES / f"{name}.toml"))
+    whole = load_program(plain, root / "whole")
     if small:
         monkeypatch.setattr(outline, "LARGE", 5)
         monkeypatch.setattr(outline, "PIECE", 8)
-    made = render(by_columns(plain), "_x")
-    source = written(made, tmp_path)
-    assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]
+    sources = render(with_matrices_by_columns(plain), "_x")
+    source = write_sources(sources, tmp_path)
+    assert f"By {len(plain.system.q)} columns, each: " in sources.files[f"{name}.h"]
     compiled(needs("gcc"), *STRICT, "-O1", "-I.", "-c", source, "selftest.c", cwd=tmp_path)
-    columns = module(by_columns(plain), root / "columns")
+    columns = load_program(with_matrices_by_columns(plain), root / "columns")
     states = np.random.default_rng(4).standard_normal((2, 9, len(plain.system.q)))
-    for found, expected in (
+    for result, expected in (
         (columns.D(states[0]), whole.D(states[0])),
         (columns.C(*states), whole.C(*states)),
     ):
-        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(result, expected, rtol=1e-13, atol=1e-13)
     values = nearby(plain.system, 2)
-    exact = program.matrix(by_columns(plain), "C", values)
+    exact = program.matrix(with_matrices_by_columns(plain), "C", values)
     expected, _ = evaluate(plain["C"], values)
     np.testing.assert_allclose(np.ravel(exact), expected, rtol=1e-13, atol=1e-13)
 
@@ -397,8 +401,8 @@ def test_matrices_by_columns_are_the_matrices(
 # --- names ---------------------------------------------------------------------------------------
 
 
-def test_parameters_may_be_called_like_directions(root: Path) -> None:
-    """The entries of a direction, for D and the Jacobian, have names that no scene can have."""
+def test_parameters_with_names_of_directions_are_accepted(root: Path) -> None:
+    """Entries of a direction, for D and the Jacobian, have names that no scene can have."""
     text = """
         eomc = 1
         name = "clash"
@@ -413,33 +417,35 @@ def test_parameters_may_be_called_like_directions(root: Path) -> None:
         linearize = true
         """
     q, qd = [0.3, 0.4], [0.2, -0.3]
-    found = []
+    results = []
     for name in ("x_along", "m"):
-        made = system.from_scene(scene.parse(text.replace("NAME", name), "clash.toml"))
-        built = module(derived(made), root / name)
-        found.append((built.D(q), built.acceleration(q, qd), *built.linearize(q, qd)[:2]))
-    np.testing.assert_array_equal(found[0][0], np.diag([2.0, 1.09]))
-    for one, other in zip(*found, strict=True):
+        clash_system = system.from_scene(scene.parse(text.replace("NAME", name), "clash.toml"))
+        built = load_program(build_program(clash_system), root / name)
+        results.append((built.D(q), built.acceleration(q, qd), *built.linearize(q, qd)[:2]))
+    np.testing.assert_array_equal(results[0][0], np.diag([2.0, 1.09]))
+    for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
-def test_parameters_may_be_called_like_values(root: Path, modules: Modules) -> None:
-    """w1 is a name of ours inside a function that does not read the parameter."""
+def test_parameters_with_names_of_values_are_accepted(root: Path, modules: Modules) -> None:
+    """w1 is a generated name inside a function that does not read the parameter."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     awkward = re.sub(r"(?m)^g( +=)", r"w1\1", text).replace("m_p*g*y_p", "m_p*w1*y_p")
     assert awkward.count("w1") == 2
-    found = module(derived(system.from_scene(scene.parse(awkward, "awkward.toml"))), root)
+    module_of_pieces = load_program(
+        build_program(system.from_scene(scene.parse(awkward, "awkward.toml"))), root
+    )
     plain = modules.unoptimised(scene_system("cartpole"))
     state = ([0.1, 0.4], [0.2, -0.3])
-    assert np.array_equal(found.acceleration(*state), plain.acceleration(*state))
-    assert np.array_equal(found.C(*state), plain.C(*state))
+    assert np.array_equal(module_of_pieces.acceleration(*state), plain.acceleration(*state))
+    assert np.array_equal(module_of_pieces.C(*state), plain.C(*state))
 
 
 @pytest.mark.parametrize("name", ["chain", "cartpole_driven"])
-def test_no_type_is_defined_twice(in_small_pieces: None, name: str) -> None:
-    """What the configuration hands on, and what its outlined functions do, are two structs."""
-    made = scene_system(name)
-    files = fast_kit(render(derived(made), "_twice"))
+def test_types_are_defined_once(in_small_pieces: None, name: str) -> None:
+    """The values of the configuration and those of its outlined functions are two structs."""
+    system = scene_system(name)
+    files = fast_kit(render(build_program(system), "_twice"))
     types = re.findall(r"^\} (\w+);", files[f"{name}.h"] + files[f"{name}.c"], re.M)
     assert len(types) == len(set(types)) > 3

@@ -1,4 +1,4 @@
-"""Polynomials of what stands on a tape: how large they may be."""
+"""Polynomials of expressions on a tape have a bounded size."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from sympy import S
 from eomc.program.polynomial import MAX_BITS, MAX_EXPONENT, TooLargeError, _bounded
 
 
-def test_long_exponents_and_numbers_are_not_multiplied_out() -> None:
-    """Beyond a bound they would take minutes and gigabytes."""
+def test_large_exponents_and_numbers_are_not_expanded() -> None:
+    """Beyond a bound the expansion would take minutes and gigabytes."""
     most, one = Fraction(MAX_EXPONENT), Fraction(1)
     fits = {(("x", -most), ("y", most)): S(2) ** (MAX_BITS - 2)}
     assert _bounded(fits) == fits

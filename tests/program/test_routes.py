@@ -1,4 +1,4 @@
-"""Every route of the registry computes the same motion; a new one is tested by its entry."""
+"""Every route of the registry computes the same motion; its entry tests a new one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def solutions(scene: str) -> dict[str, Solution]:
     return {name: way for name, way in ways.items() if isinstance(way, Solution)}
 
 
-def test_each_is_good_for_something() -> None:
+def test_each_route_is_the_cheapest_of_some_scene() -> None:
     used = {name for scene in SCENES for name in solutions(scene)}
     material = RouteInputs(derive(scene_system("cartpole_bodies")))
     used |= {r.name for r in ROUTES.values() if r.functions(material)}
@@ -38,42 +38,46 @@ def test_each_is_good_for_something() -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_all_agree_in_forty_digits(scene: str) -> None:
+def test_all_routes_agree_in_forty_digits(scene: str) -> None:
     system = scene_system(scene)
-    found = {
+    results = {
         name: lower("acceleration", way.tape, way.acceleration, checks=way.pivots)
         for name, way in solutions(scene).items()
     }
-    assert len(found) > 1
+    assert len(results) > 1
     for k in range(3):
         state = nearby(system, k) | {i.name: 0.7 for i in system.inputs}
-        right, _ = evaluate(found["lagrange"], state, exact=True)
-        for name, function in found.items():
+        right, _ = evaluate(results["lagrange"], state, exact=True)
+        for name, function in results.items():
             ours, regular = evaluate(function, state, exact=True)
             assert regular, name
             np.testing.assert_allclose(ours, right, rtol=1e-15, atol=1e-25, err_msg=name)
 
 
-def test_rotations_there_and_back_cancel_in_c() -> None:
-    """Of a box that tumbles; another entry than by Newton and Euler, and the same number."""
+def test_inverse_rotations_cancel_in_c() -> None:
+    """For a tumbling box the expression differs from Newton and Euler's, the value does not."""
     material = RouteInputs(derive(scene_system("tumbling_box")))
     plain, short = (ROUTES[name].functions(material) for name in ("newton-euler", "rotated"))
     assert plain is not None and short is not None
-    made = [lower("C", f.tape, f.outputs["C"]) for f in (plain, short)]
-    assert made[0].cost.multiplications > 60 and made[1].cost.multiplications < 50
+    functions_of_C = [lower("C", f.tape, f.outputs["C"]) for f in (plain, short)]
+    assert (
+        functions_of_C[0].cost.multiplications > 60 and functions_of_C[1].cost.multiplications < 50
+    )
     for k in range(3):
-        one, other = (evaluate(f, nearby(material.derived.system, k), exact=True)[0] for f in made)
+        one, other = (
+            evaluate(f, nearby(material.derived.system, k), exact=True)[0] for f in functions_of_C
+        )
         np.testing.assert_allclose(other, one, rtol=1e-15, atol=1e-25)
 
 
 @pytest.mark.parametrize("name", ROUTES)
-def test_a_comment_says_how_d_is_solved(name: str) -> None:
+def test_comment_names_the_route_for_the_mass_matrix(name: str) -> None:
     route = ROUTES[name]
     assert route.sentence
     assert "x, theta" in route.solved(scene_system("cartpole"), "x, theta")
 
 
-def test_no_other_file_compares_their_names() -> None:
+def test_no_other_file_compares_names_of_routes() -> None:
     package = Path(__file__).parents[2] / "generator" / "eomc"
     files = [f for f in package.rglob("*.py") if f.name != "routes.py"]
     texts = {f: f.read_text(encoding="utf-8") for f in files}
@@ -91,10 +95,10 @@ def test_no_other_file_compares_their_names() -> None:
     assert not compared
 
 
-def test_states_where_no_route_has_a_result_say_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_states_without_a_result_of_any_route_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     errors = {"one": [math.inf, *[1e-16] * 3, 3e-16], "other": [math.inf, *[1e-16] * 3, math.inf]}
-    monkeypatch.setattr(routes, "_errors", lambda made, *_: errors[made.name])
+    monkeypatch.setattr(routes, "_errors", lambda function, *_: errors[function.name])
     empty = Function("", (), (), (), (), Cost(), "", ())
-    made = {name: replace(empty, name=name) for name in errors}
-    found = routes._roundings(made, scene_system("cartpole"))
-    assert found == {"one": 3e-16, "other": math.inf}
+    function = {name: replace(empty, name=name) for name in errors}
+    roundings = routes._roundings(function, scene_system("cartpole"))
+    assert roundings == {"one": 3e-16, "other": math.inf}

@@ -30,8 +30,8 @@ from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 from eomc.verify import symbolic
 
-# angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that
-# is no angle; time, feedback and friction
+# angles as coordinates, as sums, with a number, with a parameter and times a coordinate; a
+# coordinate that is no angle; time, feedback and friction
 ODD = """
 eomc = 1
 name = "odd"
@@ -113,17 +113,17 @@ method = ["rk4", "gauss16"]
 
 
 @cache
-def odd() -> system.System:
+def scene_with_odd_angles() -> system.System:
     return system.from_scene(scene.parse(ODD, "odd.toml"))
 
 
 @cache
-def odd_target() -> Target:
-    return Target(program.build(lagrange.derive(odd())), DOUBLE)
+def target_of_odd_angles() -> Target:
+    return Target(program.build(lagrange.derive(scene_with_odd_angles())), DOUBLE)
 
 
 def chain(links: int) -> str:
-    """Point masses on links with absolute angles, let go at rest."""
+    """Write point masses on links with absolute angles, released at rest."""
     numbers = range(1, links + 1)
     angles = "".join(f"a{k} = {{ start = {0.3 + 0.1 * k:.1f} }}\n" for k in numbers)
     places = 'x0 = "0"\ny0 = "0"\n'
@@ -139,19 +139,19 @@ def chain(links: int) -> str:
 
 
 def with_run(text: str, name: str, run: str) -> str:
-    """The scene under a name of its own, with this under [run]."""
+    """Return the scene under its own name, with these options under [run]."""
     head = text.partition("[run]")[0].replace('name = "', f'name = "{name}')
     return f"{head}[run]\n{run}\n"
 
 
-def many(text: str) -> str:
-    """The scene with batches, and with a method of order 8."""
+def batch_and_order_8(text: str) -> str:
+    """Return the scene with batches, and with a method of order 8."""
     return with_run(text, "many_", 'batch = true\nmethod = ["rk4", "dp8"]')
 
 
-def test_parts_are_the_whole() -> None:
-    """What stands in the first part hangs on neither time, inputs nor velocities."""
-    accelerations = Accelerations(odd_target())
+def test_two_parts_compute_the_whole_acceleration() -> None:
+    """The first part depends on neither time, inputs nor velocities."""
+    accelerations = Accelerations(target_of_odd_angles())
     function, parts = accelerations.function, accelerations.parts
     assert parts is not None and len(accelerations.angles) >= two_point.MIN_ANGLES
     sines = {name for a in accelerations.angles for name in (a.sine, a.cosine)}
@@ -160,7 +160,7 @@ def test_parts_are_the_whole() -> None:
     place = {"x", "a", "b", "c", "d", "e"} | sines | {a.name for a in parts.configuration.body}
     for a in parts.velocity.body:
         assert not place.issuperset(set(a.value.names) - early)
-        if isinstance(a.value, Product):  # one factor of all that the place decides
+        if isinstance(a.value, Product):  # one factor of the position-dependent terms
             known = [name for name in a.value.factors if name in place | early]
             assert len(known) <= 1 or place.isdisjoint(known)
             assert abs(a.value.coefficient) == 1 or place.isdisjoint(known)
@@ -169,8 +169,8 @@ def test_parts_are_the_whole() -> None:
     assert len(parts.configuration.checks) + len(parts.velocity.checks) <= len(function.checks)
 
 
-def test_what_is_known_last_comes_last() -> None:
-    """And of two products the one known later stands first, where it is fused with the sum."""
+def test_products_are_sorted_by_latency() -> None:
+    """Of two products the later one comes first, where it is fused with the sum."""
     u, v, late, last = ((S.One, name) for name in ("u", "v", "late", "last"))
     values = {
         "late": Product(S.One, ("u", "v")),
@@ -180,13 +180,13 @@ def test_what_is_known_last_comes_last() -> None:
         "then": Product(S.One, ("last", "v")),
         "both": Sum(((S.One, "soon"), (S.NegativeOne, "then"))),
     }
-    function = odd_target().program["acceleration"]
+    function = target_of_odd_angles().program["acceleration"]
     body = tuple(Assignment(name, value, Stage.VELOCITY) for name, value in values.items())
     outputs = (Operand(S.One, "sum"), Operand(S.One, "both"))
-    made = two_point._sort_by_latency(replace(function, body=body, outputs=outputs))
-    found = {a.name: a.value for a in made.body}
-    assert found["sum"] == Sum((u, late, last))
-    assert found["both"] == Sum(((S.NegativeOne, "then"), (S.One, "soon")))
+    sorted_function = two_point._sort_by_latency(replace(function, body=body, outputs=outputs))
+    values_by_name = {a.name: a.value for a in sorted_function.body}
+    assert values_by_name["sum"] == Sum((u, late, last))
+    assert values_by_name["both"] == Sum(((S.NegativeOne, "then"), (S.One, "soon")))
 
 
 MORE = """
@@ -209,8 +209,8 @@ h = 0.01
 
 
 @pytest.mark.slow
-def test_more_angles_than_coordinates(modules: Modules) -> None:
-    """Every coordinate is an angle, and a sum of two is one more; other functions beside them."""
+def test_more_angles_than_coordinates_are_accepted(modules: Modules) -> None:
+    """Every coordinate is an angle, and a sum of two is a further one."""
     module = modules.of_text(MORE)
     trusted = symbolic.reference_for(system.from_scene(scene.parse(MORE, "more.toml")))
     _, q, qd = trusted.simulate(h=0.01, steps=50)
@@ -219,24 +219,24 @@ def test_more_angles_than_coordinates(modules: Modules) -> None:
     np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
 
 
-def written(module: ModuleType, end: str) -> str:
-    """The fast form of a module, of NAME.h or NAME.c."""
+def source_of(module: ModuleType, end: str) -> str:
+    """Return the optimised form of a module, from NAME.h or NAME.c."""
     (file,) = (Path(str(module.__file__)).parent / "fast").glob(f"*.{end}")
     return file.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
-def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> None:
+def test_scenes_with_few_angles_are_not_split(modules: Modules) -> None:
     for name in ("cartpole", "double_pendulum", "tumbling_box", "suspension"):
-        assert "_configuration;" not in written(modules.unoptimised(scene_system(name)), "c")
-    assert "} chain_configuration;" in written(modules.unoptimised(scene_system("chain")), "c")
+        assert "_configuration;" not in source_of(modules.unoptimised(scene_system(name)), "c")
+    assert "} chain_configuration;" in source_of(modules.unoptimised(scene_system("chain")), "c")
 
 
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.2, 0.45), 0.45))
-def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modules) -> None:
-    """Turned by little, by nearly what is allowed, by more: then sines are computed anew."""
+def test_short_and_long_steps_agree_with_reference(h: float, modules: Modules) -> None:
+    """Rotations by a small angle, by nearly the limit, and by more, which needs new sines."""
     built = modules.unoptimised if h == 0.45 else modules.of_text  # optimised in the slow tier
-    module, trusted = built(ODD), symbolic.derive(odd())
+    module, trusted = built(ODD), symbolic.derive(scene_with_odd_angles())
     for u in (None, [0.2, -0.1]):
         run = module.simulate(h=h, steps=12, u=u)
         _, q, qd = trusted.simulate(h=h, steps=12, u=u)
@@ -247,10 +247,10 @@ def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modu
 
 @pytest.mark.slow
 @pytest.mark.parametrize("links", (5, 8))
-def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
+def test_chains_by_link_multipliers_agree_with_reference(links: int, modules: Modules) -> None:
     module = modules.of_text(chain(links))
-    made = system.from_scene(scene.parse(chain(links), "links.toml"))
-    trusted = symbolic.reference_for(made)
+    links_system = system.from_scene(scene.parse(chain(links), "links.toml"))
+    trusted = symbolic.reference_for(links_system)
     _, q, qd = trusted.simulate(h=0.002, steps=50)
     run = module.simulate(h=0.002, steps=50)
     np.testing.assert_allclose(run.q, q, rtol=1e-11)
@@ -258,8 +258,8 @@ def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
-    """Where reduction by pi/2 in parts has no digit left."""
+def test_large_angle_is_passed_to_libm(modules: Modules) -> None:
+    """Reduction by pi/2 in parts has no correct digit left there."""
     module = modules.unoptimised(chain(5))
     trusted = symbolic.reference_for(system.from_scene(scene.parse(chain(5), "links.toml")))
     q = np.array([3e15, -2e12, 1e9, 7e22, 0.5])
@@ -268,8 +268,8 @@ def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     np.testing.assert_allclose(module.acceleration(q, qd), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) -> None:
-    """Angles are sums of coordinates, exact ones here."""
+def test_large_angle_does_not_affect_others_in_its_register(modules: Modules) -> None:
+    """The angles are sums of coordinates, which are exact here."""
     module = modules.unoptimised((SCENES / "chain.toml").read_text(encoding="utf-8"))
     for at in range(5):
         q = np.arange(5, 10) / 16
@@ -279,31 +279,30 @@ def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) 
         np.testing.assert_allclose(module.potential_energy(q), 9.81 * height, rtol=1e-13)
 
 
-@pytest.mark.parametrize("at", tiers([0, 4], 4))
-def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
-    """Of 7e22 rad, where numbers are 8e6 apart; the other links swing about it."""
+@pytest.mark.parametrize("index", tiers([0, 4], 4))
+def test_steps_at_an_angle_too_large_to_change(index: int, modules: Modules) -> None:
+    """At 7e22 rad the spacing of doubles is 8e6; the other links swing about that link."""
     module = modules.unoptimised(chain(5))
     trusted = symbolic.reference_for(system.from_scene(scene.parse(chain(5), "links.toml")))
     start, rates = module.start
-    start[at] = 7e22
+    start[index] = 7e22
     _, q, _ = trusted.simulate(start, rates, h=0.01, steps=20)
     run = module.simulate(start, rates, h=0.01, steps=20)
-    assert (run.q[:, at] == 7e22).all()
-    # whether it has rotated by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
+    assert (run.q[:, index] == 7e22).all()
+    # a rotation by h^2 a inside a step is below the spacing; a wrong sine gives an error of 0.1
     np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-4)
 
 
-def test_faults_are_told(modules: Modules) -> None:
-    """A singular D, by parameters or at a place; a state that is not finite: each with the last
-    good state."""
+def test_failures_return_the_last_good_state(modules: Modules) -> None:
+    """A singular D, by parameters or at a position, and a state that is not finite."""
     module = modules.unoptimised(chain(5))
     q, qd = module.start
     with warnings.catch_warnings(action="ignore"):
         singular = module.simulate(h=0.01, steps=3, params={"m": 0.0})
         fast = module.simulate(q, qd + 1e160, h=0.5, steps=20)
         poles = modules.unoptimised(POLES).simulate(h=0.01, steps=3)
-    found = singular.status, poles.status, fast.status
-    assert found == ("singular", "singular", "not finite")
+    statuses = singular.status, poles.status, fast.status
+    assert statuses == ("singular", "singular", "not finite")
     for run in (singular, poles, fast):
         assert len(run.q) == 1
         assert np.isfinite(run.q).all()
@@ -311,9 +310,9 @@ def test_faults_are_told(modules: Modules) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [ODD, chain(6)], ids=["odd", "chain"])
-def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
-    """Batches and other steppers, over the same two parts."""
-    module = modules.of_text(many(text))
+def test_batches_and_other_steppers_agree(text: str, modules: Modules) -> None:
+    """They share the same two parts."""
+    module = modules.of_text(batch_and_order_8(text))
     q, qd = module.start
     starts = q + 0.02 * np.arange(40)[:, None] * np.linspace(-1, 1, len(q))
     moving = np.tile(qd, (40, 1))
@@ -331,19 +330,19 @@ def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
         np.testing.assert_allclose(run.x[-1], expected, rtol=1e-9, atol=1e-10)
 
 
-def test_steps_take_it_and_predict_no_angles(modules: Modules) -> None:
-    header, source = (written(modules.unoptimised(chain(5)), end) for end in "hc")
+def test_steps_use_two_points_and_predict_no_angles(modules: Modules) -> None:
+    header, source = (source_of(modules.unoptimised(chain(5)), end) for end in "hc")
     assert "predicted" not in header and "predicted" not in source
-    # stages 0 and 2, each for two points: in the step, and in all the accelerations for themselves
+    # stages 0 and 2, each for two points: in the step and in the separate accelerations
     assert source.count("links5_both_configurations(&w->k, at, next") == 1
     assert source.count("links5_both_configurations(&k, q, q, s, s") == 1
 
 
 @pytest.mark.slow
-def test_steps_with_constraints_take_it_too(modules: Modules) -> None:
-    """The stages of gauss16 go by themselves."""
+def test_steps_with_constraints_use_two_points(modules: Modules) -> None:
+    """The stages of gauss16 are computed one by one."""
     module = modules.unoptimised(ROPE)
-    assert "rope_both_configurations(&w->k, at, next" in written(module, "c")
+    assert "rope_both_configurations(&w->k, at, next" in source_of(module, "c")
     run, other = (module.simulate(h=0.002, method=name) for name in ("rk4", "gauss16"))
     assert run.status == "ok"
     np.testing.assert_allclose(run.x[-1], other.x[-1], rtol=0, atol=1e-8)
@@ -351,23 +350,24 @@ def test_steps_with_constraints_take_it_too(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
-    """130,000 steps, so short that rounding is all of their error, beside 256 of order 8.
+def test_sums_are_compensated_in_two_point_form(modules: Modules) -> None:
+    """Compare 130,000 short steps, whose only error is rounding, with 256 steps of order 8.
 
-    Both are then off by some units of rounding, 2^-53 of numbers near 1, that the motion makes five
-    or ten of in a second; with plain sums it is some hundreds, the root of the number of steps.
+    Both then err by some units of rounding, 2^-53 of numbers near 1, which the motion multiplies by
+    five or ten in a second. With plain sums the error is some hundreds of units, the root of the
+    number of steps.
     """
-    module = modules.of_text(many(chain(6)))
+    module = modules.of_text(batch_and_order_8(chain(6)))
     short = module.simulate(h=2.0**-17, steps=2**17, every=2**17)
     few = module.simulate(h=2.0**-8, steps=2**8, method="dp8")
     assert np.abs(short.x[-1] - few.x[-1]).max() < 60 * 2.0**-53
 
 
 @pytest.mark.slow
-def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
-    """An oscillator beside five angles: a step of it is a linear map, its power the answer.
+def test_weights_sum_to_one_in_two_point_form(modules: Modules) -> None:
+    """A step of an oscillator beside five angles is a linear map, whose power is the reference.
 
-    In 326 turns a relative error of h/6, 2^-54, makes 1e-13.
+    In 326 turns a relative error of h/6, 2^-54, causes an error of 1e-13.
     """
     text = MORE.replace('"more"', '"beside"').replace("[energy]", "x = { start = 1.0 }\n[energy]")
     text = text.replace('kinetic = "', 'kinetic = "x_dot**2/2 + ')
@@ -378,9 +378,9 @@ def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
         step = mpmath.eye(2) + z + z**2 / 2 + z**3 / 6 + z**4 / 24
         exact = step**steps * mpmath.matrix([1, 0])
         run = module.simulate(h=1 / 1024, steps=steps, every=steps)
-        found = run.q[-1, -1], run.qd[-1, -1]
-        off = max(abs(mpmath.mpf(float(x)) - y) for x, y in zip(found, exact, strict=True))
-    assert off < (1e-14 if FMA else 2e-13)  # for what h/6 lacks
+        result = run.q[-1, -1], run.qd[-1, -1]
+        error = max(abs(mpmath.mpf(float(x)) - y) for x, y in zip(result, exact, strict=True))
+    assert error < (1e-14 if FMA else 2e-13)  # the error of h/6
 
 
 DIRT = """#include "dirt_odd.h"
@@ -412,12 +412,12 @@ int main(void)
 """
 
 
-def test_no_step_reads_what_none_has_written(tmp_path: Path) -> None:
-    """Vectors are as long as registers: gauss8 left what is behind the coordinates as it was."""
+def test_steps_read_no_uninitialised_values(tmp_path: Path) -> None:
+    """Vectors are as long as registers; gauss8 once left the padding uninitialised."""
     needs("gcc")
     run = 'method = ["rk4", "dp8", "gauss8", "gauss16"]'
-    made = system.from_scene(scene.parse(with_run(ODD, "dirt_", run), "dirt_odd.toml"))
-    write_files({**fast_kit(eomc.sources(made)), "dirt.c": DIRT}, tmp_path)
+    dirty_system = system.from_scene(scene.parse(with_run(ODD, "dirt_", run), "dirt_odd.toml"))
+    write_files({**fast_kit(eomc.sources(dirty_system)), "dirt.c": DIRT}, tmp_path)
     command = "gcc -std=gnu99 -O0 -march=native dirt.c dirt_odd.c -lm -o dirt"
     compiled(*command.split(), cwd=tmp_path)
     assert subprocess.run([tmp_path / "dirt"]).returncode == 0

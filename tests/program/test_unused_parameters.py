@@ -1,4 +1,4 @@
-"""Parameters that energies and forces have and no equation of motion: a warning names each."""
+"""Parameters of energies and forces that enter no equation of motion are warned of by name."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ dots = [["z", 0]]
 """
 
 
-def warned(system: System) -> list[Problem]:
-    """What a build warns of."""
-    found: list[Problem] = []
-    pipeline._program(system, found.append)
-    return found
+def warnings_of(system: System) -> list[Problem]:
+    """Return the warnings of a build."""
+    warnings: list[Problem] = []
+    pipeline._program(system, warnings.append)
+    return warnings
 
 
-def test_what_reaches_no_equation_is_told_by_the_place_where_it_stands() -> None:
-    """What an output, a picture or a start has as well is of use; energies of outputs are none."""
-    told = warned(from_scene(read.parse(SCENE)))
-    keys = {str(re.findall(r"'(\w+)'", p.message)[0]): p.key for p in told}
+def test_parameters_in_no_equation_are_warned_of_at_their_line() -> None:
+    """Use in outputs, pictures or initial values counts; use in energies as outputs does not."""
+    problems = warnings_of(from_scene(read.parse(SCENE)))
+    keys = {str(re.findall(r"'(\w+)'", p.message)[0]): p.key for p in problems}
     assert keys == {
         "M": "energy.kinetic", "I": "definitions.J", "a": "energy.kinetic",
         "shift": "definitions.of_both", "none": "forces.x",
     }  # fmt: skip
-    assert all(p.severity == "warning" and p.line for p in told)
-    why = {p.key: p.message for p in told if p.message[1] in "MI"}
+    assert all(p.severity == "warning" and p.line for p in problems)
+    why = {p.key: p.message for p in problems if p.message[1] in "MI"}
     assert "has it with x_dot, but not its square; write x_dot**2" in why["energy.kinetic"]
     assert "has it with theta_dot, but not its square" in why["definitions.J"]
 
 
-def test_of_bodies_nothing_is_told() -> None:
-    """The mass of a body that does not move is no slip."""
+def test_parameters_of_bodies_are_not_warned_of() -> None:
+    """The mass of a fixed body is no mistake."""
     text = """eomc = 1
 name = "b"
 gravity = [0, -9.81]
@@ -77,15 +77,15 @@ coordinates = "x"
 mass = 1
 inertia = "I"
 """
-    assert warned(from_scene(read.parse(text))) == []
+    assert warnings_of(from_scene(read.parse(text))) == []
 
 
-def test_systems_made_in_python_tell_it_too() -> None:
-    x, v, m, shift, seen = sympy.symbols("x x_dot m shift seen")
+def test_systems_defined_in_python_warn_too() -> None:
+    x, v, m, shift, offset = sympy.symbols("x x_dot m shift seen")
     system = System.make(
-        "made", [x], m * v + v**2, shift + seen + x**2, parameters={m: 1, shift: 2, seen: 3},
-        picture={"points": {"tip": [x + seen, 0]}, "dots": ["tip"]},
+        "made", [x], m * v + v**2, shift + offset + x**2, parameters={m: 1, shift: 2, offset: 3},
+        picture={"points": {"tip": [x + offset, 0]}, "dots": ["tip"]},
     )  # fmt: skip
-    told = warned(system)
-    assert [p.key for p in told] == ["kinetic", "potential"]
-    assert "'m' reaches no" in str(told[0]) and "'shift' reaches no" in str(told[1])
+    problems = warnings_of(system)
+    assert [p.key for p in problems] == ["kinetic", "potential"]
+    assert "'m' reaches no" in str(problems[0]) and "'shift' reaches no" in str(problems[1])

@@ -1,7 +1,7 @@
-"""Every mistake in tests/scene/bad/*.toml gets the message beside it, word for word.
+"""Every mistake in tests/scene/bad/*.toml gives exactly the message in the file beside it.
 
-After a change that is meant: `python tests/scene/test_bad_scenes.py` writes the messages anew. Read
-each one as its user would before keeping it.
+After an intended change `python tests/scene/test_bad_scenes.py` writes the messages again. Read
+each one as its user would before accepting it.
 """
 
 from functools import cache
@@ -18,46 +18,46 @@ SCENES = sorted(BAD.glob("*.toml"))
 
 
 @cache
-def said(file: Path) -> tuple[tuple[Problem, ...], str]:
-    """The problems of a scene, and the message that its user sees."""
+def problems_and_message(file: Path) -> tuple[tuple[Problem, ...], str]:
+    """Return the problems of a scene and the message that its user reads."""
     try:
         warnings = from_scene(read(file)).warnings
-    except SceneError as fault:
-        return fault.problems, str(fault)
+    except SceneError as error:
+        return error.problems, str(error)
     return warnings, "\n".join(map(str, warnings))
 
 
 def problems(file: Path) -> tuple[Problem, ...]:
-    return said(file)[0]
+    return problems_and_message(file)[0]
 
 
 def message(file: Path) -> str:
-    return said(file)[1].replace(str(file), file.name) + "\n"
+    return problems_and_message(file)[1].replace(str(file), file.name) + "\n"
 
 
-def test_there_are_many_and_none_is_orphaned():
+def test_every_message_has_its_scene():
     assert len(SCENES) >= 35
     assert {f.stem for f in BAD.glob("*.txt")} == {f.stem for f in SCENES}
 
 
 @pytest.mark.parametrize("file", SCENES, ids=lambda f: f.stem)
-def test_the_message_is_the_golden_one(file):
-    golden = file.with_suffix(".txt")
-    assert golden.exists(), f"{golden.name} is missing: python {Path(__file__).name} writes it"
-    assert message(file) == golden.read_text(encoding="utf-8")
+def test_message_is_the_accepted_one(file):
+    accepted = file.with_suffix(".txt")
+    assert accepted.exists(), f"{accepted.name} is missing: python {Path(__file__).name} writes it"
+    assert message(file) == accepted.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("file", SCENES, ids=lambda f: f.stem)
 def test_every_problem_names_file_line_and_key(file):
-    found = problems(file)
-    assert found
+    problems_of_file = problems(file)
+    assert problems_of_file
     lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
-    for problem in found:
+    for problem in problems_of_file:
         assert problem.file == str(file)
         assert problem.message
         layout = problem.message.startswith(("not TOML", "the file is"))
         assert problem.key or layout
-        # what is missing altogether, or all there is, stands in no line
+        # a missing key, or a fault of the whole file, has no line
         nowhere = problem.message.startswith("missing: ") and "." not in problem.key
         assert problem.line or nowhere or "is empty" in problem.message
         if problem.line:
@@ -65,7 +65,7 @@ def test_every_problem_names_file_line_and_key(file):
             assert problem.column < max(len(problem.source), 1) + 1
 
 
-def test_messages_stay_within_the_screen(file=BAD / "bound_length.toml"):
+def test_messages_fit_the_screen(file=BAD / "bound_length.toml"):
     assert all(len(line) < 200 for line in message(file).splitlines())
 
 

@@ -1,4 +1,4 @@
-"""Formulas mean in floats what they mean in SymPy, and both what Python says."""
+"""Formulas have the same meaning in floats, in SymPy and in Python."""
 
 import ast
 import math
@@ -52,23 +52,23 @@ def parsed(text):
 
 
 def value(formula, seed=None):
-    """The float of a formula; with a seed every leaf is off by about a rounding error."""
+    """Return the float of a formula; with a seed every leaf has an error of about one rounding."""
     draw = random.Random(seed)
 
-    def off(x):
+    def with_rounding_error(x):
         return x if seed is None else x * (1 + draw.uniform(-JITTER, JITTER))
 
     algebra = {
         **NUMERIC,
-        "pi": off(math.pi),
-        "number": lambda text: off(NUMERIC["number"](text)),
+        "pi": with_rounding_error(math.pi),
+        "number": lambda text: with_rounding_error(NUMERIC["number"](text)),
     }
-    return evaluate(formula, algebra, lambda name: off(NAMES[name]))
+    return evaluate(formula, algebra, lambda name: with_rounding_error(NAMES[name]))
 
 
 @quick
 @given(formula_texts)
-def test_floats_and_sympy_agree(text):
+def test_formulas_in_floats_and_in_sympy_agree(text):
     formula = parsed(text)
     try:
         number = value(formula)
@@ -79,13 +79,13 @@ def test_floats_and_sympy_agree(text):
     expr = sympy.sympify(evaluate(formula, ALGEBRA, symbol))
     exact = expr.xreplace({symbol(n): sympy.Rational(v) for n, v in NAMES.items()}).evalf(40)
     assume(exact.is_real and exact.is_finite)
-    # what rounding of the leaves does to the value is not the algebra's fault
+    # the effect of rounding the leaves is no error of the algebra
     assert abs(number - exact) <= 1e-12 * abs(exact) + 20 * spread
 
 
 @quick
 @given(formula_texts)
-def test_python_reads_them_alike(text):
+def test_python_reads_formulas_alike(text):
     formula = parsed(text)
     builtins = {"abs": abs, "min": min, "max": max}
     names = {**NUMERIC, **NAMES, **builtins, "pi": math.pi}
@@ -110,9 +110,9 @@ def test_python_reads_them_alike(text):
         ("2**-2", Fraction(1, 4)),
     ],
 )
-def test_decimals_are_exact(text, expected):
-    found = evaluate(parse(text), ALGEBRA, symbol)
-    assert sympy.sympify(found) == sympy.Rational(expected.numerator, expected.denominator)
+def test_decimals_are_read_as_exact_rationals(text, expected):
+    result = evaluate(parse(text), ALGEBRA, symbol)
+    assert sympy.sympify(result) == sympy.Rational(expected.numerator, expected.denominator)
     assert evaluate(parse(text), NUMERIC, {}.get) == pytest.approx(float(expected), rel=1e-15)
 
 
@@ -138,12 +138,12 @@ def test_decimals_are_exact(text, expected):
         ("\n  2\n  + 3\t", 5),
     ],
 )
-def test_values(text, expected):
+def test_values_of_formulas(text, expected):
     assert evaluate(parse(text), NUMERIC, {}.get) == pytest.approx(expected, rel=1e-15)
     assert float(sympy.sympify(evaluate(parse(text), ALGEBRA, symbol))) == pytest.approx(expected)
 
 
-def test_names_come_in_reading_order_without_functions_and_pi():
+def test_names_are_in_reading_order_without_functions_and_pi():
     formula = parse("sin(b) + a*dot(c)**2 + pi*b")
     assert [n.id for n in formula.names()] == ["b", "a", "c", "b"]
     assert [c.func.id for c in formula.calls("dot")] == ["dot"]
@@ -153,18 +153,18 @@ def test_names_come_in_reading_order_without_functions_and_pi():
     ("text", "column", "width"),
     [
         ("a + b^2", 5, 1),
-        ("  a + b^2", 5, 1),  # columns count without the blanks around
+        ("  a + b^2", 5, 1),  # columns count without the surrounding blanks
         ("a + 2b", 4, 2),
         ("a*(b c)", 3, 3),
         ("a + sine(b)", 4, 4),
         ("1/(3 - 3)", 3, 5),
         ("a + 1e999", 4, 5),
         ("sqrt(2 - 3)", 0, 11),
-        ("1/dot(3)", 2, 6),  # a rate of numbers alone is zero
+        ("1/dot(3)", 2, 6),  # a derivative of numbers only is zero
         ("a\n + #b", 5, 1),
     ],
 )
-def test_faults_know_their_place(text, column, width):
+def test_errors_give_their_column(text, column, width):
     with pytest.raises(FormulaError) as fault:
         parse(text)
     assert (fault.value.column, fault.value.width) == (column, width)
@@ -190,7 +190,7 @@ def test_faults_know_their_place(text, column, width):
         "a**" * 3000 + "2",
     ],
 )
-def test_no_formula_is_too_dear_to_refuse(text):
+def test_expensive_formulas_are_refused_quickly(text):
     with pytest.raises(FormulaError):
         parse(text)
 
@@ -206,14 +206,14 @@ def test_no_formula_is_too_dear_to_refuse(text):
         "2(a)", "a!", "$a", "`a`", "a?", "\x00", "a\x0cb", "ａ", "", "  ",
     ],
 )  # fmt: skip
-def test_everything_else_is_refused(text):
+def test_other_syntax_is_refused(text):
     with pytest.raises(FormulaError):
         parse(text)
 
 
-def test_suggestions():
+def test_suggestions_for_misspelt_names():
     assert suggest("thata", ["theta", "g"]) == "; did you mean 'theta'?"
     assert suggest("M_C", ["m_c", "m_p"]) == "; did you mean 'm_c'?"
     assert suggest("zzz", ["theta", "g"]) == ""
     assert suggest("tol", ["tolerance", "h"]) == "; did you mean 'tolerance'?"
-    assert suggest("the", ["theta_shoulder_1", "theta_shoulder_2"]) == ""  # either
+    assert suggest("the", ["theta_shoulder_1", "theta_shoulder_2"]) == ""  # both are equally near

@@ -1,4 +1,4 @@
-"""Numbers with units, velocities by other names, lines that are no TOML."""
+"""Messages for numbers with units, other names of velocities, and lines that are not TOML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from eomc.scene.read import parse
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "expected"),
     [
         ("30 deg", '"30*pi/180"'),
         ("-7.5°", '"-7.5*pi/180"'),
@@ -28,15 +28,15 @@ from eomc.scene.read import parse
         ("5 ms", "s in SI: write 0.005"),
     ],
 )
-def test_numbers_with_units(text: str, wanted: str) -> None:
-    said = messages.quantity_remedy(text)
-    assert said is not None and said.endswith(wanted)
+def test_numbers_with_units_suggest_a_remedy(text: str, expected: str) -> None:
+    remedy = messages.quantity_remedy(text)
+    assert remedy is not None and remedy.endswith(expected)
 
 
 @pytest.mark.parametrize(
     "text", ["2*m", "2 x", "m g", "1/2", "pi/2", "2 m", "sin x", "1e", "°", ""]
 )
-def test_formulas_are_not_numbers_with_units(text: str) -> None:
+def test_formulas_are_not_taken_for_numbers_with_units(text: str) -> None:
     assert messages.quantity_remedy(text, declared={"m"}) is None
 
 
@@ -45,7 +45,7 @@ def test_formulas_are_not_numbers_with_units(text: str) -> None:
     """dot_theta dottheta dtheta d_theta dtheta_dt dthetadt v_theta vel_theta Dtheta qd_theta
     thetadot thetap theta_d theta_v theta_prime theta_velocity""".split(),
 )
-def test_velocities_of_others(name: str) -> None:
+def test_other_names_of_velocities_are_recognised(name: str) -> None:
     assert (
         messages.intended_velocity(name, {"x": "coordinates", "theta": "coordinates"})
         == "theta_dot"
@@ -53,20 +53,18 @@ def test_velocities_of_others(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["theta", "omega", "dot", "d", "theta_0", "phi_dot"])
-def test_other_names_are_no_velocities(name: str) -> None:
+def test_other_names_are_not_taken_for_velocities(name: str) -> None:
     assert messages.intended_velocity(name, {"x": "coordinates", "theta": "coordinates"}) == ""
 
 
-def test_long_texts_cost_nothing() -> None:
-    begun = time.perf_counter()
+def test_long_texts_are_examined_quickly() -> None:
+    start = time.perf_counter()
     for text in ("1 " + "m " * 500_000, "1" * 1_000_000, "=" + " " * 1_000_000, "m" * 1_000_000):
         messages.quantity_remedy(text), messages.toml_remedy(text), messages.number_remedy(text)
-    assert time.perf_counter() - begun < 1
+    assert time.perf_counter() - start < 1
 
 
-def test_a_file_may_be_so_long_and_no_longer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_size_of_a_file_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(toml_text, "MAX_BYTES", 40)
     file = tmp_path / "long.toml"
     file.write_text("eomc = 1".ljust(40), encoding="utf-8")
@@ -78,13 +76,13 @@ def test_a_file_may_be_so_long_and_no_longer(
         parse(file.read_bytes(), "long.toml")
 
 
-def test_a_mark_of_byte_order_is_read_over(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     file = tmp_path / "marked.toml"
     file.write_text("eomc = 1", encoding="utf-8-sig")
     assert toml_text.tree_and_digest(file)[0] == {"eomc": 1}
 
 
-def test_a_robot_file_is_told_from_a_scene() -> None:
+def test_robot_file_is_recognised() -> None:
     with pytest.raises(EomcError, match=r"'eomc import arm\.urdf' writes"):
         parse(b'\n<robot name="arm"/>', "arm.urdf")
 

@@ -1,4 +1,4 @@
-"""No text, however broken, makes the reader fail otherwise than in words, or run anything."""
+"""No text makes the reader fail other than with a message, or execute anything."""
 
 import codecs
 import re
@@ -121,32 +121,32 @@ axis= joint= "fixed" "free" "revolute" parent= name= [0,0] [0,0,0] ["z",1]
 dot(dot(x)) (x-x) 0/0 /0 **0.5 **-1 **x (-1)""".replace("\n", " ").split(" ")
 
 EVENTS = ("exec", "os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "open")
-watch: list[str] | None = None
+watched_events: list[str] | None = None
 
 
 def _audit(event, args):
-    if watch is not None and event in EVENTS:
-        watch.append(f"{event} {args}")
+    if watched_events is not None and event in EVENTS:
+        watched_events.append(f"{event} {args}")
 
 
 @cache
 def _hooked():
-    sys.addaudithook(_audit)  # for good: it would slow the tests of other files as well
+    sys.addaudithook(_audit)  # cannot be removed: it would slow the tests of other files as well
 
 
-def harmless(text):
-    """Read `text`: a scene or an error in words, and nothing is run or opened."""
-    global watch
+def read_without_side_effects(text):
+    """Read `text`: the result is a scene or an error message, and nothing is executed or opened."""
+    global watched_events
     _hooked()
-    watch = []
+    watched_events = []
     try:
         with warnings.catch_warnings(action="error"):
             from_scene(parse(text, "fuzz.toml"))
     except EomcError as fault:
         assert str(fault).startswith("fuzz.toml")
     finally:
-        seen, watch = watch, None
-    assert not seen
+        events, watched_events = watched_events, None
+    assert not events
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -157,11 +157,11 @@ def warm():
 
 
 def in_two_tiers(examples, test):
-    """A test with few examples, and one of the slow tier with many."""
+    """Define a test with few examples and one of the slow tier with many."""
     return few(examples(test)), pytest.mark.slow(many(examples(test)))
 
 
-def slowly(text):
+def slow_version(text):
     return pytest.param(text, marks=pytest.mark.slow)
 
 
@@ -192,7 +192,7 @@ def edited(text, edit):
 def broken_scenes(text, changes):
     for change in changes:
         text = edited(text, change)
-    harmless(text)
+    read_without_side_effects(text)
 
 
 broken = given(st.sampled_from(TEXTS), st.lists(edits, min_size=1, max_size=4))
@@ -206,7 +206,7 @@ def formulas_in_scenes(tokens, blank, data):
     key = data.draw(
         st.sampled_from(['"2*a"', '"a/2"', '"sin(t)"', '"dot(x)"', '"m*v**2/2"', '"f - w"'])
     )
-    harmless(SMALL.replace(key, quoted))
+    read_without_side_effects(SMALL.replace(key, quoted))
 
 
 test_random_formulas_in_scenes, test_many_random_formulas_in_scenes = in_two_tiers(
@@ -232,11 +232,11 @@ repeat""".split()
 
 
 def values_anywhere(entries):
-    harmless("\n".join(f"{key} = {value}" for key, value in dict(entries).items()))
+    read_without_side_effects("\n".join(f"{key} = {value}" for key, value in dict(entries).items()))
     inside = "\n".join(f"{key} = {value}" for key, value in dict(entries).items())
     for table in ("coordinates", "parameters", "energy", "definitions", "run"):
-        harmless(SMALL + f"[{table}]\n{inside}\n")
-        harmless(f"eomc = 1\nname = 'n'\n[{table}]\n{inside}\n")
+        read_without_side_effects(SMALL + f"[{table}]\n{inside}\n")
+        read_without_side_effects(f"eomc = 1\nname = 'n'\n[{table}]\n{inside}\n")
 
 
 keyed = st.tuples(st.sampled_from([*tables, "x", "float", "m"]), values)
@@ -256,12 +256,16 @@ sized = st.recursive(
 
 def values_in_bodies(text, array, entries, value):
     entry = "\n".join(f"{key} = {value}" for key, value in entries.items())
-    harmless(f"{text}[[{array}]]\n{entry}\n")
-    harmless("\n".join(line for line in text.split("\n") if line.split(" =")[0] not in entries))
+    read_without_side_effects(f"{text}[[{array}]]\n{entry}\n")
+    read_without_side_effects(
+        "\n".join(line for line in text.split("\n") if line.split(" =")[0] not in entries)
+    )
     key = next(iter(entries), "mass")
-    harmless(re.sub(rf"(?m)^({key}) = .*$", lambda found: f"{key} = {value}", text))
+    read_without_side_effects(
+        re.sub(rf"(?m)^({key}) = .*$", lambda match: f"{key} = {value}", text)
+    )
     for at_top in arrays:
-        harmless(f"{at_top} = {value}\n" + text.replace("gravity", "#", 1))
+        read_without_side_effects(f"{at_top} = {value}\n" + text.replace("gravity", "#", 1))
 
 
 test_bodies_with_values_of_any_type, test_many_bodies_with_values_of_any_type = in_two_tiers(
@@ -298,7 +302,7 @@ test_random_formula_texts, test_many_random_formula_texts = in_two_tiers(
         "x = " + "{a=" * 5000,
         "a." * 5000 + "b = 1",
         "x = [\n" + "[],\n" * 20000,
-        slowly("x = [\n" + "[],\n" * 20000 + "]"),
+        slow_version("x = [\n" + "[],\n" * 20000 + "]"),
         "g = " + "9" * 5000,
         "eomc = " + "9" * 400,
         SMALL.replace("potential = 3", "potential = " + "9" * 400),
@@ -307,7 +311,7 @@ test_random_formula_texts, test_many_random_formula_texts = in_two_tiers(
         SMALL.replace("dot(x)", "dot(" * 100 + "x" + ")" * 100),
         SMALL.replace("v = ", "".join(f'y{i} = "y{(i + 1) % 300}"\n' for i in range(300)) + "v = "),
         "".join(f"k{i} = 1\n" for i in range(300)),
-        slowly("".join(f"k{i} = 1\n" for i in range(3000))),
+        slow_version("".join(f"k{i} = 1\n" for i in range(3000))),
         SMALL.replace("\n", "\r\n"),
         SMALL.replace("\n", "\r"),
         BODIES.replace("n = 3", "n = 20000"),
@@ -315,7 +319,7 @@ test_random_formula_texts, test_many_random_formula_texts = in_two_tiers(
         BODIES.replace("q[n]", "q[" + "n+" * 4000 + "1]"),
         BODIES.replace("n = 3", "n = 9999").replace('"0.1*i"', f'"{"i+" * 4900}1"'),
         BODIES + "[[body]]\n" * 300,
-        slowly(BODIES + "[[body]]\n" * 3000),
+        slow_version(BODIES + "[[body]]\n" * 3000),
         BODIES + '[[body]]\nname = "a"\nparent = "a"\n' * 1000,
         "\ufeff" + SMALL,
         "\ud800",
@@ -325,4 +329,4 @@ test_random_formula_texts, test_many_random_formula_texts = in_two_tiers(
     ids=range(27),
 )  # fmt: skip
 def test_hostile_files(text):
-    harmless(text)
+    read_without_side_effects(text)

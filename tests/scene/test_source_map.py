@@ -1,4 +1,4 @@
-"""Where a key stands, however deep it is written in its statement."""
+"""A key has a line and a column, however deep it is in its statement."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from eomc.scene.source_map import SourceMap
         "[coordinates.x]\nstart = 1\nstrat = 2",
     ],
 )
-def test_a_key_of_a_coordinate_has_its_place(text: str) -> None:
-    found = SourceMap(text, "s.toml").problem(("coordinates", "x", "strat"), "unknown")
+def test_key_of_a_coordinate_has_its_position(text: str) -> None:
+    result = SourceMap(text, "s.toml").problem(("coordinates", "x", "strat"), "unknown")
     lines = text.split("\n")
-    assert found.line == len(lines) and found.source == lines[-1]
-    assert (found.column, found.width) == (lines[-1].index("strat"), len("strat"))
+    assert result.line == len(lines) and result.source == lines[-1]
+    assert (result.column, result.width) == (lines[-1].index("strat"), len("strat"))

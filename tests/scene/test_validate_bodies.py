@@ -1,4 +1,4 @@
-"""Bodies, joints, springs, dampers and repetition: what a scene says becomes an Assembly."""
+"""Bodies, joints, springs, dampers and repetitions of a scene become an Assembly."""
 
 import math
 from pathlib import Path
@@ -26,13 +26,15 @@ def coordinates(count):
     return "[coordinates]\n" + "".join(f"{name} = {{}}\n" for name in NAMES[:count])
 
 
-def jointed(kind, gravity, more="", count=None):
-    """A scene of one body on a joint of the kind."""
-    wanted = len(JOINTS[kind].motions) if count is None else count
-    names = ", ".join(f'"{name}"' for name in NAMES[:wanted])
-    text = f"gravity = {gravity}\n" + coordinates(max(wanted, 1)) + "[parameters]\nk = 2.0\n"
-    held = f"coordinates = [{names}]\n" if wanted else ""
-    return text + f'[[body]]\nname = "link"\njoint = "{kind}"\nmass = "k"\n' + held + more
+def scene_with_joint(kind, gravity, more="", count=None):
+    """Write a scene of one body on a joint of the kind."""
+    coordinate_count = len(JOINTS[kind].motions) if count is None else count
+    names = ", ".join(f'"{name}"' for name in NAMES[:coordinate_count])
+    text = (
+        f"gravity = {gravity}\n" + coordinates(max(coordinate_count, 1)) + "[parameters]\nk = 2.0\n"
+    )
+    coordinate_key = f"coordinates = [{names}]\n" if coordinate_count else ""
+    return text + f'[[body]]\nname = "link"\njoint = "{kind}"\nmass = "k"\n' + coordinate_key + more
 
 
 def texts(entries):
@@ -40,10 +42,12 @@ def texts(entries):
 
 
 @pytest.mark.parametrize("kind", JOINTS)
-def test_each_joint_in_space(kind):
-    made = read(jointed(kind, "[0, 0, -9.81]", "axis = [0, 3, 4]\n" * (kind == "prismatic")))
-    (body,) = made.assembly.bodies
-    assert not made.assembly.plane
+def test_each_joint_is_read_in_space(kind):
+    assembly = read(
+        scene_with_joint(kind, "[0, 0, -9.81]", "axis = [0, 3, 4]\n" * (kind == "prismatic"))
+    )
+    (body,) = assembly.assembly.bodies
+    assert not assembly.assembly.plane
     assert body.joint == kind
     assert body.parent == "world"
     names = NAMES[: len(JOINTS[kind].motions)]
@@ -55,32 +59,41 @@ def test_each_joint_in_space(kind):
 
 
 @pytest.mark.parametrize("kind", [kind for kind, joint in JOINTS.items() if joint.plane])
-def test_each_joint_in_the_plane(kind):
-    made = read(jointed(kind, "[0, -9.81]", "axis = [3, -4]\n" * (kind == "prismatic")))
-    (body,) = made.assembly.bodies
-    assert made.assembly.plane
-    assert texts(made.assembly.gravity) == ["0.0", "-9.81", "0"]
+def test_each_joint_is_read_in_the_plane(kind):
+    assembly = read(
+        scene_with_joint(kind, "[0, -9.81]", "axis = [3, -4]\n" * (kind == "prismatic"))
+    )
+    (body,) = assembly.assembly.bodies
+    assert assembly.assembly.plane
+    assert texts(assembly.assembly.gravity) == ["0.0", "-9.81", "0"]
     expected = {"prismatic": ((0.6, -0.8, 0.0),), "revolute": ((0.0, 0.0, 1.0),)}
     assert body.axes == expected.get(kind, ())
 
 
 @pytest.mark.parametrize("kind", [kind for kind, joint in JOINTS.items() if not joint.plane])
-def test_joints_of_space_are_refused_in_the_plane(kind):
+def test_spatial_joints_are_refused_in_the_plane(kind):
     with pytest.raises(SceneError, match=f"a {kind} joint moves in space"):
-        read(jointed(kind, "[0, -9.81]"))
+        read(scene_with_joint(kind, "[0, -9.81]"))
 
 
 @pytest.mark.parametrize("kind", JOINTS)
-def test_every_joint_counts_its_coordinates(kind):
-    wanted = len(JOINTS[kind].motions)
+def test_wrong_number_of_coordinates_is_refused(kind):
+    expected_count = len(JOINTS[kind].motions)
     axis = "axis = [1, 0, 0]\n" * (kind == "prismatic")
     with pytest.raises(SceneError, match=rf"body\.link\.coordinates: a {kind} joint has"):
-        read(jointed(kind, "[0, 0, 0]", axis, wanted - 1 if wanted == 6 else wanted + 1))
+        read(
+            scene_with_joint(
+                kind,
+                "[0, 0, 0]",
+                axis,
+                expected_count - 1 if expected_count == 6 else expected_count + 1,
+            )
+        )
 
 
-def test_what_a_joint_has_is_one_for_each_coordinate():
+def test_values_of_a_joint_are_one_per_coordinate():
     one = 'damping = "k"\nfriction = 0.1\narmature = [1, 2, 3]\nactuator = [0, "-p_dot", "q*k"]\n'
-    (body,) = read(jointed("planar", "[0, 0]", one)).assembly.bodies
+    (body,) = read(scene_with_joint("planar", "[0, 0]", one)).assembly.bodies
     assert texts(body.damping) == ["k", "k", "k"]
     assert texts(body.friction) == ["0.1"] * 3
     assert body.friction_width.text == "0.01"
@@ -88,19 +101,19 @@ def test_what_a_joint_has_is_one_for_each_coordinate():
     assert texts(body.actuator) == ["0.0", "-p_dot", "q*k"]
 
 
-def test_what_is_not_written_is_empty():
-    (body,) = read(jointed("planar", "[0, 0]")).assembly.bodies
+def test_omitted_keys_are_empty():
+    (body,) = read(scene_with_joint("planar", "[0, 0]")).assembly.bodies
     assert body.friction_width is None
     assert (body.damping, body.friction, body.armature, body.actuator) == ((), (), (), ())
     assert body.rotation == ()
     assert texts(body.offset) == texts(body.center) == ["0"] * 3
 
 
-def test_rotations():
-    plane = read(jointed("revolute", "[0, 0]", 'rotation = "pi/2"\n')).assembly.bodies[0]
+def test_rotations_are_read():
+    plane = read(scene_with_joint("revolute", "[0, 0]", 'rotation = "pi/2"\n')).assembly.bodies[0]
     assert [(turn.axis, turn.angle.text) for turn in plane.rotation] == [("z", "pi/2")]
     turns = 'rotation = [["z", "pi/2"], ["x", "k"]]\n'
-    space = read(jointed("revolute", "[0, 0, 0]", turns)).assembly.bodies[0]
+    space = read(scene_with_joint("revolute", "[0, 0, 0]", turns)).assembly.bodies[0]
     assert [(turn.axis, turn.angle.text) for turn in space.rotation] == [("z", "pi/2"), ("x", "k")]
     assert isinstance(space.rotation[0], Turn)
 
@@ -118,8 +131,8 @@ def test_rotations():
         ((2, 2, 2, 3, 0, 0), "none can be negative"),
     ],
 )
-def test_inertias_that_no_body_has(moments, fault):
-    text = jointed("revolute", "[0, 0, 0]", f"inertia = {list(map(float, moments))}\n")
+def test_inertias_of_no_body_are_refused(moments, fault):
+    text = scene_with_joint("revolute", "[0, 0, 0]", f"inertia = {list(map(float, moments))}\n")
     if fault:
         with pytest.raises(SceneError, match=fault):
             read(text)
@@ -127,54 +140,54 @@ def test_inertias_that_no_body_has(moments, fault):
         read(text)
 
 
-def test_parents_come_before_children():
+def test_parents_must_precede_children():
     def body(name, parent, coordinate):
         return (
             f'[[body]]\nname = "{name}"\nparent = "{parent}"\njoint = "revolute"\n'
             f'coordinates = "{coordinate}"\nmass = 1\ninertia = 1\n'
         )
 
-    made = read(
+    assembly = read(
         "gravity = [0, 0]\n" + coordinates(4)
         + body("hand", "arm", "p") + body("arm", "trunk", "q")
         + body("trunk", "world", "r") + body("leg", "trunk", "s")
     )  # fmt: skip
-    assert [body.name for body in made.assembly.bodies] == ["trunk", "arm", "hand", "leg"]
+    assert [body.name for body in assembly.assembly.bodies] == ["trunk", "arm", "hand", "leg"]
 
 
-def test_bodies_placed_by_formulas():
-    made = read(
+def test_bodies_placed_by_formulas_are_read():
+    assembly = read(
         'gravity = [0, "-g"]\n' + coordinates(1) + "[parameters]\nl = 1.0\ng = 9.81\n"
         '[definitions]\nh = "l*p"\n'
         '[[body]]\nname = "bob"\nposition = ["h + sin(t)", 0]\nrotation = "p"\nmass = 1\n'
         "inertia = 2\n"
     )
-    (body,) = made.assembly.bodies
+    (body,) = assembly.assembly.bodies
     assert body.joint == ""
     assert texts(body.position) == ["h + sin(t)", "0.0", "0"]
     assert [(turn.axis, turn.angle.text) for turn in body.rotation] == [("z", "p")]
     assert texts(body.inertia) == ["0", "0", "2.0", "0", "0", "0"]
 
 
-def test_energies_are_added_and_centres_have_names():
+def test_energies_are_summed_and_centres_have_names():
     more = '[energy]\npotential = "k*link_y**2/2"\n[forces]\np = "-dot(link_x)"\n'
-    made = read(jointed("revolute", "[0, 0]", 'center = ["k", 0]\n' + more))
-    assert made.potential.text == "k*link_y**2/2"
-    assert formulas.evaluate(made.kinetic, formulas.NUMERIC, {}.__getitem__) == 0
+    assembly = read(scene_with_joint("revolute", "[0, 0]", 'center = ["k", 0]\n' + more))
+    assert assembly.potential.text == "k*link_y**2/2"
+    assert formulas.evaluate(assembly.kinetic, formulas.NUMERIC, {}.__getitem__) == 0
     with pytest.raises(SceneError, match="'link_z' is not declared"):
-        read(jointed("revolute", "[0, 0]", more.replace("link_y", "link_z")))
+        read(scene_with_joint("revolute", "[0, 0]", more.replace("link_y", "link_z")))
 
 
-def test_springs_and_dampers():
-    made = read(
-        jointed("planar", "[0, 0]", "")
+def test_springs_and_dampers_are_read():
+    assembly = read(
+        scene_with_joint("planar", "[0, 0]", "")
         + '[[spring]]\ncoordinate = "r"\nstiffness = "k"\nlength = 1\n'
         '[[spring]]\nbodies = ["world", "link"]\npoints = [[0, 1], ["k", 0]]\nstiffness = 3\n'
         '[[spring]]\nbodies = ["link", "world"]\nturning = true\nstiffness = 4\n'
         '[[damper]]\nbodies = ["world", "link"]\ndamping = 5\n'
     )
-    along, between, turning = made.assembly.springs
-    (damper,) = made.assembly.dampers
+    along, between, turning = assembly.assembly.springs
+    (damper,) = assembly.assembly.dampers
     assert (along.coordinate, along.bodies, along.length.text) == ("r", None, "1.0")
     assert between.bodies == ("world", "link")
     assert [texts(point) for point in between.points] == [["0.0", "1.0", "0"], ["k", "0.0", "0"]]
@@ -184,17 +197,17 @@ def test_springs_and_dampers():
 
 
 def test_springs_along_coordinates_need_no_bodies():
-    made = read(
+    assembly = read(
         coordinates(1) + '[energy]\nkinetic = "p_dot**2"\n'
         '[[spring]]\ncoordinate = "p"\nstiffness = 1\n'
     )
-    assert made.assembly.bodies == ()
-    assert len(made.assembly.springs) == 1
+    assert assembly.assembly.bodies == ()
+    assert len(assembly.assembly.springs) == 1
     assert read(coordinates(1) + '[energy]\nkinetic = "p_dot**2"\n').assembly is None
 
 
-def test_repetition_of_everything():
-    made = read(
+def test_every_kind_of_entry_can_be_repeated():
+    assembly = read(
         """gravity = [0, 0]
 [constants]
 n = 3
@@ -228,31 +241,31 @@ coordinate = "q[n]"
 damping = 1
 """
     )
-    assert made.warnings == ()
-    assert [c.name for c in made.constants] == ["n", "c1", "c2", "c3"]
-    assert [p.value for p in made.parameters] == [1.5, 5.0, 10.5]
-    assert made.start()[0] == pytest.approx([0.15, 1.0, 3.15], rel=1e-15)
-    assert [i.name for i in made.inputs] == ["f0", "f1", "f2"]
-    assert [(name, f.text) for name, f in made.definitions][-1] == ("s3", "s2 + q3")
-    assert {name: f.text for name, f in made.forces.items()}["q2"] == "-s2 + f1"
-    assert [body.name for body in made.assembly.bodies] == ["b1", "b2", "b3"]
-    assert texts(made.assembly.bodies[2].offset) == ["3", "(2 - 3)*c3", "0"]
-    assert [s.bodies for s in made.assembly.springs] == [("b1", "b2"), ("b2", "b3")]
-    assert [s.stiffness.text for s in made.assembly.springs] == ["1", "2"]
-    assert made.assembly.dampers[0].coordinate == "q3"
+    assert assembly.warnings == ()
+    assert [c.name for c in assembly.constants] == ["n", "c1", "c2", "c3"]
+    assert [p.value for p in assembly.parameters] == [1.5, 5.0, 10.5]
+    assert assembly.start()[0] == pytest.approx([0.15, 1.0, 3.15], rel=1e-15)
+    assert [i.name for i in assembly.inputs] == ["f0", "f1", "f2"]
+    assert [(name, f.text) for name, f in assembly.definitions][-1] == ("s3", "s2 + q3")
+    assert {name: f.text for name, f in assembly.forces.items()}["q2"] == "-s2 + f1"
+    assert [body.name for body in assembly.assembly.bodies] == ["b1", "b2", "b3"]
+    assert texts(assembly.assembly.bodies[2].offset) == ["3", "(2 - 3)*c3", "0"]
+    assert [s.bodies for s in assembly.assembly.springs] == [("b1", "b2"), ("b2", "b3")]
+    assert [s.stiffness.text for s in assembly.assembly.springs] == ["1", "2"]
+    assert assembly.assembly.dampers[0].coordinate == "q3"
 
 
-def test_a_repetition_may_be_empty():
+def test_empty_repetition_is_accepted():
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
     assert "value = 5" in text
     assert len(scene.parse(text.replace("value = 5", "value = 1")).assembly.bodies) == 1
     assert len(scene.parse(text.replace("value = 5", "value = 50")).assembly.bodies) == 50
 
 
-def test_problems_are_reported_where_the_repeated_entry_stands():
-    made = scene.read(SCENES / "chain.toml")
+def test_problems_are_reported_at_the_repeated_entry():
+    assembly = scene.read(SCENES / "chain.toml")
     lines = (SCENES / "chain.toml").read_text(encoding="utf-8").split("\n")
-    third = made.assembly.bodies[2]
+    third = assembly.assembly.bodies[2]
     for key, formula, line in (
         ("body.link3.inertia", third.inertia[2], "inertia "),
         ("body.link3.offset", third.offset[0], "offset "),
@@ -260,23 +273,23 @@ def test_problems_are_reported_where_the_repeated_entry_stands():
         ("coordinates.theta4", None, '"theta[i]"'),
         ("gravity", None, "gravity "),
     ):
-        problem = made.problem(key, "is odd", formula)
+        problem = assembly.problem(key, "is odd", formula)
         assert problem.key == key
         assert lines[problem.line - 1].startswith(line)
         assert problem.column >= 0
-    second = made.problem("body.link2.mass", "is odd").line
-    assert second == made.problem("body.link5.mass", "is odd").line
-    assert second > made.problem("body.link1.mass", "is odd").line
+    second = assembly.problem("body.link2.mass", "is odd").line
+    assert second == assembly.problem("body.link5.mass", "is odd").line
+    assert second > assembly.problem("body.link1.mass", "is odd").line
 
 
 @pytest.mark.parametrize("name", ["chain", "cartpole_bodies", "tumbling_box", "suspension"])
-def test_scenes_of_bodies_read_without_warnings(name):
-    made = scene.read(SCENES / f"{name}.toml")
-    assert made.warnings == ()
-    assert made.assembly.bodies
+def test_scenes_of_bodies_give_no_warnings(name):
+    assembly = scene.read(SCENES / f"{name}.toml")
+    assert assembly.warnings == ()
+    assert assembly.assembly.bodies
 
 
-def test_values_are_checked_where_a_parameter_is_set():
+def test_values_are_checked_when_a_parameter_is_set():
     text = """
 eomc = 1
 name = "swing"
@@ -309,6 +322,8 @@ friction_width = "w"
 @pytest.mark.parametrize("number", tiers([1000, 4000], 1000))
 def test_thousands_of_bodies_are_read(number):
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
-    made = scene.parse(text.replace("value = 5", f"value = {number}"))  # and as many coordinates
-    assert len(made.assembly.bodies) == number
-    assert math.isclose(made.start()[0][-1], number / 10)
+    assembly = scene.parse(
+        text.replace("value = 5", f"value = {number}")
+    )  # and the same number of coordinates
+    assert len(assembly.assembly.bodies) == number
+    assert math.isclose(assembly.start()[0][-1], number / 10)

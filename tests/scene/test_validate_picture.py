@@ -1,4 +1,4 @@
-"""[picture]: what is wrong with it is told at its place; nothing of it reaches the equations."""
+"""Errors of [picture] are located, and a picture does not affect the equations."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ BARE = CART[: CART.index("[picture]")]
 POINTS = 'points = { tip = ["x - l*sin(theta)", "l*cos(theta)"] }'
 
 
-def test_points_are_named_or_written_out():
+def test_points_are_named_or_explicit():
     text = f'{BARE}[picture]\n{POINTS}\nlines = [[["x", 0], "tip"]]\npaths = ["tip"]\naxes = "xz"\n'
     picture = parse(text).picture
     line, path = picture.shapes
@@ -30,20 +30,20 @@ def test_boxes_and_circles_have_sizes_and_may_be_rotated():
     assert [(t.axis, t.angle.text) for t in circle.rotation] == [("z", "x")]
 
 
-def test_bodies_and_points_are_places():
+def test_bodies_and_points_are_positions():
     shapes = parse(BODIES).picture.shapes
     assert [(p.name, p.at) for p in shapes[0].places] == [("pole", None), ("tip", None)]
 
 
-def test_a_scene_without_one_has_none():
+def test_scene_without_a_picture_has_none():
     assert parse(BARE).picture is None
 
 
-def test_a_definition_that_only_the_picture_uses_is_used():
-    made = parse(
+def test_definition_used_only_by_the_picture_is_not_warned_of():
+    scene_with_picture = parse(
         BARE.replace("[energy]", 'far = "x + 1"\n[energy]') + '[picture]\ndots = [["far", 0]]'
     )
-    assert not made.warnings
+    assert not scene_with_picture.warnings
 
 
 @pytest.mark.parametrize(
@@ -75,19 +75,19 @@ def test_a_definition_that_only_the_picture_uses_is_used():
         ('points = { "a b" = [0, 0] }\ndots = ["a b"]', "a b"),
     ],
 )
-def test_faults_are_told_once_and_at_their_place(lines, words):
-    with pytest.raises(SceneError, match=words) as told:
+def test_errors_are_reported_once_at_their_line(lines, words):
+    with pytest.raises(SceneError, match=words) as error:
         parse(f"{BARE}[picture]\n{lines}\n")
-    assert len(told.value.problems) == 1
-    assert told.value.problems[0].line > BARE.count("\n")
+    assert len(error.value.problems) == 1
+    assert error.value.problems[0].line > BARE.count("\n")
 
 
-def test_a_point_is_no_body():
+def test_point_is_not_accepted_as_a_body():
     with pytest.raises(SceneError, match="'cart' is a body or point already"):
         parse(BODIES.replace("[picture]", "[picture]\npoints = { cart = [0, 0] }"))
 
 
-def test_a_picture_can_not_depend_on_inputs():
+def test_picture_cannot_depend_on_inputs():
     text = BARE.replace("[definitions]", '[inputs]\nF = 1\n[definitions]\ny_f = "F"\n', 1)
     with pytest.raises(SceneError, match="can't depend on inputs"):
         parse(text.replace("F = 1", "F = { signal = 1 }") + '[picture]\ndots = [["y_f", 0]]\n')
