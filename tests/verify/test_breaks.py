@@ -1,7 +1,7 @@
 """A wrong sign anywhere between the scene and the machine code makes the check fail.
 
-Each breakage changes one thing in the generator, builds the cart-pole with it and lets `check`
-look: it has to fail, and in the rows that are about what was broken.
+Each breakage changes one thing in the generator, builds the cart-pole and runs `check`: it must
+fail, in the checks that concern the broken part.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ Breakage = Callable[[pytest.MonkeyPatch], None]
 SCENE = "cartpole_driven"
 
 
-def checked(folder: Path, scene: str = SCENE, states: int = 8) -> CheckReport:
-    """The check of a scene built anew, under a digest of its own."""
+def build_and_check(folder: Path, scene: str = SCENE, states: int = 8) -> CheckReport:
+    """Build a scene with a digest of its own and check it."""
     digest = hashlib.sha256(str(folder).encode()).hexdigest()
-    made = replace(scene_system(scene), digest=digest)
-    return check(made, eomc.load(made, folder), states=states)
+    system = replace(scene_system(scene), digest=digest)
+    return check(system, eomc.load(system, folder), states=states)
 
 
-def failed(report: CheckReport) -> set[str]:
+def failed_checks(report: CheckReport) -> set[str]:
     return {row.name for row in report.results if not row.passed}
 
 
@@ -50,15 +50,15 @@ def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def derived(change: Callable[[EquationsOfMotion], EquationsOfMotion]) -> Breakage:
-    """The equations of motion are changed before they become a program."""
+    """Change the equations of motion before they are lowered to a program."""
 
     def breakage(patch: pytest.MonkeyPatch) -> None:
         right = lagrange.derive
 
         def wrong(system: System) -> lagrange.Derivation:
-            made = right(system)
-            ways = {"lagrange": made.lagrange, "newton_euler": made.newton_euler}
-            return replace(made, **{way: change(e) for way, e in ways.items() if e})
+            derivation = right(system)
+            methods = {"lagrange": derivation.lagrange, "newton_euler": derivation.newton_euler}
+            return replace(derivation, **{way: change(e) for way, e in methods.items() if e})
 
         patch.setattr(lagrange, "derive", wrong)
 
@@ -66,7 +66,7 @@ def derived(change: Callable[[EquationsOfMotion], EquationsOfMotion]) -> Breakag
 
 
 def negated(e: EquationsOfMotion, field: str, *at: int) -> EquationsOfMotion:
-    """One entry of a vector or matrix with the other sign."""
+    """Return the equations with the opposite sign of one entry of a vector or matrix."""
     value = getattr(e, field)
     if len(at) == 1:
         return replace(e, **{field: tuple(-x if (i,) == at else x for i, x in enumerate(value))})
@@ -77,51 +77,51 @@ def negated(e: EquationsOfMotion, field: str, *at: int) -> EquationsOfMotion:
 
 
 def text(right: str, wrong: str) -> Breakage:
-    """Templates and hand-written C say something else."""
+    """Replace text in templates and handwritten C."""
 
     def breakage(patch: pytest.MonkeyPatch) -> None:
         read = resources.text
         places = [part for part in TEMPLATES if right in part.read_text(encoding="utf-8")]
         assert places, f"{right!r} stands in no template any more"
         patch.setattr(resources, "text", lambda *where: read(*where).replace(right, wrong))
-        patch.setattr(render, "environment", render.environment.__wrapped__)  # read anew
+        patch.setattr(render, "environment", render.environment.__wrapped__)  # clears the cache
 
     return breakage
 
 
 def lowered(patch: pytest.MonkeyPatch) -> None:
-    """On its way to assignments the last sum of the acceleration loses a sign."""
+    """Negate one term in the last sum of the acceleration while it is lowered to assignments."""
     right = routes.lower
 
     def wrong(name: str, *how: Any, **more: Any) -> Any:
-        made = right(name, *how, **more)
+        function = right(name, *how, **more)
         if name != "acceleration":
-            return made
-        body = list(made.body)
+            return function
+        body = list(function.body)
         k = max(k for k, a in enumerate(body) if isinstance(a.value, Sum))
         (weight, first), *rest = body[k].value.terms
         body[k] = replace(body[k], value=Sum(((-weight, first), *rest), body[k].value.constant))
-        return replace(made, body=tuple(body))
+        return replace(function, body=tuple(body))
 
     patch.setattr(routes, "lower", wrong)
 
 
 def printed(patch: pytest.MonkeyPatch) -> None:
-    """Differences are written as sums."""
+    """Print differences as sums."""
     right = c_expression.Printer._sum
     patch.setattr(c_expression.Printer, "_sum", lambda *a: right(*a).replace(" - ", " + "))
 
 
 def eliminated(patch: pytest.MonkeyPatch) -> None:
-    """The solver's last pivot is taken with the wrong sign, after D itself was right."""
+    """Use the wrong sign of the solver's last pivot, after D itself."""
     right = program.cheapest
 
     def wrong(name: str, *how: Any) -> Any:
-        made = right(name, *how)
+        function = right(name, *how)
         if name != "acceleration":
-            return made
-        outputs = tuple(replace(o, coefficient=-o.coefficient) for o in made.outputs[:1])
-        return replace(made, outputs=(*outputs, *made.outputs[1:]))
+            return function
+        outputs = tuple(replace(o, coefficient=-o.coefficient) for o in function.outputs[:1])
+        return replace(function, outputs=(*outputs, *function.outputs[1:]))
 
     patch.setattr(program, "cheapest", wrong)
 
@@ -129,7 +129,7 @@ def eliminated(patch: pytest.MonkeyPatch) -> None:
 MOTION = "D qdd + bias = tau"
 TEMPLATES = [*(ROOT / "templates").rglob("*.jinja"), *(ROOT / "csrc").rglob("*.h")]
 
-# what is broken, how, and rows that have to say so
+# What is broken, how, and the checks that must fail.
 BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
     "an entry of D": (derived(lambda e: negated(e, "D", 0, 1)), {"D", "D = D^T", MOTION}),
     "both of D": (
@@ -172,34 +172,39 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
 }
 
 
-OF_RUNS = {"order of rk4", "power balance"}  # of several step sizes, which take most of the time
+OF_RUNS = {
+    "order of rk4",
+    "power balance",
+}  # these run several step sizes, which take most of the time
 
-# the binding, a template; what tests/verify/test_check.py breaks in a stand-in, what
-# tests/physics/test_steppers.py breaks in a tableau, and what golden files show, is slow
+# The binding, a template. Other breakages are slow: test_check.py covers them with a stand-in,
+# tests/physics/test_steppers.py with a tableau, and the golden files show them.
 QUICK = ("what Python asks for",)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", (SCENE, "kapitza_pendulum"))
-def test_unbroken_it_passes(scene: str) -> None:
-    report = checked(KEPT / "unbroken", scene)
+def test_check_passes_without_breakage(scene: str) -> None:
+    report = build_and_check(KEPT / "unbroken", scene)
     assert report.passed, report.table()
 
 
 @pytest.mark.parametrize("what", tiers(BREAKAGES, *QUICK))
-def test_broken_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def test_check_fails_with_breakage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
     breakage, rows = BREAKAGES[what]
     breakage(monkeypatch)
     without = "add_advice_check" if rows & OF_RUNS else "add_convergence_checks"
     monkeypatch.setattr(Comparison, without, lambda *_: None)
-    report = checked(tmp_path, states=8 if rows & OF_RUNS else 4)
+    report = build_and_check(tmp_path, states=8 if rows & OF_RUNS else 4)
     assert not report.passed
-    assert rows <= failed(report), report.table()
+    assert rows <= failed_checks(report), report.table()
 
 
-def test_an_inertia_with_the_wrong_sign_is_not_even_built(
+def test_build_refuses_an_inertia_with_the_wrong_sign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     derived(lambda e: negated(e, "D", 0, 0))(monkeypatch)
     with pytest.raises(eomc.EomcError, match=r"D is not positive definite|has no inertia"):
-        checked(tmp_path)
+        build_and_check(tmp_path)

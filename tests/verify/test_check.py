@@ -1,4 +1,4 @@
-"""The check passes what is right and fails what is wrong, in the row that says so."""
+"""The check passes correct modules and fails wrong ones, in the corresponding check."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from eomc.verify.report import CheckReport, Measurement
 from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import SymbolicReference, derive
 
-# what is broken, how, and the rows that must say so
+# What is broken, how, and the checks that must fail.
 BROKEN = {
     "a sign in D": (
         "cartpole_driven", bent("D", flipped(0, 1)), {"D", "D = D^T", "D qdd + bias = tau"},
@@ -96,13 +96,13 @@ def reference(name: str) -> SymbolicReference:
     return derive(scene_system(name))
 
 
-def failed(report: CheckReport) -> set[str]:
+def failed_checks(report: CheckReport) -> set[str]:
     return {row.name for row in report.results if not row.passed}
 
 
 @cache
-def right() -> CheckReport:
-    """The check of a mass on a spring, which several tests read."""
+def report_of_mass_spring() -> CheckReport:
+    """The report of a mass on a spring, which several tests read."""
     return check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
 
 
@@ -119,8 +119,8 @@ def right() -> CheckReport:
         "mass_spring",
     ),
 )
-def test_what_is_right_passes(name: str) -> None:
-    """Also in other arithmetic: the simplified equations round differently."""
+def test_correct_module_passes(name: str) -> None:
+    """Also with other arithmetic: the simplified equations round differently."""
     report = check(scene_system(name), StandIn(simplified(reference(name))))
     assert report.passed, report.table()
     values = [row for row in report.results if row.unit == "units of rounding"]
@@ -129,10 +129,10 @@ def test_what_is_right_passes(name: str) -> None:
     assert order.error == pytest.approx(4, abs=0.2)
 
 
-# rows of runs of several step sizes, which take most of the time
+# Checks of runs with several step sizes, which take most of the time.
 OF_RUNS = {"order of rk4", "power balance"}
 LONG = {what for what, (_, _, rows) in BROKEN.items() if rows & OF_RUNS}
-# each row once; an order that is too low: test_breaks, tests/physics/test_steppers
+# Each check once; test_breaks and tests/physics/test_steppers cover an order that is too low.
 QUICK = (
     "a sign in D", "a sign in D, on the diagonal", "a sign in C", "a sign in g", "a sign in bias",
     "a sign in tau", "a sign in an acceleration", "the time of a step",
@@ -141,8 +141,10 @@ QUICK = (
 )  # fmt: skip
 
 
-def checked(what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = None) -> CheckReport:
-    """The check of what is broken, without rows of runs that say nothing of it."""
+def check_broken(
+    what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = None
+) -> CheckReport:
+    """Check a broken module, without checks of runs that do not concern the breakage."""
     without = "add_advice_check" if what in LONG else "add_convergence_checks"
     monkeypatch.setattr(Comparison, without, lambda *_: None)
     name, break_, _ = BROKEN[what]
@@ -152,28 +154,30 @@ def checked(what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = Non
 
 
 @pytest.mark.parametrize("what", tiers(BROKEN, *QUICK))
-def test_what_is_wrong_fails(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    report = checked(what, monkeypatch, states=4)
-    assert BROKEN[what][2] <= failed(report), report.table()
+def test_wrong_module_fails(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    report = check_broken(what, monkeypatch, states=4)
+    assert BROKEN[what][2] <= failed_checks(report), report.table()
     assert not report.passed
 
 
 @pytest.fixture
 def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference is Taylor arithmetic, and sizes come from changing all inputs at once."""
+    """Use Taylor arithmetic as reference, and scales from changing all inputs at once, as for
+    large systems.
+    """
     monkeypatch.setattr(references, "MAX_SIZE", 0)
     monkeypatch.setattr(sampling, "MOST_NUDGES", 0)
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole_driven", "foucault_pendulum"), "cartpole_driven"))
-def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
+def test_correct_module_passes_as_if_large(name: str, as_if_large: None) -> None:
     report = check(scene_system(name), StandIn(simplified(reference(name))))
     assert report.passed, report.table()
     assert report.states == LARGE.states
     assert report.reference == "Taylor arithmetic"
     assert "6 random states, against Taylor arithmetic" in " ".join(report.table().split())
     values = [row for row in report.results if row.unit == "units of rounding"]
-    assert max(row.error for row in values) < 10  # sizes are smaller than with one by one
+    assert max(row.error for row in values) < 10  # combined scales are smaller
 
 
 @pytest.mark.parametrize(
@@ -188,25 +192,25 @@ def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
         "a sign in C", "a parameter ignored in D", "energy",
     ),
 )  # fmt: skip
-def test_what_is_wrong_fails_as_if_large(
+def test_wrong_module_fails_as_if_large(
     what: str, as_if_large: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    report = checked(what, monkeypatch)
-    assert BROKEN[what][2] <= failed(report), report.table()
+    report = check_broken(what, monkeypatch)
+    assert BROKEN[what][2] <= failed_checks(report), report.table()
 
 
-def test_a_module_that_raises_fails_with_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_of_a_module_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     module = StandIn(reference("mass_spring"))
     module.g = lambda *place, **how: {}["k"]  # type: ignore[method-assign]
     report = check(scene_system("mass_spring"), module, states=4)
-    assert failed(report) == {"g", "bias = C qd + g"}
+    assert failed_checks(report) == {"g", "bias = C qd + g"}
     assert "KeyError: 'k'" in report.table()
 
 
 @pytest.mark.slow
-def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
-    """Spans between two jumps show it; before, the row was of any span."""
+def test_order_is_measured_between_discontinuities_of_friction() -> None:
+    """The order shows in spans between two discontinuities; the check used to take any span."""
     x, v = symbol("x"), symbol("x_dot")
     system = System.make("dry", [x], v**2 / 2, x**2 / 2, forces={x: -sympy.sign(v)}, h=0.05)
     report = check(system, StandIn(derive(system)), states=8)
@@ -215,8 +219,10 @@ def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
     assert order.judged and 3.5 < order.error < 4.5
 
 
-def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says so, in the table and in JSON, and passes; without a jump it fails."""
+def test_order_is_not_judged_across_discontinuities(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table and the JSON report say so, and the check passes; without a discontinuity it
+    fails.
+    """
     x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Measurement(1.0)
     monkeypatch.setattr(Convergence, "order", low)
     monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
@@ -228,7 +234,7 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
         assert ("not to be expected with sign" in " ".join(report.table().split())) == passed
 
 
-def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unmeasurable_order_is_reported_as_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     unseen = Measurement(math.nan, "too few halvings")
     monkeypatch.setattr(Convergence, "order", lambda *_: unseen)
     monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
@@ -239,7 +245,7 @@ def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -
     assert row["name"] == "order of rk4" and row["error"] is None and row["passed"]
 
 
-def test_a_singular_start_is_passed_over() -> None:
+def test_singular_initial_state_is_skipped() -> None:
     r, theta, m = symbol("r"), symbol("theta"), symbol("m")
     speed = symbol("r_dot") ** 2 + r**2 * symbol("theta_dot") ** 2
     system = System.make("polar", {r: 0.0, theta: 0.0}, m * speed / 2, m * r**2, parameters={m: 2})
@@ -248,16 +254,16 @@ def test_a_singular_start_is_passed_over() -> None:
     assert report.rejected >= 1
 
 
-def test_a_coordinate_without_inertia_is_reported() -> None:
+def test_coordinate_without_inertia_is_reported() -> None:
     x, y = symbol("x"), symbol("y")
     system = System.make("lazy", [x, y], symbol("x_dot") ** 2 / 2, x**2 + y**2)
     report = check(system, StandIn(derive(system)), states=4)
-    assert failed(report) == {"states"}
+    assert failed_checks(report) == {"states"}
     assert report.states == 0
 
 
-def test_cancelling_terms_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """C is 0 only as the difference of equal terms: rounding in it is not held against 0."""
+def test_rounding_of_cancelling_terms_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """C is 0 only as the difference of equal terms, so its rounding is not compared with 0."""
     monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     a, b = symbol("a"), symbol("b")
     angle, rate = a + b, symbol("a_dot") + symbol("b_dot")
@@ -267,41 +273,41 @@ def test_cancelling_terms_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.passed, report.table()
 
 
-def test_each_method_has_its_row_of_one_step() -> None:
+def test_each_method_has_a_check_of_one_step() -> None:
     for methods in (("rk4", "dp8", "gauss4"), ("gauss8", "euler")):
         names = list[str]()
-        given = SimpleNamespace(
+        comparison = SimpleNamespace(
             methods=methods, add_check=lambda name, *_, names=names: names.append(name),
             value_error=len, rk4_step_error=None, run_error=None, run_energy_error=None,
             step_error=len,
         )  # fmt: skip
-        add_value_checks(cast(Comparison, given))
+        add_value_checks(cast(Comparison, comparison))
         assert [n.removeprefix("one step of ") for n in names if "one step of" in n] == [
             m for m in methods if m != "rk4"
         ]
         assert ("one step" in names) == ("rk4" in methods)
 
 
-def test_the_report_can_be_read_by_programs_and_people() -> None:
-    report = right()
-    told = json.loads(json.dumps(report.as_dict(), allow_nan=False))
-    assert told["passed"] is True
-    assert told["reference"] == "equations written out"
-    assert {row["name"] for row in told["rows"]} >= {"D", "acceleration", "run", "order of rk4"}
+def test_report_as_json_and_as_table() -> None:
+    report = report_of_mass_spring()
+    parsed = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert parsed["passed"] is True
+    assert parsed["reference"] == "equations written out"
+    assert {row["name"] for row in parsed["rows"]} >= {"D", "acceleration", "run", "order of rk4"}
     assert all(row.name in report.table() for row in report.results)
     assert max(map(len, report.table().splitlines())) <= 100
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_report() -> None:
+def test_report_is_reproducible_for_a_seed() -> None:
     module = StandIn(reference("cartpole"))
     first, second = (check(scene_system("cartpole"), module, states=4) for _ in range(2))
     assert first == second
     assert first != check(scene_system("cartpole"), module, states=4, seed=1)
 
 
-class Advising:
-    """A compiled module that advises for steps `by` times as long as they are."""
+class ModuleWithScaledAdvice:
+    """A compiled module that gives advice for steps `by` times as long as the actual ones."""
 
     def __init__(self, module: Any, by: float) -> None:
         self.module, self.by = module, by
@@ -310,8 +316,8 @@ class Advising:
         return getattr(self.module, name)
 
     def advice(self, q: Any, qd: Any, h: float, **how: Any) -> str | None:
-        told: str | None = self.module.advice(q, qd, h * self.by, **how)
-        return told
+        message: str | None = self.module.advice(q, qd, h * self.by, **how)
+        return message
 
 
 SLOPES = """eomc = 1
@@ -341,14 +347,14 @@ linearize = "parameters"
         *(pytest.param("float", what, marks=pytest.mark.slow) for what in ("", "A")),
     ],
 )
-def test_derivatives_are_compared_with_differences(
+def test_derivatives_are_compared_with_finite_differences(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str
 ) -> None:
     monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     text = f'{SLOPES}real = "{real}"\n'
     module = modules.unoptimised(text)
 
-    class Bent:
+    class WrongModule:
         def __getattr__(self, name: str) -> Any:
             return getattr(module, name)
 
@@ -359,24 +365,26 @@ def test_derivatives_are_compared_with_differences(
         def sensitivity(self, *place: Any, **how: Any) -> Any:
             return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
 
-    report = check(system_of(parse(text)), Bent(), states=4)
+    report = check(system_of(parse(text)), WrongModule(), states=4)
     rows = {"": set(), "sensitivity": {"sensitivity"}}.get(wrong, {"linearize", "closed loop"})
-    assert failed(report) == rows, report.table()
+    assert failed_checks(report) == rows, report.table()
     assert {"linearize", "sensitivity"} <= {row.name for row in report.results}
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole", "mass_spring"), "mass_spring"))
-def test_advice_on_h_is_held_against_runs(modules: Modules, name: str) -> None:
-    """Right within a factor of eight one way, and of two the other."""
+def test_advice_on_h_is_compared_with_runs(modules: Modules, name: str) -> None:
+    """The advice must be right within a factor of eight below and of two above."""
     system = scene_system(name)
     for by, good in ((1.0, True), (1 / 16, False), (16.0, False)):
-        made = Comparison(system, Advising(modules(name), by), np.random.default_rng(0), 4)
-        made.add_advice_check("rk4")
-        (row,) = made.results
+        comparison = Comparison(
+            system, ModuleWithScaledAdvice(modules(name), by), np.random.default_rng(0), 4
+        )
+        comparison.add_advice_check("rk4")
+        (row,) = comparison.results
         assert row.name == "h of rk4" and row.passed == good, row
         assert not good or row.error in (0.25, 0.5, 1, 2)
 
 
-def test_where_no_mode_turns_there_is_no_h_to_test() -> None:
-    (row,) = (r for r in right().results if r.name == "h of rk4")
+def test_without_oscillation_there_is_no_advice_to_check() -> None:
+    (row,) = (r for r in report_of_mass_spring().results if r.name == "h of rk4")
     assert row.passed and math.isinf(row.error) and row.unit.startswith("no limit to test")

@@ -1,4 +1,4 @@
-"""Rows of `check` about adaptive steps: bounded where events are not, stiff where they say so."""
+"""Checks of adaptive steps: bounded if events accumulate, stiff steps where they are expected."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from eomc.verify.checks_refusals import RefusalChecks
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Measurement
 
-# the more it has jumped the sooner it jumps again: without end before 0.17 s
+# the intervals between jumps shrink: they accumulate before 0.17 s
 ENDLESS = """eomc = 1
 name = "endless"
 [coordinates]
@@ -45,7 +45,7 @@ tolerance = 1e-6
 """
 
 
-# steps of 1e-5 s, which a time of 15 s has no digits for in single precision
+# steps of 1e-5 s, which single precision cannot resolve at a time of 15 s
 STIFF = """eomc = 1
 name = "stiff_single"
 [coordinates]
@@ -64,15 +64,15 @@ batch = true
 
 
 @pytest.fixture
-def of(modules: Modules) -> Comparison:
-    made = from_scene(parse(ENDLESS, "test.toml"))
-    return Comparison(made, modules.unoptimised(ENDLESS), np.random.default_rng(1), None)
+def endless(modules: Modules) -> Comparison:
+    system = from_scene(parse(ENDLESS, "test.toml"))
+    return Comparison(system, modules.unoptimised(ENDLESS), np.random.default_rng(1), None)
 
 
 @pytest.fixture
 def bounded() -> Iterator[None]:
     def late(*_: Any) -> None:
-        pytest.fail("no end in sight")  # no Exception, which rows would keep
+        pytest.fail("no end in sight")  # not an Exception, which checks would catch
 
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(20)
@@ -82,32 +82,36 @@ def bounded() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("bounded")
-def test_events_without_end_are_left_after_what_is_compared(of: Comparison) -> None:
-    """Of a run of 5 s, which would take memory as long as it went on."""
-    checks_adaptive.report_runs(of)
-    assert [row.passed for row in of.results] == [True] * 3, of.results
+def test_accumulating_events_are_not_simulated_beyond_the_compared_time(
+    endless: Comparison,
+) -> None:
+    """A full run of 5 s would need memory as long as it continued."""
+    checks_adaptive.report_runs(endless)
+    assert [row.passed for row in endless.results] == [True] * 3, endless.results
 
 
-def test_a_row_of_stiff_steps_takes_them(of: Comparison) -> None:
-    """All but those that the reference goes by."""
+def test_check_of_stiff_steps_takes_stiff_steps(endless: Comparison) -> None:
+    """All runs are stiff except the reference's."""
     stiff = list[bool]()
 
-    class Told:
-        Interrupted = of.module.Interrupted
+    class RecordingModule:
+        Interrupted = endless.module.Interrupted
 
         def simulate(self, *args: Any, **how: Any) -> Any:
-            run = of.module.simulate(*args, **how)
+            run = endless.module.simulate(*args, **how)
             stiff.append(run.stiff_steps == run.steps)
             return run
 
-    checks_adaptive._run_error(of, Told(), 1e-6, True, of.expected[0].state)
+    checks_adaptive._run_error(endless, RecordingModule(), 1e-6, True, endless.expected[0].state)
     assert stiff.count(True) >= 3 and stiff.count(False) == 1
 
 
-def test_inputs_that_are_held_are_those_of_all_stages(modules: Modules) -> None:
-    """Where steps are too long for sweeps, stages are found by Newton's method, all at once."""
-    made = scene_system("cartpole_driven")
-    driven = Comparison(made, modules("cartpole_driven"), np.random.default_rng(1), 4)
+def test_constant_inputs_apply_to_all_stages(modules: Modules) -> None:
+    """If steps are too long for fixed-point iteration, Newton's method solves all stages at
+    once.
+    """
+    system = scene_system("cartpole_driven")
+    driven = Comparison(system, modules("cartpole_driven"), np.random.default_rng(1), 4)
     s = replace(driven.expected[0].state, u=np.array([0.5]))
     x, times = np.array([*s.q, *s.qd]), np.array([2.5])
     rows, _ = checks_adaptive._reference_states(driven, s, x, times, times)
@@ -116,45 +120,45 @@ def test_inputs_that_are_held_are_those_of_all_stages(modules: Modules) -> None:
 
 @pytest.fixture(scope="module")
 def stiff(modules: Modules) -> Comparison:
-    made = from_scene(parse(STIFF, "test.toml"))
-    of = Comparison(made, modules.unoptimised(STIFF), np.random.default_rng(0), 2)
-    late = replace(of.expected[-1].state, t=14.64)
-    of.expected[-1] = replace(of.expected[-1], state=late)
-    return of
+    system = from_scene(parse(STIFF, "test.toml"))
+    comparison = Comparison(system, modules.unoptimised(STIFF), np.random.default_rng(0), 2)
+    late = replace(comparison.expected[-1].state, t=14.64)
+    comparison.expected[-1] = replace(comparison.expected[-1], state=late)
+    return comparison
 
 
-def test_steps_are_judged_where_time_tells_them(
+def test_steps_are_judged_if_time_resolves_them(
     stiff: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, drive = AdaptiveRefusalChecks(stiff, RefusalChecks(stiff)), AdaptiveRefusalChecks.drive
-    assert made.step_limit_violations() == 0
+    checks, drive = AdaptiveRefusalChecks(stiff, RefusalChecks(stiff)), AdaptiveRefusalChecks.drive
+    assert checks.step_limit_violations() == 0
     start, late = (e.state for e in stiff.expected)
-    assert made.step_limit_errors(start) == 0 and made.step_limit_errors(late) is None
+    assert checks.step_limit_errors(start) == 0 and checks.step_limit_errors(late) is None
 
-    def unheard(self: AdaptiveRefusalChecks, *of: Any, h_most: float = 0.0, **how: Any) -> Any:
-        return drive(self, *of, **how)
+    def refuse_without_limit(
+        self: AdaptiveRefusalChecks, *args: Any, h_most: float = 0.0, **how: Any
+    ) -> Any:
+        return drive(self, *args, **how)
 
-    monkeypatch.setattr(AdaptiveRefusalChecks, "drive", unheard)
-    assert made.step_limit_violations() == 1
+    monkeypatch.setattr(AdaptiveRefusalChecks, "drive", refuse_without_limit)
+    assert checks.step_limit_violations() == 1
     monkeypatch.setattr(stiff, "expected", stiff.expected[1:])
-    assert isinstance(
-        made.step_limit_violations(), Measurement
-    )  # nothing is judged, and it says so
+    assert isinstance(checks.step_limit_violations(), Measurement)
 
 
-def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> None:
+def test_batch_steps_are_judged_if_time_resolves_them(stiff: Comparison) -> None:
     many = AdaptiveBatchChecks(stiff, [])
     assert many.state is stiff.expected[0].state
     right = many.compare_with_single_runs()
     assert isinstance(right, float) and right < BATCH_LIMIT
 
-    class Off:
+    class PerturbedBatch:
         simulate = staticmethod(stiff.module.simulate)
 
         def simulate_batch(self, *args: Any, **how: Any) -> Any:
             run = stiff.module.simulate_batch(*args, **how)
             return SimpleNamespace(q=run.q * 1.01, qd=run.qd)
 
-    many.module = Off()
+    many.module = PerturbedBatch()
     wrong = many.compare_with_single_runs()
     assert isinstance(wrong, float) and wrong > BATCH_LIMIT

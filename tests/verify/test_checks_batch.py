@@ -1,4 +1,4 @@
-"""Rows about batches compare as far as there are digits, and no less."""
+"""Checks of batches compare all significant digits, and no more."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eomc.verify.checks_batch import STEPS, BatchChecks
 from eomc.verify.checks_runs import RunChecks, run_in_c
 from eomc.verify.comparison import Comparison
 
-# forces that answer where a slide is; with a cosine of it they have no digit at 1e304
+# forces that depend on a slide; with a cosine of it they have no digit at 1e304
 SLIDE = """eomc = 1
 name = "slide"
 [coordinates]
@@ -31,44 +31,46 @@ x = "FORCE"
 h = 0.02
 batch = true
 """
-ALL_BUT_LOST = 5e305
-SOON_LOST = 8e306  # after a few steps
+NEARLY_OVERFLOWING = 5e305
+OVERFLOWING = 8e306  # after a few steps
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 def batches(modules: Modules, force: str, text: str = SLIDE) -> BatchChecks:
     text = text.replace("FORCE", force)
-    made = from_scene(parse(text, "slide.toml"))
-    comparison = Comparison(made, modules.unoptimised(text), np.random.default_rng(0), 4)
+    system = from_scene(parse(text, "slide.toml"))
+    comparison = Comparison(system, modules.unoptimised(text), np.random.default_rng(0), 4)
     return BatchChecks(RunChecks(comparison), [])
 
 
 @pytest.mark.parametrize(
     ("force", "digits"), tiers([("-x/7", True), ("-40*cos(x)*x", False)], "-40*cos(x)*x")
 )
-def test_rows_without_digits_are_compared_by_their_own_rounding(
+def test_rows_without_digits_are_compared_by_rounding(
     modules: Modules, force: str, digits: bool
 ) -> None:
     b = batches(modules, force)
-    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([ALL_BUT_LOST]))
-    alone, beside = (
+    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([NEARLY_OVERFLOWING]))
+    single, perturbed = (
         run_in_c(b.model, "rk4", replace(s, qd=s.qd * by), b.h, STEPS) for by in (1, 1 + 1e-13)
     )
-    kept = alone.rows[:, :6]
-    assert not b.differs_beyond_rounding("rk4", s, kept, alone)
-    assert not b.differs_beyond_rounding("rk4", s, beside.rows[:, :6], alone)
-    assert b.differs_beyond_rounding("rk4", s, kept * 1.01, alone) == digits
+    rows = single.rows[:, :6]
+    assert not b.differs_beyond_rounding("rk4", s, rows, single)
+    assert not b.differs_beyond_rounding("rk4", s, perturbed.rows[:, :6], single)
+    assert b.differs_beyond_rounding("rk4", s, rows * 1.01, single) == digits
 
 
-def test_the_last_row_of_an_instance_that_stops_is_that_alone(modules: Modules) -> None:
-    """Also where it stops after its first step; one that goes on has no digit left to compare."""
+def test_last_row_of_a_stopped_instance_equals_a_single_run(modules: Modules) -> None:
+    """Also if it stops after its first step; an instance that continues has no digit left to
+    compare.
+    """
     b = batches(modules, "-x/7")
-    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([SOON_LOST]), params=None)
+    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([OVERFLOWING]), params=None)
     alone = run_in_c(b.model, "rk4", s, b.h, STEPS)
     assert 0 < alone.steps < STEPS and alone.status
     whole = b.simulate("rk4", [s] * len(b.instances), None)
-    for steps in range(alone.steps, 0, -1):  # rounding may decide a step that all but fails
+    for steps in range(alone.steps, 0, -1):  # rounding may decide a step that nearly fails
         whole.steps[0] = steps
         whole.q[0, steps + 1 :] = whole.qd[0, steps + 1 :] = np.nan
         assert not b.fails_differently("rk4", whole, 0, s)
@@ -79,7 +81,7 @@ def test_the_last_row_of_an_instance_that_stops_is_that_alone(modules: Modules) 
     assert not b.fails_differently("rk4", whole, 0, b.instances[0])
 
 
-def test_own_and_shared_parameters_are_compared_by_what_rounding_does(modules: Modules) -> None:
+def test_own_and_shared_parameters_are_compared_by_rounding(modules: Modules) -> None:
     b = batches(modules, "-x/7")
     alike = [replace(s, params=b.instances[0].params) for s in b.instances]
     one, other = (b.simulate("rk4", alike, None, own=own) for own in (False, True))
@@ -105,11 +107,13 @@ batch = true
 """
 
 
-def test_what_one_coordinate_alone_would_throw_counts(modules: Modules) -> None:
-    """Both moved by as much leave the spring between them as it is; roundings do not."""
+def test_perturbation_of_single_coordinates_counts(modules: Modules) -> None:
+    """Equal changes of both leave the spring between them unchanged; rounding errors do not."""
     b = batches(modules, "", COUPLED)
     s = replace(b.instances[0], q=np.array([0.5, 0.5]), qd=np.array([0.1, 0.1]), params=None)
-    beside = run_in_c(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
-    assert np.abs(beside.rows[:, 1] - run_in_c(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
-    off = b.step_error("rk4", s, beside.rows[:, 1])
+    perturbed = run_in_c(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
+    assert (
+        np.abs(perturbed.rows[:, 1] - run_in_c(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
+    )
+    off = b.step_error("rk4", s, perturbed.rows[:, 1])
     assert off is not None and off < 10

@@ -1,4 +1,4 @@
-"""Energies of bodies once more from point masses: right for every tree, and a fault is noticed."""
+"""Energies of bodies, checked with point masses: correct for every tree; errors are detected."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from eomc.verify.taylor import TaylorReference
 NAMES = ("kinetic_energy", "potential_energy", "power")
 
 
-def compared(text: str, states: int = 4) -> dict[str, float]:
-    """How far the reference's energies are off from those of point masses."""
-    made = from_scene(parse(text, "test.toml"))
-    assert made.scene is not None
-    module = StandIn(TaylorReference(made))  # type: ignore[arg-type]  # which answers alike
-    check = Comparison(made, module, np.random.default_rng(0), states)
+def energy_errors(text: str, states: int = 4) -> dict[str, float]:
+    """Return the deviation of the reference's energies from those of point masses."""
+    system = from_scene(parse(text, "test.toml"))
+    assert system.scene is not None
+    module = StandIn(TaylorReference(system))  # has the same interface
+    check = Comparison(system, module, np.random.default_rng(0), states)
     assert check.expected
-    return {name: BodyChecks(check, made.scene).largest_error(name) for name in NAMES}
+    return {name: BodyChecks(check, system.scene).largest_error(name) for name in NAMES}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plane", [True, False])
 @settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_every_tree_has_the_energies_of_its_point_masses(plane: bool, data: Any) -> None:
+def test_energies_of_trees_equal_those_of_point_masses(plane: bool, data: Any) -> None:
     shape = data.draw(st.sampled_from([s for s in SHAPES if len(s) < 3]))
-    off = compared(data.draw(trees(shape, plane)))
+    off = energy_errors(data.draw(trees(shape, plane)))
     assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
@@ -103,7 +103,7 @@ damping = 2
 """
 
 
-def test_every_kind_of_joint_is_known_here_too() -> None:
+def test_every_kind_of_joint_is_covered() -> None:
     assert checks_bodies._MOTIONS.keys() == JOINTS.keys()
 
 
@@ -113,7 +113,7 @@ def kinds(kind: str, coordinates: str) -> str:
 
 
 def single() -> str:
-    """One body on a spherical joint, with a spring and a damper to the world."""
+    """Return one body on a spherical joint, with a spring and a damper to the world."""
     head, rest = kinds("spherical", "abc").split("[definitions]")
     body = rest.split("[[body]]")[1]
     ends = rest.split("[[spring]]")[1].replace("placed", "world")
@@ -125,7 +125,7 @@ def single() -> str:
     "kind, coordinates", tiers((("spherical", "abc"), ("free", "abcdef")), "spherical")
 )
 def test_joints_of_three_angles_and_bodies_placed_by_formulas(kind: str, coordinates: str) -> None:
-    off = compared(kinds(kind, coordinates), 3)
+    off = energy_errors(kinds(kind, coordinates), 3)
     assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
@@ -147,7 +147,7 @@ def with_wrong(method: str, by: Callable[[Any], Any]) -> Callable[[pytest.Monkey
     return patch
 
 
-# what is wrong in multibody.py, and the energy that tells
+# The error in multibody.py, and the energy that shows it.
 WRONG = {
     "the sign of gravity": (with_wrong("_gravity_potential", lambda P: -P), "potential_energy"),
     "a term of K": (with_wrong("_kinetic_terms", lambda terms: terms[:-1]), "kinetic_energy"),
@@ -172,17 +172,17 @@ RIGHT = building.Builder._kinetic_terms
 @pytest.mark.parametrize(
     "what", tiers(WRONG, "the sign of gravity", "the sense of a rotation", "products of inertia")
 )
-def test_a_fault_in_what_is_made_of_bodies_is_noticed(
+def test_errors_in_energies_of_bodies_are_detected(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     patch, name = WRONG[what]
     patch(monkeypatch)
-    assert compared(single())[name] > 1e3 * checks_bodies.RELATIVE_LIMIT
+    assert energy_errors(single())[name] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
-def test_a_damper_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_damper_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building.Builder, "_add_damper", lambda *line: None)
-    assert compared(single())["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
+    assert energy_errors(single())["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
 LIMITED = """
@@ -221,24 +221,24 @@ b = "push"
 """
 
 
-def test_of_inputs_beyond_their_limits_the_limits_act() -> None:
-    off = compared(LIMITED, 12)
+def test_inputs_are_saturated_at_their_limits() -> None:
+    off = energy_errors(LIMITED, 12)
     assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
-def test_limits_left_out_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_limits_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hybrid, "saturate_inputs", lambda system: system)
-    assert compared(LIMITED, 12)["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
+    assert energy_errors(LIMITED, 12)["power"] > 1e3 * checks_bodies.RELATIVE_LIMIT
 
 
-def test_terms_linear_in_the_velocities_are_no_energy() -> None:
+def test_terms_linear_in_velocities_are_not_part_of_the_energy() -> None:
     potential = '[energy]\npotential = "a*b + 0.3*arm_x*dot(arm_y) + way"\n'
     text = LIMITED.replace("[forces]", f'way = "0.2*a_dot*sin(b)"\n{potential}[forces]')
-    off = compared(text, 4)
+    off = energy_errors(text, 4)
     assert max(off.values()) < checks_bodies.RELATIVE_LIMIT, off
 
 
-def test_quaternions_are_scipys() -> None:
+def test_quaternions_agree_with_scipy() -> None:
     random = np.random.default_rng(3)
     a, b, x = random.normal(size=(5, 4)), random.normal(size=(5, 4)), random.normal(size=(5, 3))
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
@@ -248,12 +248,12 @@ def test_quaternions_are_scipys() -> None:
     np.testing.assert_allclose(checks_bodies.rotate(product, x), (one * other).apply(x), atol=1e-14)
 
 
-def test_point_masses_have_the_inertia_of_the_body() -> None:
-    made = from_scene(read(SCENES / "tumbling_box.toml"))
-    assert made.scene is not None and made.scene.assembly is not None
-    start = State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
-    line = checks_bodies.MotionLine(made.scene, start, 0.1)
-    (body,) = [b for b in made.scene.assembly.bodies if b.joint]
+def test_point_masses_reproduce_the_inertia_of_the_body() -> None:
+    system = from_scene(read(SCENES / "tumbling_box.toml"))
+    assert system.scene is not None and system.scene.assembly is not None
+    start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
+    line = checks_bodies.MotionLine(system.scene, start, 0.1)
+    (body,) = [b for b in system.scene.assembly.bodies if b.joint]
     masses, points = zip(*line.points(body), strict=True)
     m, x = np.array(masses), np.array(points)
     assert math.isclose(m.sum(), float(line.evaluate(body.mass)))

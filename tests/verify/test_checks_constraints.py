@@ -1,4 +1,4 @@
-"""Rows of `eomc check` about what constraints hold notice what is wrong."""
+"""Checks of constraints detect errors."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def bob(modules: Modules) -> ModuleType:
     return modules.unoptimised(BOB)
 
 
-def failed(module: Any, report: Callable[[Comparison], None]) -> set[str]:
-    """Of the rows that one part of the check adds."""
-    made = Comparison(BOB, module, np.random.default_rng(0), 4)
-    report(made)
-    return {row.name for row in made.results if not row.passed}
+def failed_checks(module: Any, report: Callable[[Comparison], None]) -> set[str]:
+    """Return the failed checks among those that one part of the check adds."""
+    comparison = Comparison(BOB, module, np.random.default_rng(0), 4)
+    report(comparison)
+    return {row.name for row in comparison.results if not row.passed}
 
 
-class Bent:
-    """A module whose tangents lead a thousandth off the rows."""
+class WrongTangent:
+    """A module whose tangents violate the constraints by a thousandth."""
 
     def __init__(self, module: ModuleType) -> None:
         self.module = module
@@ -74,31 +74,33 @@ class Bent:
 
 
 @pytest.mark.slow
-def test_what_is_right_passes(bob: ModuleType) -> None:
+def test_correct_module_passes(bob: ModuleType) -> None:
     rows = check(BOB, bob, states=4).results
     assert {row.name for row in rows} >= {"tangent", "negative D along the rows"}
     assert all(row.passed for row in rows)
 
 
-def test_a_tangent_that_leaves_the_rows_fails(bob: ModuleType) -> None:
-    assert failed(Bent(bob), checks_constraints.report) == {"tangent"}
+def test_tangent_that_violates_the_constraints_fails(bob: ModuleType) -> None:
+    assert failed_checks(WrongTangent(bob), checks_constraints.report) == {"tangent"}
 
 
-class Answering:
-    """A module made of the reference alone, with what one of its values goes through."""
+class ReferenceModule:
+    """A module that returns the reference's values, with a change applied to some of them."""
 
-    def __init__(self, of: Comparison, **bent: Callable[[Any], Any]) -> None:
-        self.reference, self.bent = of.reference, bent
+    def __init__(self, of: Comparison, **changes: Callable[[Any], Any]) -> None:
+        self.reference, self.changes = of.reference, changes
 
     def __getattr__(self, name: str) -> Any:
-        bend = self.bent.get(name, lambda found: found)
+        bend = self.changes.get(name, lambda value: value)
 
-        def found(q: Any, qd: Any = None, t: float = 0.0, u: Any = None, params: Any = None) -> Any:
+        def evaluate(
+            q: Any, qd: Any = None, t: float = 0.0, u: Any = None, params: Any = None
+        ) -> Any:
             if name in ("multipliers", "reactions"):
                 return bend(self.reference.multipliers(q, qd, t, u, params))
             return bend(self.reference.evaluate(name, q, qd, t, u, params))
 
-        return found
+        return evaluate
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +114,14 @@ def hinged() -> Comparison:
 @pytest.mark.parametrize(
     ("sign", "least", "most"), [(1, 0, WORK_TOLERANCE), (-1, 0.1, 2), (np.nan, 1, np.inf)]
 )
-def test_reactions_are_compared_where_a_coordinate_hardly_moves(
+def test_reactions_are_compared_if_a_coordinate_hardly_moves(
     hinged: Comparison, sign: float, least: float, most: float
 ) -> None:
-    """What is no number passed."""
-    made = ConstraintChecks(
-        hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]})
+    """NaN used to pass."""
+    checks = ConstraintChecks(
+        hinged, ReferenceModule(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]})
     )
-    assert least <= made.reaction_error() <= most
+    assert least <= checks.reaction_error() <= most
 
 
 BELT = """eomc = 1
@@ -139,21 +141,23 @@ motor = "y + z - sin(t) - 1"
 
 
 @pytest.mark.parametrize(
-    "bent", [{}, {"constraint_rates": np.zeros_like}, {"constraint_jacobian": np.abs}]
+    "changes", [{}, {"constraint_rates": np.zeros_like}, {"constraint_jacobian": np.abs}]
 )
-def test_rows_do_the_work_of_their_parts_without_rates(bent: dict[str, Any]) -> None:
-    """A belt's with no t in it, of which it was expected that it does none."""
+def test_constraint_power_follows_from_explicit_time_terms(changes: dict[str, Any]) -> None:
+    """A belt's constraint without explicit time was expected to do no work."""
     system = assembled(from_scene(parse(BELT)))
     of = Comparison(system, None, np.random.default_rng(0), 4)
-    power = ConstraintChecks(of, Answering(of, **bent)).power_error()
-    assert (power > LIMIT) == bool(bent)
+    power = ConstraintChecks(of, ReferenceModule(of, **changes)).power_error()
+    assert (power > LIMIT) == bool(changes)
 
 
 def test_accelerations_of_negative_masses_fail(
     bob: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RefusalChecks, "accelerate", lambda *_: (OK, True))
-    assert failed(bob, lambda made: RefusalChecks(made).report()) == {"negative D along the rows"}
+    assert failed_checks(bob, lambda comparison: RefusalChecks(comparison).report()) == {
+        "negative D along the rows"
+    }
 
 
 @pytest.mark.slow
@@ -162,16 +166,16 @@ def test_multipliers_of_negative_masses_fail(
 ) -> None:
     call = RefusalChecks.call
 
-    def found(self: RefusalChecks, name: str, s: Any) -> Any:
+    def call_without_multipliers(self: RefusalChecks, name: str, s: Any) -> Any:
         return None if name == "multipliers" else call(self, name, s)
 
-    monkeypatch.setattr(RefusalChecks, "call", found)
-    told = {"negative D along the rows: refusals"}
-    assert failed(bob, lambda made: RefusalChecks(made).report()) == told
+    monkeypatch.setattr(RefusalChecks, "call", call_without_multipliers)
+    expected = {"negative D along the rows: refusals"}
+    assert failed_checks(bob, lambda comparison: RefusalChecks(comparison).report()) == expected
 
 
-def test_states_with_a_negative_d_are_left_out() -> None:
-    """Of a scene with a mass that its coordinates may make negative, these say nothing."""
+def test_states_with_negative_D_are_skipped() -> None:
+    """They are meaningless for a scene whose coordinates may make a mass negative."""
     kinetic = "(m - 2*x)*(x_dot**2 + y_dot**2)/2"
     text = SCENE.replace("m*(x_dot**2 + y_dot**2)/2", kinetic)
     system = assembled(from_scene(parse(text)))
@@ -181,10 +185,10 @@ def test_states_with_a_negative_d_are_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_runs_whose_step_is_too_long_are_no_fault_of_the_rows(modules: Modules) -> None:
-    """Angles of 1e37, whose sines are anything, were taken for rows that are not held."""
+def test_runs_with_too_long_steps_do_not_fail_the_constraint_check(modules: Modules) -> None:
+    """Angles of 1e37, whose sines are meaningless, used to be reported as violated constraints."""
     system = assembled(from_scene(parse((SCENES / "four_bar.toml").read_text("utf-8") + STIFF)))
     module, random = modules.unoptimised(system), np.random.default_rng(0)
-    made = ConstraintChecks(Comparison(system, module, random, 4), module)
-    found = made.residual_along_run("rk4")
-    assert isinstance(found, float) and 0 < found < MAX_RESIDUAL
+    checks = ConstraintChecks(Comparison(system, module, random, 4), module)
+    residual = checks.residual_along_run("rk4")
+    assert isinstance(residual, float) and 0 < residual < MAX_RESIDUAL

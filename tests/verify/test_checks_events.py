@@ -1,4 +1,4 @@
-"""The rows of `eomc check` about events notice a formula that is another one."""
+"""Checks of events detect a wrong formula."""
 
 from __future__ import annotations
 
@@ -52,27 +52,27 @@ def ball(modules: Modules) -> ModuleType:
     return modules.unoptimised(BALL)
 
 
-def failed(system: System, ball: ModuleType) -> set[str]:
-    made = Comparison(system, ball, np.random.default_rng(0), 4)
-    checks_events.report_functions(made)
-    return {row.name for row in made.results if not row.passed}
+def failed_checks(system: System, ball: ModuleType) -> set[str]:
+    comparison = Comparison(system, ball, np.random.default_rng(0), 4)
+    checks_events.report_functions(comparison)
+    return {row.name for row in comparison.results if not row.passed}
 
 
-def test_what_is_right_passes(ball: ModuleType) -> None:
+def test_correct_module_passes(ball: ModuleType) -> None:
     rows = check(BALL, ball, states=4).results
     assert {"events", "jumps"} <= {row.name for row in rows}
     assert all(row.passed for row in rows)
 
 
-def test_another_place_or_jump_fails(ball: ModuleType) -> None:
+def test_wrong_event_function_or_jump_fails(ball: ModuleType) -> None:
     impact, top = BALL.events
     later = replace(top, when=top.when + symbol("z") * 1e-9)
-    assert failed(replace(BALL, events=(impact, later)), ball) == {"events"}
+    assert failed_checks(replace(BALL, events=(impact, later)), ball) == {"events"}
     (name, speed), place = impact.jump
     harder = replace(impact, jump=((name, -speed), place))
-    assert failed(replace(BALL, events=(harder, top)), ball) == {"jumps"}
-    other = replace(impact, jump=(place,))  # the velocity goes on
-    assert failed(replace(BALL, events=(other, top)), ball) == {"jumps"}
+    assert failed_checks(replace(BALL, events=(harder, top)), ball) == {"jumps"}
+    other = replace(impact, jump=(place,))  # the velocity is unchanged
+    assert failed_checks(replace(BALL, events=(other, top)), ball) == {"jumps"}
 
 
 ODD = """eomc = 1
@@ -100,10 +100,10 @@ tolerance = 1e-9
 """
 
 
-def test_where_formulas_are_not_real_there_is_nothing_to_compare(modules: Modules) -> None:
-    made = from_scene(parse(ODD))
-    of = Comparison(made, modules.unoptimised(made), np.random.default_rng(0), 8)
-    checks_events.report_functions(of)
-    checks_inputs_outputs.report_outputs(of)
-    assert {"events", "jumps", "outputs"} <= {row.name for row in of.results}
-    assert all(row.passed for row in of.results)
+def test_complex_values_of_formulas_are_not_compared(modules: Modules) -> None:
+    system = from_scene(parse(ODD))
+    comparison = Comparison(system, modules.unoptimised(system), np.random.default_rng(0), 8)
+    checks_events.report_functions(comparison)
+    checks_inputs_outputs.report_outputs(comparison)
+    assert {"events", "jumps", "outputs"} <= {row.name for row in comparison.results}
+    assert all(row.passed for row in comparison.results)

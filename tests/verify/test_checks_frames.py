@@ -1,4 +1,4 @@
-"""The check composes frames of quaternions along a bent line, and finds what is wrong with them."""
+"""The check composes frames of quaternions along a curve, and detects errors in frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROWS = {
 
 
 class Wrong:
-    """The module with one function's last number a little off."""
+    """The module with the last number of one function slightly changed."""
 
     def __init__(self, module: ModuleType, name: str) -> None:
         self._module, self._name = module, name
@@ -38,46 +38,46 @@ class Wrong:
         if name != self._name:
             return whole
 
-        def off(*state: Any, **how: Any) -> Any:
-            found = whole(*state, **how)
-            last = np.array(found[-1] if isinstance(found, tuple) else found)
+        def changed(*state: Any, **how: Any) -> Any:
+            result = whole(*state, **how)
+            last = np.array(result[-1] if isinstance(result, tuple) else result)
             last.flat[-1] += 1e-6 * (1 + np.max(np.abs(last)))
-            if isinstance(found, (Pose, Momentum)):
-                return type(found)(*found[:-1], last)
+            if isinstance(result, (Pose, Momentum)):
+                return type(result)(*result[:-1], last)
             return last
 
-        return off
+        return changed
 
 
 @pytest.fixture(scope="module")
 def comparison(modules: Modules) -> Comparison:
-    made = from_scene(parse(SPACE, "test.toml"))
-    return Comparison(made, modules.unoptimised(SPACE), np.random.default_rng(0), 6)
+    system = from_scene(parse(SPACE, "test.toml"))
+    return Comparison(system, modules.unoptimised(SPACE), np.random.default_rng(0), 6)
 
 
-def failed(of: Comparison, module: Any) -> set[str]:
-    """The rows that do not pass of a module in the comparison's place."""
-    right, of.results, of.module = of.module, [], module
+def failed_checks(comparison: Comparison, module: Any) -> set[str]:
+    """Return the names of the checks that fail for a module."""
+    right, comparison.results, comparison.module = comparison.module, [], module
     try:
-        checks_bodies.report_frames(of, of.system.scene)
-        checks_bodies.report_inverse_dynamics(of)
+        checks_bodies.report_frames(comparison, comparison.system.scene)
+        checks_bodies.report_inverse_dynamics(comparison)
     finally:
-        of.module = right
-    return {row.name for row in of.results if not row.passed}
+        comparison.module = right
+    return {row.name for row in comparison.results if not row.passed}
 
 
 @pytest.mark.parametrize("name", ["", *ROWS])
-def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
-    found = failed(comparison, Wrong(comparison.module, name))
+def test_wrong_functions_fail(comparison: Comparison, name: str) -> None:
+    failures = failed_checks(comparison, Wrong(comparison.module, name))
     assert sorted(row.name for row in comparison.results) == sorted(ROWS.values())
-    # forces are held against the Jacobians
+    # forces are compared with the Jacobians
     also = {"forces at frames"} if name == "jacobian" else set()
-    assert found == ({ROWS[name], *also} if name else set()), comparison.results
+    assert failures == ({ROWS[name], *also} if name else set()), comparison.results
 
 
 @pytest.fixture(scope="module")
 def stiff(comparison: Comparison) -> Comparison:
-    """Two of the coordinates move as on stiff springs."""
+    """Two of the coordinates move as if on stiff springs."""
     of = Comparison(comparison.system, comparison.module, np.random.default_rng(0), 4)
     for sizes, hardly in ((of.sampler.spread, 1e-7), (of.sampler.speed, 1e-4)):
         sizes[[0, -1]] = hardly
@@ -86,23 +86,25 @@ def stiff(comparison: Comparison) -> Comparison:
 
 
 @pytest.mark.parametrize("name", ["", "frame_acceleration", "jacobian"])
-def test_of_what_hardly_moves_differences_are_no_rounding(stiff: Comparison, name: str) -> None:
-    """They were, along lines no longer than such a coordinate's way."""
+def test_differences_along_stiff_coordinates_are_not_hidden_by_rounding(
+    stiff: Comparison, name: str
+) -> None:
+    """They were, along lines shorter than the range of such a coordinate."""
     also = {"forces at frames"} if name == "jacobian" else set()
-    found = failed(stiff, Wrong(stiff.module, name))
-    assert found == ({ROWS[name], *also} if name else set()), stiff.results
+    failures = failed_checks(stiff, Wrong(stiff.module, name))
+    assert failures == ({ROWS[name], *also} if name else set()), stiff.results
 
 
 @pytest.mark.slow
-def test_joints_that_move_together(modules: Modules) -> None:
-    """By formulas of coordinates: rates and accelerations have slopes and drift."""
+def test_coupled_joints(modules: Modules) -> None:
+    """Formulas of coordinates give rates and accelerations with slopes and drift."""
     text = SPACE.replace(
         'coordinates = ["phi", "psi"]', 'coordinates = ["phi*psi", "sin(psi) - x"]'
     )
     module = modules.unoptimised(text.replace("crane3", "crane4"))
-    made = from_scene(parse(text.replace("crane3", "crane4"), "test.toml"))
-    comparison = Comparison(made, module, np.random.default_rng(0), 6)
-    checks_bodies.report_frames(comparison, made.scene)
+    system = from_scene(parse(text.replace("crane3", "crane4"), "test.toml"))
+    comparison = Comparison(system, module, np.random.default_rng(0), 6)
+    checks_bodies.report_frames(comparison, system.scene)
     checks_bodies.report_inverse_dynamics(comparison)
     assert len(comparison.results) == len(ROWS)
     assert all(row.passed for row in comparison.results), comparison.results

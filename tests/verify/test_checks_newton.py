@@ -1,4 +1,4 @@
-"""Steps that are long against the fastest mode: Newton's method is needed, and has to be right."""
+"""Steps that are long relative to the fastest mode: Newton's method is needed and must be right."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from eomc.integrators.tableaux import METHODS
 from eomc.verify import checks_newton, one_step, symbolic
 from eomc.verify.comparison import Comparison
 
-MADE = variant("pendulum_dp8_gauss8")
+SYSTEM = variant("pendulum_dp8_gauss8")
 
-# what the C says, and what it is made to say
+# The C text, and its wrong replacement.
 WRONG = {
     "the diagonal of the substitution": ("x[i] *= M[n*i + i];", "x[i] *= M[n*i - i];"),
     "a sum of the substitution": (
@@ -34,20 +34,19 @@ WRONG = {
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum."""
-    symbolic.reference_for(MADE).acceleration(
-        *np.zeros((2, len(MADE.q)))
-    )  # made once, for all forks
-    return Shipped(MADE, tmp_path_factory.mktemp("newton"))
+    # Derive the reference once for all forked processes.
+    symbolic.reference_for(SYSTEM).acceleration(*np.zeros((2, len(SYSTEM.q))))
+    return Shipped(SYSTEM, tmp_path_factory.mktemp("newton"))
 
 
-def sweeps(shipped: Shipped, source: str) -> float:
-    """What the row finds of a changed source; inf where it ends wrong."""
+def extra_iterations(shipped: Shipped, source: str) -> float:
+    """Return the result of the check for changed C; a large number if it diverges."""
 
     def measure() -> float:
-        made = Comparison(MADE, shipped.load(), np.random.default_rng(0), 4)
-        found = checks_newton.NewtonChecks(made).extra_sweeps("gauss8")
-        assert isinstance(found, float)
-        return found if math.isfinite(found) else 1e9
+        comparison = Comparison(SYSTEM, shipped.load(), np.random.default_rng(0), 4)
+        result = checks_newton.NewtonChecks(comparison).extra_sweeps("gauss8")
+        assert isinstance(result, float)
+        return result if math.isfinite(result) else 1e9
 
     assert shipped.compile(("-O0", "-march=native"), source) is None
     kind, value = in_a_fork(measure, 60)
@@ -55,36 +54,41 @@ def sweeps(shipped: Shipped, source: str) -> float:
     return value
 
 
-def test_right_ones_need_few_sweeps(shipped: Shipped) -> None:
-    assert -1 <= sweeps(shipped, shipped.source) < 3
+def test_correct_derivatives_need_few_iterations(shipped: Shipped) -> None:
+    assert -1 <= extra_iterations(shipped, shipped.source) < 3
 
 
 @pytest.mark.parametrize("what", tiers(WRONG, "the diagonal of the substitution"))
-def test_wrong_ones_do_not(shipped: Shipped, what: str) -> None:
+def test_wrong_derivatives_need_many_iterations(shipped: Shipped, what: str) -> None:
     right, wrong = WRONG[what]
     assert shipped.source.count(right) == 1
-    assert sweeps(shipped, shipped.source.replace(right, wrong)) > checks_newton.MAX_EXTRA_SWEEPS
+    assert (
+        extra_iterations(shipped, shipped.source.replace(right, wrong))
+        > checks_newton.MAX_EXTRA_SWEEPS
+    )
 
 
-def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
+def test_newton_and_fixed_point_iteration_give_the_same_step() -> None:
     def a(q: Any, qd: Any, t: Any) -> Any:
         return -np.sin(q) - qd**3 / 5 + np.cos(3 * t)[..., None]
 
     q, qd, m = np.array([0.5, -0.3]), np.array([0.2, 0.7]), METHODS["gauss6"]
-    sweeps = one_step.step(m, lambda q, qd, t: a(q, qd, np.asarray(t)), q, qd, 0.2, 0.3)
+    extra_iterations = one_step.step(m, lambda q, qd, t: a(q, qd, np.asarray(t)), q, qd, 0.2, 0.3)
     ends, count = one_step.step_by_newton(m, a, q, qd, 0.2, 0.3)
-    assert np.allclose(ends, sweeps, rtol=0, atol=1e-14)
+    assert np.allclose(ends, extra_iterations, rtol=0, atol=1e-14)
     assert 1 < count < 10
 
 
-def test_plain_sweeps_contract_as_the_squares_of_their_weights_do() -> None:
-    """Of an oscillator: h^2 w^2 times the largest eigenvalue of A A, which is 1/12 of gauss4."""
+def test_contraction_rate_of_fixed_point_iteration() -> None:
+    """For an oscillator it is h^2 w^2 times the largest eigenvalue of A A, which is 1/12 for
+    gauss4.
+    """
     slopes = np.array([[-9.0, 0.0]])
     assert one_step.contraction_factor(METHODS["gauss4"], slopes, 0.5) == pytest.approx(9 / 48)
 
 
-def test_states_of_which_one_overflows_have_no_step() -> None:
-    """Sweeps that diverge are not answers of the states that have not overflowed yet."""
+def test_overflow_of_one_state_invalidates_the_step() -> None:
+    """The values of a diverging iteration are no result for the other states either."""
 
     def acceleration(q: Any, qd: Any, t: Any) -> Any:
         return -1e13 * qd
@@ -95,7 +99,7 @@ def test_states_of_which_one_overflows_have_no_step() -> None:
     assert np.all(np.isnan(ends))
 
 
-def test_the_stages_of_one_state_are_asked_for_together() -> None:
+def test_stages_of_one_state_are_evaluated_in_one_call() -> None:
     calls = 0
 
     def a(q: Any, qd: Any, t: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The check compares outputs with formulas in eighty digits, and finds wrong ones."""
+"""The check compares outputs with formulas in eighty digits, and detects errors."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class Wrong:
     ("wrong", "failed"),
     [({}, []), ({"output": 1e-11}, ["outputs"]), ({"C": 1e-7}, ["outputs: C, D"])],
 )
-def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
-    made, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
-    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+def test_wrong_outputs_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
+    system, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
+    comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
     assert [row.name for row in comparison.results] == ["outputs", "outputs: C, D"]
     assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
@@ -103,27 +103,27 @@ linearize = true
         ({"C": 1e-4}, ["outputs: C, D"]),
     ],
 )
-def test_wrong_ones_of_multipliers_fail(
+def test_wrong_outputs_of_multipliers_fail(
     modules: Modules, wrong: dict[str, float], failed: list[str]
 ) -> None:
-    made, module = (
+    system, module = (
         assembled(from_scene(parse(ON_A_ROD, "test.toml"))),
         modules.unoptimised(ON_A_ROD),
     )
-    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
     assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
 
 
 @pytest.mark.slow
-def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
+def test_derivatives_by_parameters_that_jumps_change(modules: Modules) -> None:
     text = ON_A_ROD.replace('"x_dot**2 + y_dot**2"', '"m*(x_dot**2 + y_dot**2)"')
     text = text.replace("[inputs]", "[parameters]\nm = 1.5\n[inputs]").replace(
         "lambda_rod", "m*x*lambda_rod"
     )
     text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
-    made, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
-    comparison = Comparison(made, module, np.random.default_rng(0), None)
+    system, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
+    comparison = Comparison(system, module, np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
     assert [row.passed for row in comparison.results] == [True, True], comparison.results
 
@@ -146,9 +146,9 @@ load = "k*x + x_ddot"
 """
 
 
-def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules) -> None:
-    made, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
-    comparison = Comparison(made, module, np.random.default_rng(0), None)
+def test_output_that_cancels_with_an_acceleration_passes(modules: Modules) -> None:
+    system, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
+    comparison = Comparison(system, module, np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
     assert {row.name: row.passed for row in comparison.results} == {"outputs": True}
 
@@ -157,8 +157,8 @@ def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules)
 def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str, float]) -> None:
     text = CANCELLING.replace('"k*x + x_ddot"', '"k*x**2 + k*x_ddot"\nside = "k*x"')
     text += '[run]\nlinearize = "parameters"\n'
-    made, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
-    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    system, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
+    comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
     checks_inputs_outputs.report_outputs(comparison)
-    found = {row.name: row.passed for row in comparison.results}
-    assert found == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}
+    results = {row.name: row.passed for row in comparison.results}
+    assert results == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}

@@ -1,4 +1,4 @@
-"""Runs of both forms of C are compared as far as there is something to compare."""
+"""Runs of portable and optimised C are compared as far as both can be compared."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ duration = 100.0
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-class Ended:
-    """A run of which the first rows are kept, one number of the last changed by a part of it."""
+class TruncatedRun:
+    """The first rows of a run, with a relative error in one number of the last row."""
 
     def __init__(self, run: Any, rows: int, off: float) -> None:
         self.q, self.qd = run.q[:rows].copy(), run.qd[:rows].copy()
@@ -48,46 +48,46 @@ class Ended:
         return len(self.q)
 
 
-class Plain:
+class TruncatingModule:
     """A module whose runs end early."""
 
     def __init__(self, module: ModuleType, rows: int, off: float = 0.0) -> None:
         self.module, self.rows, self.off = module, rows, off
 
-    def simulate(self, **how: Any) -> Ended:
-        return Ended(self.module.simulate(**how), self.rows, self.off)
+    def simulate(self, **how: Any) -> TruncatedRun:
+        return TruncatedRun(self.module.simulate(**how), self.rows, self.off)
 
 
-def compared(modules: Modules, h: str, rows: int, off: float = 0.0, text: str = QUARTIC) -> Any:
+def run_error(modules: Modules, h: str, rows: int, off: float = 0.0, text: str = QUARTIC) -> Any:
     text = text.replace("H", h)
     module = modules.unoptimised(text)
-    made = Comparison(from_scene(parse(text, "q.toml")), module, np.random.default_rng(0), 4)
+    comparison = Comparison(from_scene(parse(text, "q.toml")), module, np.random.default_rng(0), 4)
     return checks_plain._run_off(
-        made, Plain(module, rows, off), "gauss8", made.expected[0], float(h)
+        comparison, TruncatingModule(module, rows, off), "gauss8", comparison.expected[0], float(h)
     )
 
 
-def test_a_form_that_ends_where_the_step_can_be_made_fails(modules: Modules) -> None:
-    assert compared(modules, "0.1", 25) < 1
-    assert compared(modules, "0.1", 25, 1e-9) > 1e4
+def test_run_that_ends_although_the_step_is_possible_fails(modules: Modules) -> None:
+    assert run_error(modules, "0.1", 25) < 1
+    assert run_error(modules, "0.1", 25, 1e-9) > 1e4
     with pytest.raises(RuntimeError, match="24 steps of the fast form, 4 of plain"):
-        compared(modules, "0.1", 5)
+        run_error(modules, "0.1", 5)
 
 
 @pytest.mark.slow
-def test_no_form_has_to_find_stages_that_nothing_finds_soon(modules: Modules) -> None:
-    """Where the motion turns many times within a step, and is not linear in it."""
-    assert compared(modules, "30.0", 5) < 1
-    off = compared(modules, "30.0", 5, 1e-6)  # by the last step, which rounding may find or not
+def test_stages_without_quick_convergence_are_not_required(modules: Modules) -> None:
+    """The motion oscillates many times within a step, and is not linear."""
+    assert run_error(modules, "30.0", 5) < 1
+    off = run_error(modules, "30.0", 5, 1e-6)  # whether the last step converges depends on rounding
     assert off is None or off < 1
     linear = QUARTIC.replace("2e3*x**4", "0*x**4")
     with pytest.raises(RuntimeError, match="24 steps of the fast form, 4 of plain"):
-        compared(modules, "30.0", 5, text=linear)
-    assert compared(modules, "30.0", 25, 1e-6, linear) > 1e4
+        run_error(modules, "30.0", 5, text=linear)
+    assert run_error(modules, "30.0", 25, 1e-6, linear) > 1e4
 
 
-def test_steps_under_inputs_can_go_on_too() -> None:
-    """Inputs are held over a step, for each of its stages: (..., nu) beside q of (..., nq)."""
+def test_steps_with_inputs_are_continued() -> None:
+    """Inputs are constant over a step, for each of its stages: (..., nu) with q of (..., nq)."""
 
     def acceleration(q: Any, qd: Any, t: Any, u: Any, params: Any) -> Any:
         assert u.shape == (*q.shape[:-1], 1)
@@ -117,23 +117,23 @@ h = 0.02
 
 
 @pytest.mark.slow
-def test_few_sweeps_are_compared_in_steps_so_short_that_they_do(modules: Modules) -> None:
-    """The fast form leaves stages where five sweeps come to, as far as they were to settle."""
+def test_few_iterations_are_compared_with_short_steps(modules: Modules) -> None:
+    """Optimised C stops after five iterations, as accurate as they are in steps of that length."""
     module = modules.unoptimised(FRICTION)
     system = from_scene(parse(FRICTION, "f.toml"))
     plain = eomc.load(system, Path("build/tests/plain_sweeps"), form="plain")
-    made = Comparison(system, module, np.random.default_rng(0), 4)
-    long = checks_plain._run_off(made, plain, "gauss16", made.expected[0], 0.02 / 16)
+    comparison = Comparison(system, module, np.random.default_rng(0), 4)
+    long = checks_plain._run_off(comparison, plain, "gauss16", comparison.expected[0], 0.02 / 16)
     assert long is not None and long > LIMIT
-    least = checks_plain._least_off(made, plain, "gauss16", made.expected[0])
+    least = checks_plain._least_off(comparison, plain, "gauss16", comparison.expected[0])
     assert least is not None and least < LIMIT
-    wrong = Plain(plain, 25, 1e-9)
-    off = checks_plain._least_off(made, wrong, "gauss16", made.expected[0])
+    wrong = TruncatingModule(plain, 25, 1e-9)
+    off = checks_plain._least_off(comparison, wrong, "gauss16", comparison.expected[0])
     assert off is not None and off > LIMIT
 
 
-class Linear:
-    """A module of which one entry of A is off by a part of it."""
+class WrongDerivative:
+    """A module in which one entry of A has a relative error."""
 
     def __init__(self, module: ModuleType, off: float) -> None:
         self.module, self.off = module, off
@@ -150,13 +150,13 @@ class Linear:
 
 
 @pytest.mark.slow
-def test_derivatives_that_cancel_to_nothing_are_compared_in_units_of_their_terms() -> None:
-    """Of a rolling disk no angle's acceleration depends on where it points."""
+def test_cancelling_derivatives_are_compared_relative_to_their_terms() -> None:
+    """The angular accelerations of a rolling disk do not depend on its heading."""
     text = (SCENES / "rolling_disk.toml").read_text().replace("[run]", "[run]\nlinearize = true")
     system = from_scene(parse(text, "disk.toml"))
     plain = eomc.load(system, Path("build/tests/plain_disk"), form="plain")
     fast = eomc.load(system, Path("build/tests/fast_disk"), form="fast")
-    made = Comparison(pipeline.assemble(system), fast, np.random.default_rng(0), 8)
-    assert checks_plain._linearization(made, plain) < LIMIT
+    comparison = Comparison(pipeline.assemble(system), fast, np.random.default_rng(0), 8)
+    assert checks_plain._linearization(comparison, plain) < LIMIT
     for off in (1e-8, 1e-11):
-        assert checks_plain._linearization(made, Linear(plain, off)) > LIMIT
+        assert checks_plain._linearization(comparison, WrongDerivative(plain, off)) > LIMIT

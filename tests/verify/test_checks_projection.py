@@ -1,4 +1,4 @@
-"""Rows about `project`: each of what it is named for, nothing held or something."""
+"""Checks of `project`, with no coordinates fixed and with some fixed."""
 
 from __future__ import annotations
 
@@ -21,48 +21,48 @@ SYSTEM = scene_system("pendulum_xy")
 
 @dataclass
 class Projecting:
-    """The reference's `project`, wrong by a part where as many names are held as are said."""
+    """The reference's `project`, wrong if the number of fixed names is in `wrong`."""
 
     wrong: tuple[int, ...] = ()
-    asked: list[Sequence[str]] = field(default_factory=list)
+    fixed_names: list[Sequence[str]] = field(default_factory=list)
 
     def project(self, q: Any, qd: Any, *, t: float, params: Any, fixed: Sequence[str]) -> Any:
         names = [c.name for c in SYSTEM.coordinates]
-        of = tuple(k for k, name in enumerate(names) if name in fixed)
-        found = np.array(symbolic.reference_for(SYSTEM).project(q, qd, t, params, of))
-        self.asked.append(fixed)
-        free = [k for k in range(len(names)) if k not in of]
-        found[:, free] *= 1 + 1e-9 * (len(fixed) in self.wrong)
-        return found
+        indices = tuple(k for k, name in enumerate(names) if name in fixed)
+        result = np.array(symbolic.reference_for(SYSTEM).project(q, qd, t, params, indices))
+        self.fixed_names.append(fixed)
+        free = [k for k in range(len(names)) if k not in indices]
+        result[:, free] *= 1 + 1e-9 * (len(fixed) in self.wrong)
+        return result
 
 
 def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, CheckResult]:
-    monkeypatch.setattr(ProjectionChecks, "wrong_refusals", lambda _: 0.0)  # which ask a C function
+    monkeypatch.setattr(ProjectionChecks, "wrong_refusals", lambda _: 0.0)  # they call a C function
     random = np.random.default_rng(0)
-    made = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
-    report_projection(made, module, "")
-    return {row.name: row for row in made.results}
+    comparison = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
+    report_projection(comparison, module, "")
+    return {row.name: row for row in comparison.results}
 
 
 @pytest.mark.slow
-def test_states_are_put_back_with_nothing_held_and_with_one_held(
+def test_project_is_checked_without_and_with_fixed_coordinates(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     right = Projecting()
-    found = rows(monkeypatch, right)
-    assert all(row.passed and row.error < 2 for row in found.values())
-    assert {len(held) for held in right.asked} == {0, 2}
+    results = rows(monkeypatch, right)
+    assert all(row.passed and row.error < 2 for row in results.values())
+    assert {len(names) for names in right.fixed_names} == {0, 2}
     for count, fails in ((0, "project"), (2, "project, held")):
-        found = rows(monkeypatch, Projecting((count,)))
-        assert [name for name, row in found.items() if not row.passed] == [fails]
+        results = rows(monkeypatch, Projecting((count,)))
+        assert [name for name, row in results.items() if not row.passed] == [fails]
 
 
-def test_what_is_held_and_moves_all_the_same_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Loose(Projecting):
+def test_change_of_a_fixed_coordinate_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    class ChangesFixed(Projecting):
         def project(self, q: Any, qd: Any, **how: Any) -> Any:
-            found = super().project(q, qd, **how)
-            return found * (1 + 4e-16) if how["fixed"] else found
+            result = super().project(q, qd, **how)
+            return result * (1 + 4e-16) if how["fixed"] else result
 
-    found = rows(monkeypatch, Loose())
-    assert [name for name, row in found.items() if not row.passed] == ["project, held"]
-    assert np.isinf(found["project, held"].error)
+    results = rows(monkeypatch, ChangesFixed())
+    assert [name for name, row in results.items() if not row.passed] == ["project, held"]
+    assert np.isinf(results["project, held"].error)

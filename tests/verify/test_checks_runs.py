@@ -1,4 +1,4 @@
-"""Rows about runs see what only runs at such places compute."""
+"""Checks of runs detect errors that only occur at particular states."""
 
 from __future__ import annotations
 
@@ -21,24 +21,23 @@ from eomc.verify.checks_runs import TURNS, RunChecks, largest_angle
 from eomc.verify.comparison import Comparison
 from eomc.verify.sampling import State
 
-MADE = variant("pendulum_gauss16")
+SYSTEM = variant("pendulum_gauss16")
 STAGE = "x[k] = at[k][j];"
 
 
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum with rk4 and gauss16."""
-    symbolic.reference_for(MADE).acceleration(
-        *np.zeros((2, len(MADE.q)))
-    )  # made once, for all forks
-    return Shipped(MADE, tmp_path_factory.mktemp("runs"))
+    # Derive the reference once for all forked processes.
+    symbolic.reference_for(SYSTEM).acceleration(*np.zeros((2, len(SYSTEM.q))))
+    return Shipped(SYSTEM, tmp_path_factory.mktemp("runs"))
 
 
-def found(shipped: Shipped, source: str, row: Callable[[Comparison], object]) -> float:
-    """The number of a row of a changed source."""
+def evaluate_check(shipped: Shipped, source: str, row: Callable[[Comparison], object]) -> float:
+    """Return the value of a check for changed C."""
 
     def measure() -> float:
-        value = row(Comparison(MADE, shipped.load(), np.random.default_rng(0), 4))
+        value = row(Comparison(SYSTEM, shipped.load(), np.random.default_rng(0), 4))
         assert isinstance(value, float)
         return value if math.isfinite(value) else 1e300
 
@@ -48,8 +47,8 @@ def found(shipped: Shipped, source: str, row: Callable[[Comparison], object]) ->
     return value
 
 
-def test_a_step_that_is_refused_without_need_fails() -> None:
-    """Of a method whose sweeps come to their end on the reference."""
+def test_unnecessary_refusal_of_a_step_fails() -> None:
+    """The iteration of the method converges in the reference."""
     system = scene_system("mass_spring")
     module: Any = StandIn(symbolic.derive(system))
     module.simulate = lambda **how: SimpleNamespace(status="no convergence")
@@ -70,8 +69,8 @@ teeth = "a - 3*b"
 """
 
 
-def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
-    """Of a - 3 b: three turns of a to one of b, off by no more than their last digits."""
+def test_large_angles_satisfy_gear_constraints() -> None:
+    """For a - 3 b, three turns of a for one of b, up to their last digits."""
     system = from_scene(parse(GEARS, "gears.toml"))
     module: Any = StandIn(symbolic.derive(system))
     module._model = None
@@ -82,7 +81,7 @@ def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
             runs.constraints_hold(State(np.array([0.3, 0.1]) + turns * np.array(by), np.zeros(2)))
             == holds
         )
-    for off, holds in ((1e-8, True), (1e-3, False)):  # digits of 2.5e7 are of 4e-9
+    for off, holds in ((1e-8, True), (1e-3, False)):  # digits of 2.5e7 are 4e-9
         q = np.array([0.3, 0.1]) + turns * np.array([3, 1]) + [off, 0]
         assert runs.constraints_hold(State(q, np.zeros(2))) == holds
 
@@ -102,16 +101,16 @@ x = "z"
 
 
 def phase(angle: str, rate: str = "1") -> Any:
-    """A scene with a cosine of that angle."""
+    """Return a scene with the cosine of an angle."""
     return from_scene(parse(PHASE.replace("ANGLE", angle).replace("RATE", rate), "phase.toml"))
 
 
 @pytest.mark.parametrize("angle", ["late", "late**2", "late**3/12", "late**5", "exp(late/10)"])
-def test_angles_are_compared_as_far_as_doubles_hold_them(
+def test_angles_are_compared_up_to_their_rounding(
     monkeypatch: pytest.MonkeyPatch, angle: str
 ) -> None:
-    """A time that is off by its last digit is none of the module's faults; by 1e-9 it is one."""
-    monkeypatch.setattr(RunChecks, "far_steps", lambda *_: 0.0)  # which are the C's own
+    """A rounding error of the time is not an error of the module; 1e-9 is one."""
+    monkeypatch.setattr(RunChecks, "far_steps", lambda *_: 0.0)  # those depend on the C code
     for rate, fails in (("(1 + 2**-52)", False), ("(1 + 1e-9)", True)):
         module: Any = StandIn(symbolic.derive(phase(angle, rate)))
         module._model = None
@@ -120,11 +119,11 @@ def test_angles_are_compared_as_far_as_doubles_hold_them(
         assert (runs.far_angle_error() > runs.limit) == fails
 
 
-def test_the_largest_angle_is_that_of_all_formulas() -> None:
+def test_largest_angle_covers_all_formulas() -> None:
     at = State(np.array([2.0]), np.array([0.5]), 3.0)
     assert largest_angle(phase("late**3"))(at) == 27
     assert largest_angle(phase("late*x - 7*x_dot*sin(100*late)"))(at) == pytest.approx(300)
-    assert largest_angle(phase("dot(late)*1e9"))(at) == 0  # a rate is no part of it
+    assert largest_angle(phase("dot(late)*1e9"))(at) == 0  # a rate is not part of it
 
 
 THROWN = """eomc = 1
@@ -141,7 +140,7 @@ a = "u - 5e4*a_dot"
 """
 
 
-def test_inputs_are_compared_as_long_as_steps_do_not_throw_the_state_out() -> None:
+def test_inputs_are_compared_while_steps_are_stable() -> None:
     """A step of h times -5e4/s multiplies a velocity by 2.4e5."""
     system = from_scene(parse(THROWN, "thrown.toml"))
     module: Any = StandIn(symbolic.derive(system))
@@ -156,18 +155,24 @@ def test_inputs_are_compared_as_long_as_steps_do_not_throw_the_state_out() -> No
 
 
 @pytest.mark.slow
-def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) -> None:
-    """There stages of gauss16 are computed one by one, which stands last in its sweep."""
+def test_steps_of_every_method_are_compared_at_large_angles(shipped: Shipped) -> None:
+    """There gauss16 evaluates stages one by one, in the code at the end of its iteration."""
     assert shipped.source.count(STAGE) == 1
     wrong = shipped.source.replace(STAGE, STAGE.replace("= at", "= -at"))
-    assert found(shipped, shipped.source, lambda check: RunChecks(check).far_angle_error()) < 10
-    assert found(shipped, wrong, lambda check: RunChecks(check).far_angle_error()) > RunChecks.limit
+    assert (
+        evaluate_check(shipped, shipped.source, lambda check: RunChecks(check).far_angle_error())
+        < 10
+    )
+    assert (
+        evaluate_check(shipped, wrong, lambda check: RunChecks(check).far_angle_error())
+        > RunChecks.limit
+    )
 
 
 @pytest.mark.slow
-def test_a_stepper_that_refuses_what_it_could_do_fails(shipped: Shipped) -> None:
+def test_method_that_refuses_possible_steps_fails(shipped: Shipped) -> None:
     right, wrong = "double most = 0, change = 0, size;", "double most = 0, change = 1, size;"
     assert shipped.source.count(right) == 1
-    assert found(shipped, shipped.source, lambda check: check.step_error("gauss16")) < 10
+    assert evaluate_check(shipped, shipped.source, lambda check: check.step_error("gauss16")) < 10
     refusing = shipped.source.replace(right, wrong)
-    assert found(shipped, refusing, lambda check: check.step_error("gauss16")) == 1e300
+    assert evaluate_check(shipped, refusing, lambda check: check.step_error("gauss16")) == 1e300

@@ -1,4 +1,4 @@
-"""Sines and cosines where they all but vanish: a reduction that is off by 1e-17 shows there."""
+"""Sines and cosines near their zeros, where an error of 1e-17 in the angle reduction shows."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from eomc.verify.comparison import Comparison
 from eomc.verify.report import Measurement
 
 
-class Bent:
-    """A module whose D is another."""
+class ModuleWithChangedD:
+    """A module whose D is changed by a function."""
 
     def __init__(self, module: Any, bend: Callable[[np.ndarray, float], np.ndarray]) -> None:
         self.module, self.bend = module, bend
@@ -48,41 +48,43 @@ def noisy(D: np.ndarray, theta: float) -> np.ndarray:
 @pytest.mark.parametrize(
     "bend, wrong", [(lambda D, _: D, False), (shifted, True), (stretched, True), (noisy, False)]
 )
-def test_an_entry_that_is_one_cosine_is_judged_by_itself(
+def test_entry_that_is_a_cosine_is_judged_separately(
     modules: Modules, bend: Callable[[np.ndarray, float], np.ndarray], wrong: bool
 ) -> None:
-    """Noise of a sum that cancels is none of the sine's."""
-    module = Bent(modules("cartpole"), bend)
-    found = largest_error_near_zeros(
+    """Rounding errors of a cancelling sum are not errors of the sine."""
+    module = ModuleWithChangedD(modules("cartpole"), bend)
+    error = largest_error_near_zeros(
         Comparison(scene_system("cartpole"), module, np.random.default_rng(0), 4)
     )
-    assert isinstance(found, float)
+    assert isinstance(error, float)
     assert (
-        found > 1e6 * VANISHING_LIMIT
+        error > 1e6 * VANISHING_LIMIT
         if wrong and bend is shifted
-        else (found > VANISHING_LIMIT) == wrong
+        else (error > VANISHING_LIMIT) == wrong
     )
 
 
 @pytest.mark.parametrize(
     "size, near, judged", [(1e-17, 0, False), (1e-9, 1, False), (1e-9, 0, True)]
 )
-def test_what_is_left_of_a_sum_that_cancels_is_no_cosine(
+def test_remainder_of_a_cancelling_sum_is_not_a_cosine(
     modules: Modules, size: float, near: float, judged: bool
 ) -> None:
-    """The reference's g[0] is 0, and here so little times cos(theta); or so far out alone."""
+    """g[0] of the reference is 0, and here a small multiple of cos(theta); or only at large
+    angles.
+    """
     check = Comparison(scene_system("cartpole"), modules("cartpole"), np.random.default_rng(0), 4)
     right = check.reference.evaluate
 
     def evaluate(name: str, q: Any, *rest: Any) -> Any:
-        found = np.array(right(name, q, *rest))
+        values = np.array(right(name, q, *rest))
         if name == "g":
-            found[..., 0] += size * np.cos(q[..., 1]) + near * (np.abs(q[..., 1]) < 100)
-        return found
+            values[..., 0] += size * np.cos(q[..., 1]) + near * (np.abs(q[..., 1]) < 100)
+        return values
 
     check.reference = SimpleNamespace(evaluate=evaluate)  # type: ignore[assignment]
-    found = largest_error_near_zeros(check)
-    assert isinstance(found, float) and (found > VANISHING_LIMIT) == judged
+    error = largest_error_near_zeros(check)
+    assert isinstance(error, float) and (error > VANISHING_LIMIT) == judged
 
 
 FIVE_BAR = (
@@ -130,20 +132,20 @@ points = [["b", 0], ["e", 0]]
 
 
 @pytest.mark.slow
-def test_differences_of_angles_are_no_sines(tmp_path: Path) -> None:
-    """What q2 - q1 rounds far out is the same at neighbours, and now and then with others moved."""
+def test_sines_of_angle_differences_are_not_judged(tmp_path: Path) -> None:
+    """The rounding of a large q2 - q1 is equal at neighbours, and differs when others change."""
     (tmp_path / "five_bar.toml").write_text(FIVE_BAR, encoding="utf-8")
-    made = eomc.read(tmp_path / "five_bar.toml")
-    module = eomc.load(made, tmp_path / "build")
-    found = [
-        largest_error_near_zeros(Comparison(made, module, np.random.default_rng(k), 4))
+    system = eomc.read(tmp_path / "five_bar.toml")
+    module = eomc.load(system, tmp_path / "build")
+    errors = [
+        largest_error_near_zeros(Comparison(system, module, np.random.default_rng(k), 4))
         for k in range(12)
     ]
-    assert all(isinstance(x, float) and x <= VANISHING_LIMIT for x in found), found
+    assert all(isinstance(x, float) and x <= VANISHING_LIMIT for x in errors), errors
 
 
 @pytest.mark.slow
-def test_where_no_entry_is_a_sine_alone_nothing_is_judged(modules: Modules) -> None:
-    made = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
-    found = largest_error_near_zeros(made)
-    assert isinstance(found, Measurement) and found.why
+def test_nothing_is_judged_without_an_entry_that_is_a_sine(modules: Modules) -> None:
+    comparison = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
+    measurement = largest_error_near_zeros(comparison)
+    assert isinstance(measurement, Measurement) and measurement.why

@@ -1,4 +1,4 @@
-"""The rows of `eomc check` about events in fixed steps notice what is wrong."""
+"""Checks of events with fixed steps detect errors."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def swing(modules: Modules) -> ModuleType:
     return modules.unoptimised(SWING)
 
 
-class Bent:
-    """A module whose runs are changed on their way out."""
+class ModuleWithChangedRuns:
+    """A module whose runs are changed before they are returned."""
 
     def __init__(self, module: Any, change: Any) -> None:
         self.module, self.change = module, change
@@ -57,38 +57,38 @@ class Bent:
         return run
 
 
-def lost(run: Any) -> None:
-    """One event is not told."""
+def without_one_event(run: Any) -> None:
+    """Remove one event from the results."""
     which, rows = run.event_data
     run.event_data = which[which != 0], rows[which != 0]
 
 
 def late(run: Any) -> None:
-    """The state at each event is that of a moment later."""
+    """Replace the state at each event by that of a moment later."""
     which, rows = run.event_data
     run.event_data = which, rows + np.array([0, 1e-9, 0])
 
 
-def aside(run: Any) -> None:
-    """A row is beside the motion."""
+def perturbed_row(run: Any) -> None:
+    """Perturb one row."""
     run._rows[1][len(run) // 2] += 1e-9
 
 
-def row(module: Any) -> Any:
-    made = Comparison(SWING, module, np.random.default_rng(0), 4, None)
-    checks_events.report_fixed_steps(made)
-    (found,) = made.results
-    assert found.name == "events in steps of rk4" and not module._model.integrator.ignores_events
-    return found
+def check_events(module: Any) -> Any:
+    comparison = Comparison(SWING, module, np.random.default_rng(0), 4, None)
+    checks_events.report_fixed_steps(comparison)
+    (result,) = comparison.results
+    assert result.name == "events in steps of rk4" and not module._model.integrator.ignores_events
+    return result
 
 
-def test_a_right_module_passes(swing: ModuleType) -> None:
+def test_correct_module_passes(swing: ModuleType) -> None:
     check(SWING, swing, states=4)
-    assert swing.simulate(h=0.05, duration=2.0).events["wall"]  # as before
-    found = row(swing)
-    assert found.passed and found.judged and found.error < 10
+    assert swing.simulate(h=0.05, duration=2.0).events["wall"]  # confirms that there are events
+    result = check_events(swing)
+    assert result.passed and result.judged and result.error < 10
 
 
-@pytest.mark.parametrize("change", [lost, late, aside])
-def test_a_wrong_one_fails(swing: ModuleType, change: Any) -> None:
-    assert not row(Bent(swing, change)).passed
+@pytest.mark.parametrize("change", [without_one_event, late, perturbed_row])
+def test_wrong_module_fails(swing: ModuleType, change: Any) -> None:
+    assert not check_events(ModuleWithChangedRuns(swing, change)).passed

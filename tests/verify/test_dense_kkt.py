@@ -1,4 +1,4 @@
-"""The reference of systems with constraints is compared with trusted answers."""
+"""The reference of constrained systems is compared with independent references."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def answers(name: str) -> list[ReferenceModel]:
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, *PLANE))
-def test_accelerations_and_multipliers_at_trusted_states(name: str) -> None:
+def test_accelerations_and_multipliers_at_reference_states(name: str) -> None:
     q, qd, a, multipliers = constrained.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
     t_end = float(constrained.cases()[name]["t_end"])
     for answer in answers(name):
@@ -43,32 +43,34 @@ def test_accelerations_and_multipliers_at_trusted_states(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
-def test_two_ways_to_the_rows_agree(name: str) -> None:
-    """Written out, and by Taylor arithmetic; and all states at once as one by one."""
+def test_both_evaluations_of_constraints_agree(name: str) -> None:
+    """Compare written-out equations with Taylor arithmetic, and all states at once with single
+    states.
+    """
     taylor, plain = answers(name)
     q0, qd0 = constrained.ends(name, "q0", "qd0")
     random = np.random.default_rng(3)
     q, qd = q0 + random.normal(size=(5, len(q0))) / 5, qd0 + random.normal(size=(5, len(q0)))
     times = random.uniform(0, 3, 5)
     for what in ("constraints", "constraint_jacobian", "constraint_rates", "gamma"):
-        found = taylor.evaluate(what, q, qd, times)
+        computed = taylor.evaluate(what, q, qd, times)
         expected = plain.evaluate(what, q, qd, times)
         size = np.max(np.abs(expected)) + 1
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * size)
+        np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-14 * size)
         one = plain.evaluate(what, q[2], qd[2], times[2])
         np.testing.assert_array_equal(expected[2], one)
 
 
 @pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
-def test_rows_are_each_other_s_derivatives(name: str) -> None:
-    """A, rates and gamma beside differences along a line in time."""
+def test_constraint_rates_are_derivatives(name: str) -> None:
+    """Compare A, rates and gamma with differences along a line in time."""
     answer = TaylorReference(constrained.system(name))
     q, qd = constrained.ends(name, "q0", "qd0")
     q = q + 0.1 * np.cos(np.arange(len(q)))
     qd = qd + np.sin(np.arange(len(q)))
     qdd, h = np.cos(3.0 * np.arange(len(q))), 1e-4
 
-    def along(what: str, s: float) -> np.ndarray:
+    def value_at(what: str, s: float) -> np.ndarray:
         return answer.evaluate(what, q + s * qd + s**2 * qdd / 2, qd + s * qdd, 0.7 + s)
 
     n = len(constrained.cases()[name]["constraints"])
@@ -76,14 +78,14 @@ def test_rows_are_each_other_s_derivatives(name: str) -> None:
         answer.evaluate(x, q, qd, 0.7) for x in ("constraint_jacobian", "constraint_rates", "gamma")
     )
     size = np.max(np.abs(A)) * (np.max(np.abs(qd)) + np.max(np.abs(qdd)))
-    slope = (along("constraints", h) - along("constraints", -h))[:n] / (2 * h)
+    slope = (value_at("constraints", h) - value_at("constraints", -h))[:n] / (2 * h)
     np.testing.assert_allclose(rates[:n], slope, atol=1e-6 * size)
-    bend = (along("constraint_rates", h) - along("constraint_rates", -h)) / (2 * h)
+    bend = (value_at("constraint_rates", h) - value_at("constraint_rates", -h)) / (2 * h)
     np.testing.assert_allclose(A @ qdd + gamma, bend, atol=1e-6 * size)
 
 
 @pytest.mark.parametrize("name", tiers(RUNS, "chaplygin_sleigh"))
-def test_projected_rk4_makes_the_errors_that_an_independent_one_made(name: str) -> None:
+def test_error_of_projected_rk4_is_that_of_an_independent_one(name: str) -> None:
     measured = constrained.cases()[name]["rk4_measured"][0]
     answer = symbolic.reference_for(constrained.system(name))
     steps = measured["steps"]
@@ -98,16 +100,18 @@ def test_projected_rk4_makes_the_errors_that_an_independent_one_made(name: str) 
 
 
 def double_pendulum() -> System:
-    """On a table; its second row says what its first says."""
+    """Return a pendulum on a table, whose second constraint repeats the first."""
     x, y, m = (symbol(name) for name in ("x", "y", "m"))
     rates = symbol("x_dot") ** 2 + symbol("y_dot") ** 2
-    made = System.make("twice", {x: 1.0, y: 0.0}, m * rates / 2, parameters={m: 2.0})
+    system = System.make("twice", {x: 1.0, y: 0.0}, m * rates / 2, parameters={m: 2.0})
     rod = x**2 + y**2 - 1
-    return replace(made, constraints=(Constraint("rod", rod), Constraint("again", 3 * rod)))
+    return replace(system, constraints=(Constraint("rod", rod), Constraint("again", 3 * rod)))
 
 
-def test_a_row_that_says_what_another_says_shares_its_force() -> None:
-    """The least multipliers, each row scaled; the accelerations are those of one row."""
+def test_repeated_constraint_shares_the_force() -> None:
+    """The multipliers have minimum norm, with scaled constraints; accelerations are those of
+    one.
+    """
     answer = symbolic.derive(double_pendulum())
     q, qd = [0.6, 0.8], [-1.6, 1.2]
     np.testing.assert_allclose(answer.acceleration(q, qd), [-2.4, -3.2], rtol=1e-14)
@@ -116,40 +120,40 @@ def test_a_row_that_says_what_another_says_shares_its_force() -> None:
     assert first + 3 * again == pytest.approx(-4)
 
 
-def test_a_row_without_inertia_beside_it_is_solved_for() -> None:
+def test_massless_coordinate_is_solved_from_its_constraint() -> None:
     x, s = symbol("x"), symbol("s")
-    made = System.make("massless", {x: 0.0, s: 0.0}, symbol("x_dot") ** 2, 9.81 * x)
-    held = replace(made, constraints=(Constraint("drive", s - x - sympy.sin(t)),))
-    answer = symbolic.derive(held)
-    found = answer.acceleration([0.2, 0.2 + np.sin(0.5)], [0.0, np.cos(0.5)], 0.5)
-    np.testing.assert_allclose(found, [-9.81 / 2, -9.81 / 2 - np.sin(0.5)], rtol=1e-14)
+    system = System.make("massless", {x: 0.0, s: 0.0}, symbol("x_dot") ** 2, 9.81 * x)
+    constrained_system = replace(system, constraints=(Constraint("drive", s - x - sympy.sin(t)),))
+    answer = symbolic.derive(constrained_system)
+    computed = answer.acceleration([0.2, 0.2 + np.sin(0.5)], [0.0, np.cos(0.5)], 0.5)
+    np.testing.assert_allclose(computed, [-9.81 / 2, -9.81 / 2 - np.sin(0.5)], rtol=1e-14)
     assert answer.multipliers([0.2, 0.2], [0.0, 0.0])[0] == pytest.approx(0, abs=1e-12)
 
 
-def test_project_finds_the_nearest_state_of_many() -> None:
+def test_project_returns_the_nearest_of_many_states() -> None:
     answer = symbolic.derive(double_pendulum())
     q, qd = answer.project([[1.2, 0.0], [0.3, -0.4]], [[0.1, 2.0], [1.0, 1.0]])
     np.testing.assert_allclose(q, [[1, 0], [0.6, -0.8]], atol=1e-15)
     np.testing.assert_allclose(qd, [[0, 2], [1.12, 0.84]], atol=1e-15)
 
 
-def test_what_can_not_be_put_onto_its_rows_is_nan() -> None:
-    made = double_pendulum()
+def test_failed_projection_is_nan() -> None:
+    system = double_pendulum()
     x = symbol("x")
-    torn = replace(made, constraints=(Constraint("one", x - 1), Constraint("two", x - 2)))
+    torn = replace(system, constraints=(Constraint("one", x - 1), Constraint("two", x - 2)))
     q, _ = symbolic.derive(torn).project([0.0, 0.0], [0.0, 0.0])
     assert np.all(np.isnan(q))
 
 
-def test_rows_of_rates_are_linear_in_them() -> None:
-    made = double_pendulum()
+def test_velocity_constraints_must_be_linear() -> None:
+    system = double_pendulum()
     bad = (Constraint("speed", symbol("x_dot") ** 2 - 1, holonomic=False),)
     for answer in (symbolic.derive, TaylorReference):
         with pytest.raises(EomcError, match="speed is not linear in the rates"):
-            answer(replace(made, constraints=bad))
+            answer(replace(system, constraints=bad))
 
 
-def test_scales_make_rows_and_coordinates_alike() -> None:
+def test_scales_make_constraints_and_coordinates_comparable() -> None:
     D, A = np.diag([1e-6, 1e6]), np.array([[1e-3, 1e3], [2.0, 0.0]])
     s = kkt.scales(D, A)
     B = s[2:, None] * A * s[:2]
@@ -159,28 +163,30 @@ def test_scales_make_rows_and_coordinates_alike() -> None:
     np.testing.assert_allclose(D @ x - A.T @ multipliers, [1.0, 2.0], rtol=1e-9)
 
 
-def test_a_row_of_rates_moves_no_position() -> None:
-    """Where it points is not where it may be: a position is put onto rows of positions alone."""
+def test_velocity_constraints_do_not_change_positions() -> None:
+    """Positions are projected onto position constraints only."""
     xd, yd, zd = (symbol(f"{n}_dot") for n in "xyz")
     rows = {"line": symbol("y") - 2 * symbol("x"), "blade": zd - symbol("y") * xd}
-    made = System.make("mixed", ["x", "y", "z"], (xd**2 + yd**2 + zd**2) / 2, constraints=rows)
-    for answer in (TaylorReference(made), symbolic.derive(made)):
+    system = System.make("mixed", ["x", "y", "z"], (xd**2 + yd**2 + zd**2) / 2, constraints=rows)
+    for answer in (TaylorReference(system), symbolic.derive(system)):
         q, qd = answer.project(np.array([1.0, 1.0, 5.0]), np.array([1.0, 1.0, 0.0]))
         np.testing.assert_allclose(q, [0.6, 1.2, 5.0], rtol=1e-15)
         np.testing.assert_allclose([qd[1] - 2 * qd[0], qd[2] - 1.2 * qd[0]], 0, atol=1e-15)
 
 
-def test_many_states_are_corrected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each as it is alone, also where others take longer or never get there."""
+def test_states_are_corrected_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each result is that of a single state, also if others need more iterations or fail."""
     answer = TaylorReference(double_pendulum())
     q = np.array([[1.001, 0.0], [0.7, -0.7], [np.nan, 0.0], [0.6, -0.8]])
     qd = np.array([[0.1, 2.0], [1.0, 1.0], [0.0, 1.0], [0.8, 0.6]])
-    asked: list[object] = []
+    calls: list[object] = []
     ask = answer.value
-    monkeypatch.setattr(answer, "value", lambda *given: asked.append(given) or ask(*given))
-    alone = [answer.corrected(*state, 0.0) for state in zip(q, qd, strict=True)]
-    apart = len(asked)
-    found = answer.corrected(q, qd, np.zeros(4))
-    np.testing.assert_allclose(found, np.moveaxis(alone, 0, 1), rtol=1e-15, atol=1e-15)
-    assert np.isnan(found[0][2]).all() and np.isfinite(np.delete(found, 2, 1)).all()
-    assert len(asked) - apart < 0.8 * apart
+    monkeypatch.setattr(
+        answer, "value", lambda *arguments: calls.append(arguments) or ask(*arguments)
+    )
+    single = [answer.corrected(*state, 0.0) for state in zip(q, qd, strict=True)]
+    single_calls = len(calls)
+    corrected = answer.corrected(q, qd, np.zeros(4))
+    np.testing.assert_allclose(corrected, np.moveaxis(single, 0, 1), rtol=1e-15, atol=1e-15)
+    assert np.isnan(corrected[0][2]).all() and np.isfinite(np.delete(corrected, 2, 1)).all()
+    assert len(calls) - single_calls < 0.8 * single_calls

@@ -1,4 +1,4 @@
-"""`check` of linkages that pass positions where their rows depend on each other."""
+"""`check` of linkages that pass positions with dependent constraints."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ mass = 1.5
 center = ["d/2", 0]
 inertia = "d**2/8"
 """
-PLACES = {1: 0.0, 3: 1.0, 4: 0.5}  # of cranks, in parts of the coupler
+PLACES = {1: 0.0, 3: 1.0, 4: 0.5}  # of cranks, in fractions of the coupler
 
 
 def parallelogram(cranks: tuple[int, ...], start: float, rate: float) -> str:
-    """Cranks of one length on one coupler, which goes flat where they do."""
+    """Return cranks of equal length on one coupler, which all become collinear together."""
     how = {k: f"start = {start}, {f'rate = {rate}' if k == 1 else 'guess = true'}" for k in cranks}
     return "\n".join(
         [
@@ -71,18 +71,18 @@ RESTS, TURNS = ((1, 3, 4), 0.3, 0.0), ((1, 3), 0.5, 6.0)
 
 
 @cache
-def system(*of: object) -> System:
-    return assembled(from_scene(parse(parallelogram(*of), "parallelogram.toml")))
+def system(*parameters: object) -> System:
+    return assembled(from_scene(parse(parallelogram(*parameters), "parallelogram.toml")))
 
 
-def comparison(modules: Modules, *of: object, seed: int = 0) -> Comparison:
-    made: ModuleType = modules.unoptimised(parallelogram(*of))
-    return Comparison(system(*of), made, np.random.default_rng(seed), None)
+def comparison(modules: Modules, *parameters: object, seed: int = 0) -> Comparison:
+    module: ModuleType = modules.unoptimised(parallelogram(*parameters))
+    return Comparison(system(*parameters), module, np.random.default_rng(seed), None)
 
 
 @pytest.mark.slow
-def test_an_advised_step_is_tried_from_starts_on_the_rows(modules: Modules) -> None:
-    """Near the flat position: a start moved off the rows by 1e-6 has none on them near."""
+def test_advised_step_is_tried_from_consistent_states(modules: Modules) -> None:
+    """Near the singular position no state near a start moved by 1e-6 satisfies the constraints."""
     advice = comparison(modules, *TURNS).advice
     x, v = -5e-6, -3.6
     advice.stiffest_state = replace(advice.start, q=np.array([x, x, 0]), qd=np.array([v, v, 0]))
@@ -91,30 +91,35 @@ def test_an_advised_step_is_tried_from_starts_on_the_rows(modules: Modules) -> N
 
 
 @pytest.mark.slow
-def test_states_are_as_fast_as_the_motion(modules: Modules) -> None:
-    """A turned start is assembled: a step's correction would throw it, to 70 rad/s."""
+def test_sampled_velocities_are_those_of_the_motion(modules: Modules) -> None:
+    """A rotated start is assembled; a step's correction would accelerate it to 70 rad/s."""
     assert comparison(modules, *TURNS).sampler.speed.max() < 12
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("of", "seed"), [(TURNS, 1), (RESTS, 0)])
-def test_roundings_that_grow_where_rows_fade_are_no_errors(
+def test_rounding_amplified_near_singular_positions_is_no_error(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:
-    made = comparison(modules, *of, seed=seed)
-    runs, rows = RunChecks(made), ConstraintChecks(made, made.module)
-    for found, limit in (
+    linkage_comparison = comparison(modules, *of, seed=seed)
+    runs, rows = (
+        RunChecks(linkage_comparison),
+        ConstraintChecks(linkage_comparison, linkage_comparison.module),
+    )
+    for error, limit in (
         (runs.short_step_error(), SHORT_LIMIT), (runs.long_step_error(), runs.limit),
         (rows.residual_along_run("rk4"), MAX_RESIDUAL),
     ):  # fmt: skip
-        assert isinstance(found, float) and found <= limit
-    runs.sine_error()  # which draws before it
+        assert isinstance(error, float) and error <= limit
+    runs.sine_error()  # advances the random numbers
     assert runs.far_angle_error() <= runs.limit
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("of", [RESTS, TURNS, ((1, 3), 0.05, -3.0), ((1, 3, 4), 0.5, 6.0)])
 @pytest.mark.parametrize("seed", range(3))
-def test_parallelograms_pass(of: tuple[object, ...], seed: int, modules: Modules) -> None:
+def test_check_of_parallelograms_passes(
+    of: tuple[object, ...], seed: int, modules: Modules
+) -> None:
     report = check(system(*of), modules.unoptimised(parallelogram(*of)), seed=seed)
     assert report.passed, report.table()

@@ -1,4 +1,4 @@
-"""`eomc check` executes every line of the C that it ships: gcov counts them."""
+"""`eomc check` executes every line of the generated C, as counted by gcov."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from compilers import compiled, run
 from conftest import needs
 from instrument import missed, unexecuted
 
-# other lines under [run], and scenes to have them
+# other lines under [run], and the scenes that get them
 VARIANTS = {
     "dp8": ("cartpole_driven", 'method = ["rk4", "dp8"]'),
     "batch": ("cartpole", 'batch = true\nmethod = ["rk4", "dp8"]'),
@@ -22,8 +22,8 @@ VARIANTS = {
     "linearize": ("cartpole_driven", 'linearize = "parameters"'),
 }
 
-# b has no inertia where a is beyond 2 rad, which a run that leaves b alone comes to smoothly; z is
-# free, so that it can leave the finite numbers at the end of a step
+# b has no inertia if a is beyond 2 rad, which a run with b at rest reaches smoothly; z is free, so
+# that it can overflow at the end of a step.
 GENTLE = """eomc = 1
 name = "gentle"
 [coordinates]
@@ -41,7 +41,7 @@ method = ["rk4", "gauss16"]
 h = 0.01
 """
 
-# lines that nothing reaches, by scene, and why
+# lines that no check reaches, by scene, with the reason
 UNREACHABLE = {
     "bricard": (
         r"return BRICARD_SINGULAR;",
@@ -57,9 +57,9 @@ UNREACHABLE = {
     ),
 }
 
-# of adaptive steps: what only stiff motion comes to on its way, as in
-# tests/runtime/test_adaptive_stiff.py; sweeps and differences that fail where the accelerations
-# do not; what only a program in C asks for, a run without a memory
+# Lines of adaptive steps that are executed elsewhere: in stiff motion only, as in
+# tests/runtime/test_adaptive_stiff.py; iterations and differences that fail where the accelerations
+# do not; runs without a workspace, which only C programs start.
 ADAPTIVE = re.compile(
     r"x->(stiff_votes|stiff) .*|memory->evaluations \+= 2\*NQ \+ 1;|newton = .*|if \(newton\)"
     r"|continue;|return 1;|return \w+_NOT_FINITE;|row\[k\] = k;|memset\(&own.*|memory = &own;"
@@ -73,27 +73,30 @@ def text_of(name: str, more: str = "") -> str:
 
 
 def unexplained(name: str, text: str, folder: Path) -> list[str]:
-    """The lines that the check of a scene leaves out, without those that nothing reaches."""
+    """Return the lines that the check of a scene does not execute, without known unreachable
+    ones.
+    """
     needs("gcov")
     _, lines = missed(text, folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     excused, _ = UNREACHABLE.get(name, ("(?!)", ""))
     left = [(number, line) for number, line in lines if not re.fullmatch(excused, line)]
-    left = [(n, line) for n, line in left if n not in behind_steps(name, source)]
-    # a batch without instances, which only a program in C asks for: tests/c/test_batch_source.py
+    left = [(n, line) for n, line in left if n not in lines_after_constrained_steps(name, source)]
+    # A batch without instances, which only C programs run: tests/c/test_batch_source.py.
     empty = {n + 1 for n, line in enumerate(source.splitlines(), 1) if "if (count <= 0)" in line}
     left = [(n, line) for n, line in left if n not in empty]
-    # steps towards a singular place, and too long for sweeps: tests/runtime/test_adaptive*.py
+    # Steps towards a singular position, and too long for the iteration:
+    # tests/runtime/test_adaptive*.py.
     ends = ("if (!cut && 16*h <=", "fifth*fifth*change >", "if (memory->max_evaluations &&")
-    # the nearest position, at a position where the same matrix has been regular before
+    # The projection at a position where the same matrix has been regular before.
     ends += (f"if (!{name}_least_change(d, D, A, residual, fixed, HOLONOMIC))\n",)
-    # the iteration for it diverges, and the projection stands: tests/emit/test_projection.py
+    # The projection's iteration diverges and is kept: tests/emit/test_projection.py.
     ends += ("if (64*part < 1)",)
     text = source.splitlines(keepends=True)
     refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
     fallback = {n for n, x in enumerate(text, 1) if x.strip() == "at[i] = on[i];"}
     refused |= fallback | {n - 1 for n in fallback}
-    # behind the status of a limit of evaluations: tests/runtime/test_batch_adaptive.py
+    # After the status of a limit of evaluations: tests/runtime/test_batch_adaptive.py.
     refused |= {n + 1 for n in refused if "TOO_LONG" in text[n - 1]}
     left = [(n, line) for n, line in left if n not in refused]
     if "_adaptive_state;" in source:
@@ -103,26 +106,26 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     return [f"{number}: {line}" for number, line in left]
 
 
-def behind_steps(name: str, source: str) -> set[int]:
-    """What refuses the end of a step under constraints, counts singular positions, judges these.
+def lines_after_constrained_steps(name: str, source: str) -> set[int]:
+    """Return lines that refuse the end of a constrained step, or count and judge singular
+    positions.
 
-    Where a step is lost, or its derivatives, its stages nearly always are before; these linkages
-    have no singular positions on their way. Nor do they lie near zero, where positions are
-    assembled to rounding.
-    tests/runtime/test_constrained_runs.py has others that do.
+    If a step or its derivatives fail, its stages nearly always fail earlier; these linkages have no
+    singular positions on their way. Nor are they near zero, where positions are assembled to
+    rounding. tests/runtime/test_constrained_runs.py has others that execute these lines.
     """
-    found: set[int] = set()
+    numbers: set[int] = set()
     within = judges = rounds = False
     for number, line in enumerate(source.splitlines(), start=1):
         judges |= bool(
             re.match(rf"\S.*\b{name}_rate_terms\w*\(|\s+if \(!far && \*singular\)", line)
         )
         if judges:
-            found.add(number)
+            numbers.add(number)
             judges = line not in ("}", " " * 8 + "}")
         rounds = (rounds or "if (pass && 2*off > before)" in line) and line != " " * 8 + "}"
         if rounds:
-            found.add(number)
+            numbers.add(number)
         within = (
             within
             or bool(
@@ -134,25 +137,25 @@ def behind_steps(name: str, source: str) -> set[int]:
         ) and line != "}"
         refuses = within and re.search("return|break", line) and "OK" not in line
         if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):
-            found.add(number)
-    return found
+            numbers.add(number)
+    return numbers
 
 
 def never_singular(name: str, source: str) -> bool:
-    """Whether D is decided by the parameters alone: the function of a state returns 1."""
+    """Return True if D depends on parameters only: the function of a state returns 1."""
     solve = re.findall(rf"int {name}_solve(?:_at)?\([^;{{]*\)\n{{.*?\n}}", source, re.DOTALL)
     return bool(solve) and solve[0].rstrip().endswith("return 1;\n}")
 
 
 def after_solve(name: str, source: str) -> set[int]:
-    """The lines behind the question whether that function has returned 0."""
-    found: set[int] = set()
+    """Return the lines that follow a check whether that function returned 0."""
+    numbers: set[int] = set()
     lines = source.splitlines()
     for number, line in enumerate(lines, start=1):
         if re.search(rf"if \(!{name}_(solve|rates|rk4)\w*\(", line):
             end = next(k for k in range(number, len(lines) + 1) if "SINGULAR" in lines[k - 1])
-            found |= {end, end + 1} if "break;" in lines[end] else {end}
-    return found
+            numbers |= {end, end + 1} if "break;" in lines[end] else {end}
+    return numbers
 
 
 @pytest.mark.slow
@@ -182,7 +185,7 @@ PROGRAM = """int main(int count, char **words)
 """
 
 
-def test_gcov_tells_which_lines_were_not_executed(tmp_path: Path) -> None:
+def test_gcov_reports_lines_that_were_not_executed(tmp_path: Path) -> None:
     needs("gcov")
     (tmp_path / "scene.c").write_text(PROGRAM, encoding="utf-8")
     compiled("gcc", "-O0", "--coverage", "-c", "scene.c", "-o", "scene.o", cwd=tmp_path)
@@ -192,10 +195,10 @@ def test_gcov_tells_which_lines_were_not_executed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lines_that_are_not_executed_are_found(
+def test_lines_that_were_not_executed_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the rows about refusals, these are left out; those about properties say nothing."""
+    """Without the compiled checks, lines about refusals are not executed."""
     import instrument
 
     needs("gcov")

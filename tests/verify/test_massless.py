@@ -1,4 +1,4 @@
-"""Coordinates without inertia of their own, which constraints give them: built, run and checked."""
+"""Coordinates without inertia of their own, determined by constraints: built, run and checked."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import eomc
 from eomc.verify.check import check
 
-# a mass on a rod, a string over a pulley drawn by it; s has no inertia
+# a mass on a rod, a string over a pulley pulled by it; s has no inertia
 PULLEY = """eomc = 1
 name = "cord"
 [coordinates]
@@ -29,7 +29,7 @@ h = 0.01
 duration = 2
 """
 
-# only x + s has inertia: D is singular, though none of its diagonal is 0
+# only x + s has inertia: D is singular, although no diagonal entry is 0
 BELT = """eomc = 1
 name = "belt"
 [coordinates]
@@ -52,25 +52,25 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 def built(text: str, folder: Path) -> tuple[eomc.System, object]:
     (folder / "scene.toml").write_text(text, encoding="utf-8")
-    made = eomc.read(folder / "scene.toml")
-    return made, eomc.load(made, folder / "build")
+    system = eomc.read(folder / "scene.toml")
+    return system, eomc.load(system, folder / "build")
 
 
-def test_d_may_be_singular_where_the_rows_are_not(tmp_path: Path) -> None:
-    """Beside x = 2 s + y put in by hand: K = (3 s' + y')^2/2 + y'^2/2."""
-    made, module = built(BELT.replace("METHODS", 'method = "rk4"'), tmp_path)
+def test_singular_D_is_accepted_if_constraints_are_regular(tmp_path: Path) -> None:
+    """Compare with x = 2 s + y substituted by hand: K = (3 s' + y')^2/2 + y'^2/2."""
+    system, module = built(BELT.replace("METHODS", 'method = "rk4"'), tmp_path)
     s, y = 0.25, -0.4
     x = 2 * s + y
     a = np.linalg.solve([[9, 3], [3, 2]], [-(12 * x + 2 * s), -(9.81 + 6 * x)])
     expected = [2 * a[0] + a[1], *a]
-    found = module.acceleration([x, s, y], [0.0, 0.0, 0.0])
-    np.testing.assert_allclose(found, expected, rtol=1e-13)
-    # row s: 0 + A^T lambda = 2 s + the inertia of x + s
+    accelerations = module.acceleration([x, s, y], [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(accelerations, expected, rtol=1e-13)
+    # Row s: 0 + A^T lambda = 2 s + the inertia of x + s.
     belt = module.multipliers([x, s, y], [0.0, 0.0, 0.0])
     np.testing.assert_allclose(float(np.squeeze(belt)), (a[1] + 9.81) / -1, rtol=1e-13)
     run = module.simulate(method="rk4")
     assert np.ptp(run.energy) < 1e-6 and np.abs(run.constraints["belt"]).max() < 1e-14
-    assert made.closure is not None and len(made.closure.weights) == 1
+    assert system.closure is not None and len(system.closure.weights) == 1
 
 
 @pytest.mark.slow
@@ -84,12 +84,12 @@ def test_d_may_be_singular_where_the_rows_are_not(tmp_path: Path) -> None:
     ids=["pulley", "belt", "belt in floats"],
 )
 def test_check_passes(text: str, methods: str, tmp_path: Path) -> None:
-    made, module = built(text.replace("METHODS", methods), tmp_path)
-    report = check(made, module)
+    system, module = built(text.replace("METHODS", methods), tmp_path)
+    report = check(system, module)
     assert report.passed, report.table()
 
 
-def test_what_no_row_holds_is_refused(tmp_path: Path) -> None:
+def test_unconstrained_massless_coordinate_is_refused(tmp_path: Path) -> None:
     text = PULLEY.replace('pulley = "s - x - 2*y"\n', "").replace("METHODS", "")
     with pytest.raises(eomc.EomcError, match="coordinate 's' has no inertia"):
         built(text, tmp_path)

@@ -1,4 +1,4 @@
-"""A sample of mutants of the C is noticed by the check; `python tests/mutants.py` has more."""
+"""The check detects a sample of mutants of the C; `python tests/mutants.py` runs more."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from mutants import tried
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cartpole", "furuta_pendulum"])
-def test_a_sample_is_noticed(name: str, tmp_path: Path) -> None:
-    """One survivor may be: what moves results by little more than rounding."""
+def test_sample_of_mutants_is_detected(name: str, tmp_path: Path) -> None:
+    """One survivor is allowed: a change of results by little more than rounding."""
     kind, value = in_a_fork(lambda: tried(name, 20, 11, tmp_path), 1200)
     assert kind == "done", value
     counts, survived = value  # type: ignore[misc]

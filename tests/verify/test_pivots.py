@@ -1,4 +1,4 @@
-"""Pivots that are not looked at, or beside the wrong size, on every route to accelerations."""
+"""Pivots that are not tested, or compared with a wrong scale, in every route to accelerations."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from eomc.program.routes import ROUTES, RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 
-# a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
+# A pivot, and its limit: zero, or the rounding error of the diagonal entry.
 PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
 
 
 def chain(links: int, run: str = "") -> System:
-    """Rods in a row, each with a mass of its own, so that each pivot can fail by itself."""
+    """Return rods in a row, each with its own mass, so that each pivot can fail separately."""
     bodies = [
         {"name": f"link{k}", "joint": "revolute", "coordinates": f"q{k}", "mass": f"m{k}",
          "center": ["l/2", 0], "inertia": f"m{k}*l**2/12",
@@ -41,27 +41,29 @@ def chain(links: int, run: str = "") -> System:
 
 
 def changes(source: str) -> Iterator[Mutant]:
-    """Each pivot left out; and each beside the size of a mass or of nothing in its place."""
+    """Yield changes: no test of a pivot; a limit relative to a mass, or zero, in place of the
+    scale.
+    """
     for match in PIVOT.finditer(source):
         start, end = match.span()
         if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("* ", "/*")):
             continue
         yield Mutant(start, end, "0")
-        if match[3]:  # what would do for a D of another unit
+        if match[3]:  # sufficient for a D of another unit
             yield Mutant(*match.span(3), f"1e20*{match[3]}")
             yield Mutant(*match.span(3), f"-1e20*{match[3]}")
 
 
-def unnoticed(made: System, name: str, folder: Path, least: int) -> list[str]:
-    """The changes of pivots that pass the check."""
+def surviving_changes(system: System, name: str, folder: Path, least: int) -> list[str]:
+    """Return the changes of pivot tests that pass the check."""
 
-    def all_of() -> list[str]:
-        bench = Bench(name, folder, made)
+    def survivors() -> list[str]:
+        bench = Bench(name, folder, system)
         tried = list(changes(bench.shipped.source))
         assert len(tried) >= least, len(tried)
         return [bench.place(m) for m in tried if bench.judge(m)[0] not in ("killed", "no C")]
 
-    kind, value = in_a_fork(all_of, 1200)
+    kind, value = in_a_fork(survivors, 1200)
     assert kind == "done", value
     assert isinstance(value, list)
     return value
@@ -69,16 +71,18 @@ def unnoticed(made: System, name: str, folder: Path, least: int) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name, least", [("cartpole", 2), ("cartpole_batch", 3)])
-def test_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
-    assert unnoticed(variant(name), name, tmp_path, least) == []
+def test_check_detects_changed_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
+    assert surviving_changes(variant(name), name, tmp_path, least) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "links, run, least", [(2, "", 2), (3, "", 3), (6, "", 6), (4, "batch = true", 4)]
 )
-def test_pivots_of_trees(links: int, run: str, least: int, tmp_path: Path) -> None:
-    assert unnoticed(chain(links, run), f"rods{links}", tmp_path, least) == []
+def test_check_detects_changed_pivots_of_trees(
+    links: int, run: str, least: int, tmp_path: Path
+) -> None:
+    assert surviving_changes(chain(links, run), f"rods{links}", tmp_path, least) == []
 
 
 SOLVED = ["cartpole", "heavy_top", "tumbling_box", "rods3"]
@@ -86,19 +90,21 @@ SOLVED = ["cartpole", "heavy_top", "tumbling_box", "rods3"]
 
 @pytest.mark.parametrize("name", tiers(SOLVED, "cartpole", "heavy_top", "tumbling_box"))
 def test_pivots_are_schur_complements_of_D(name: str) -> None:
-    """Beside the diagonal entries that they were; by the articulated route beside a trace."""
-    made = chain(3) if name == "rods3" else variant(name)
-    reference, material = symbolic.reference_for(made), RouteInputs(lagrange.derive(made))
-    ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
-    solved = {r: way for r, way in ways.items() if isinstance(way, Solution) and way.matrix == "D"}
+    """Compare the limits with diagonal entries; by the articulated route with a trace."""
+    system = chain(3) if name == "rods3" else variant(name)
+    reference, material = symbolic.reference_for(system), RouteInputs(lagrange.derive(system))
+    programs = {r.name: r.accelerations(material) for r in ROUTES.values()}
+    solved = {
+        r: way for r, way in programs.items() if isinstance(way, Solution) and way.matrix == "D"
+    }
     assert solved
-    values = nearby(made, 3)
-    place = [[values[f"{c.name}{end}"] for c in made.coordinates] for end in ("", "_dot")]
-    given = {p.name: values[p.name] for p in made.parameters}
-    D = reference.evaluate("D", *place, 0.0, None, given)
+    values = nearby(system, 3)
+    place = [[values[f"{c.name}{end}"] for c in system.coordinates] for end in ("", "_dot")]
+    parameters = {p.name: values[p.name] for p in system.parameters}
+    D = reference.evaluate("D", *place, 0.0, None, parameters)
     for route, way in solved.items():
         pairs = [x for pair in way.pivots for x in pair]
-        computed = evaluator(lower("pivots", way.tape, pairs, made.names))(values)[0]
+        computed = evaluator(lower("pivots", way.tape, pairs, system.names))(values)[0]
         assert len(way.order) == len(way.pivots) == len(D)
         for n, (k, pivot, size) in enumerate(
             zip(way.order, computed[::2], computed[1::2], strict=True)

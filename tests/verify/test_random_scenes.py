@@ -1,6 +1,6 @@
-"""Random valid scenes pass the check, and with one term negated they do not.
+"""Random valid scenes pass the check, and with one term negated they fail it.
 
-Many more of both: python tests/random_scenes.py --count 2000 [--negate | --wide].
+python tests/random_scenes.py --count 2000 [--negate | --wide] runs many more of both.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from eomc.verify.comparison import Comparison
 from eomc.verify.report import CheckReport, Measurement
 from eomc.verify.sampling import State
 
-# Right modules of which a row about orders, advised steps or balances once said FAILED.
+# Correct modules for which a check of orders, advised steps or balances once failed.
 DRAG = """eomc = 1
 name = "drag"
 gravity = [0, "-9.81"]
@@ -97,7 +97,7 @@ potential = "-depth*exp(-x**2)"
 method = ["rk4", "gauss8", "gauss16"]
 h = 0.02
 """
-# so many links that accelerations come from link multipliers, which divide by the masses
+# with so many links, accelerations come from link multipliers, which divide by masses
 MASSLESS = """eomc = 1
 name = "massless"
 [coordinates]
@@ -219,25 +219,25 @@ REGRESSIONS = {
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def checked(text: str, modules: Modules) -> CheckReport:
+def check_text(text: str, modules: Modules) -> CheckReport:
     return check(from_scene(parse(text, "test.toml")), modules.unoptimised(text))
 
 
 @cache
-def right(text: str, modules: Modules) -> CheckReport:
-    """As it is, for several tests."""
-    return checked(text, modules)
+def report_of(text: str, modules: Modules) -> CheckReport:
+    """Return the report of an unchanged module, for several tests."""
+    return check_text(text, modules)
 
 
 @pytest.mark.parametrize("what", tiers(REGRESSIONS, "friction alone"))
-def test_right_modules_pass(modules: Modules, what: str) -> None:
-    report = right(REGRESSIONS[what], modules)
+def test_correct_modules_pass(modules: Modules, what: str) -> None:
+    report = report_of(REGRESSIONS[what], modules)
     assert report.passed, report.table()
     about = [row for row in report.results if any(word in row.name for word in JUDGES)]
     assert all(row.judged for row in about), report.table()
 
 
-# what the author of scenes wrote when a row of a right module once said FAILED
+# Random scenes for which a check of a correct module once failed.
 SEEDS = """400000 500399 500434 500578 500643 500672 700053 800095 800167 800199 800410
 800476 900093 910099 920113 920124 920312
 930199 940014 950333 950375 970109 980083 2350034 2301127 2301434 2301494
@@ -246,37 +246,41 @@ SEEDS = """400000 500399 500434 500578 500643 500672 700053 800095 800167 800199
 
 
 @pytest.mark.parametrize("seed", tiers(SEEDS))
-def test_right_modules_of_these_numbers_pass(seed: str, tmp_path: Path) -> None:
-    found = outcome(int(seed), False, tmp_path)
-    assert found.outcome == "passed", found
+def test_correct_modules_of_these_seeds_pass(seed: str, tmp_path: Path) -> None:
+    result = outcome(int(seed), False, tmp_path)
+    assert result.outcome == "passed", result
 
 
-WIDE_SEEDS = "120 124 143 150 1088".split()  # the same of scene_author_wide
+WIDE_SEEDS = "120 124 143 150 1088".split()  # the same for scene_author_wide
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [*map(str, range(12)), *WIDE_SEEDS])
 def test_wide_scenes_pass(seed: str, tmp_path: Path) -> None:
-    """With outputs, limits, events, tolerances, forces, points, frames, constraints and loops."""
-    found = outcome(int(seed), False, tmp_path, wide=True)
-    assert found.outcome == "passed", (found, wide_text(int(seed)))
+    """They have outputs, limits, events, tolerances, forces, points, frames, constraints and
+    loops.
+    """
+    result = outcome(int(seed), False, tmp_path, wide=True)
+    assert result.outcome == "passed", (result, wide_text(int(seed)))
 
 
 @pytest.mark.slow
-def test_short_steps_end_where_rounding_of_constraints_lets_them(modules: Modules) -> None:
-    """15 units without it, 29 on another machine: of 20, where wrong sines make hundreds."""
+def test_short_steps_agree_up_to_rounding_of_constraints(modules: Modules) -> None:
+    """The limit is 20 units; without this rounding 15, on another machine 29; wrong sines give
+    hundreds.
+    """
     text = wide_text(1034)
     comparison = Comparison(
         assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
         np.random.default_rng(1034), None,
     )  # fmt: skip
-    found = RunChecks(comparison).short_step_error()
-    assert isinstance(found, float) and found < 5
+    error = RunChecks(comparison).short_step_error()
+    assert isinstance(error, float) and error < 5
 
 
 @pytest.mark.slow
-def test_stages_by_sweeps_end_at_rounding_of_far_angles(modules: Modules) -> None:
-    """As those by Newton's method do: 8,417 units without it, of 1,000."""
+def test_iterated_stages_agree_up_to_rounding_of_large_angles(modules: Modules) -> None:
+    """So do those of Newton's method: 8,417 units without this rounding, with a limit of 1,000."""
     own = wide_text(25099).split("method = ")[0]
     text = own + 'method = ["gauss16"]\nh = 0.004\nduration = 0.5\n'
     comparison = Comparison(
@@ -284,11 +288,11 @@ def test_stages_by_sweeps_end_at_rounding_of_far_angles(modules: Modules) -> Non
         np.random.default_rng(25099), None,
     )  # fmt: skip
     runs = RunChecks(comparison)
-    runs.sine_error()  # which draws before it
+    runs.sine_error()  # advances the random numbers
     assert 0 < runs.far_angle_error() < 100
 
 
-def test_wide_scenes_have_all_of_it() -> None:
+def test_wide_scenes_cover_all_features() -> None:
     texts = [wide_text(k) for k in range(200)]
     words = ["[[event]]", '"jump"', '"stop"', "[outputs]", "limits", "[[loop]]", "[constraints]"]
     words += ["tolerance", "discretize", "inverse_dynamics", "frames", "momentum", "[[force]]"]
@@ -331,21 +335,21 @@ linearize = true
 """
 
 
-def test_derivatives_are_compared_where_small_terms_count(
+def test_derivatives_are_compared_where_small_terms_matter(
     modules: Modules, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A term of order x**4 beside 1, in a motion that stays within 1e-2 for what is drawn."""
-    made = from_scene(parse(FAR, "test.toml"))
-    comparison = Comparison(made, modules.unoptimised(FAR), np.random.default_rng(0), None)
+    """A term of order x**4 is added to 1, in a motion with |x| < 1e-2 at the sampled states."""
+    system = from_scene(parse(FAR, "test.toml"))
+    comparison = Comparison(system, modules.unoptimised(FAR), np.random.default_rng(0), None)
     near = max(abs(float(e.state.q[0])) for e in comparison.expected)
     (far,) = comparison.sampler.far_states()
     assert abs(float(far.state.q[0])) > 2 * near
     assert largest_error(comparison, "linearize") < 1e-8
 
     def wrong(check: Comparison, name: str, s: State) -> Any:
-        found = module_derivatives(check, name, s)
-        assert found is not None
-        return found + 1e-3 * (s.q[0] / 0.3) ** 6
+        derivatives = module_derivatives(check, name, s)
+        assert derivatives is not None
+        return derivatives + 1e-3 * (s.q[0] / 0.3) ** 6
 
     monkeypatch.setattr(checks_derivatives, "module_derivatives", wrong)
     assert largest_error(comparison, "linearize") > 1e-7
@@ -379,42 +383,42 @@ inertia = 0.1
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [WOUND, WOUND_ARM])
-def test_an_angle_that_is_wound_up_may_throw_another_coordinate(
+def test_rounding_of_a_large_angle_may_affect_another_coordinate(
     modules: Modules, text: str
 ) -> None:
-    report = checked(text, modules)
+    report = check_text(text, modules)
     assert report.passed, report.table()
 
 
 @pytest.mark.parametrize("potential", tiers(["x**2", "max(-x, 0)**2"], "max(-x, 0)**2"))
-def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
+def test_rounding_is_not_judged_if_steps_skip_a_kink(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, potential: str
 ) -> None:
     monkeypatch.setattr(RunChecks, "run_difference", lambda *_: 99.0)
     text = WELL.replace("-depth*exp(-x**2)", potential).replace(', "gauss8", "gauss16"', "")
-    (row,) = (r for r in checked(text, modules).results if r.name == "rk4 rounding")
+    (row,) = (r for r in check_text(text, modules).results if r.name == "rk4 rounding")
     bends = "max" in potential
     assert row.passed == bends and row.judged != bends
     assert (row.unit == "not judged: steps leap over max") == bends
 
 
 @pytest.mark.parametrize("finer", [60.0, 20.0])
-def test_what_shorter_steps_make_less_is_no_rounding(
+def test_error_that_decreases_with_step_size_is_not_rounding(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, finer: float
 ) -> None:
-    """As of friction that turns within a thousandth of a step."""
-    found = dict(zip(FINE, (99.0, finer), strict=True))
-    monkeypatch.setattr(RunChecks, "run_difference", lambda *given: found[given[-1]])
+    """As for friction that changes within a thousandth of a step."""
+    errors = dict(zip(FINE, (99.0, finer), strict=True))
+    monkeypatch.setattr(RunChecks, "run_difference", lambda *arguments: errors[arguments[-1]])
     text = WELL.replace(', "gauss8", "gauss16"', "")
-    made = from_scene(parse(text, "test.toml"))
+    system = from_scene(parse(text, "test.toml"))
     module = modules.unoptimised(text)
-    runs = RunChecks(Comparison(made, module, np.random.default_rng(0), 4))
+    runs = RunChecks(Comparison(system, module, np.random.default_rng(0), 4))
     steep = Measurement(finer, "forces are so steep that shorter steps differ less")
     assert runs.rounding_error("rk4") == (finer if finer > 50 else steep)
 
 
-def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -> None:
-    (row,) = (r for r in right(DRAG, modules).results if r.name == "h of rk4")
+def test_advice_near_stiff_friction_is_compared_with_eigenvalues(modules: Modules) -> None:
+    (row,) = (r for r in report_of(DRAG, modules).results if r.name == "h of rk4")
     assert row.passed and row.limit == 2 and 1 <= row.error < 1.1
     assert "eigenvalues" in row.unit
 
@@ -437,28 +441,28 @@ duration = 1.0
 
 
 @pytest.mark.slow
-def test_steps_too_long_for_the_motion_do_not_say_how_far_it_goes(modules: Modules) -> None:
-    """RK4 is lost in steps of this h: what it says of the motion after some is nothing."""
+def test_unstable_steps_do_not_determine_the_scale_of_the_motion(modules: Modules) -> None:
+    """RK4 diverges with steps of this h, so that the motion is unknown after some steps."""
     module = modules.unoptimised(LEAVING)
-    made = from_scene(parse(LEAVING, "test.toml"))
-    comparison = Comparison(made, module, np.random.default_rng(0), None)
+    system = from_scene(parse(LEAVING, "test.toml"))
+    comparison = Comparison(system, module, np.random.default_rng(0), None)
     assert comparison.simulate(comparison.sampler.start).status == "not finite"
     assert np.allclose(comparison.sampler.spread, [0.5, 0.3], rtol=0.1)
     assert np.allclose(comparison.sampler.speed, [84, 3], rtol=0.1)
     stiff = comparison.advice.stiffest_state
     assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * comparison.advice.scale)
-    report = right(LEAVING, modules)
+    report = report_of(LEAVING, modules)
     (row,) = (r for r in report.results if r.name == "h of gauss16")
     assert row.judged and report.passed, report.table()
 
 
-def test_a_method_of_order_1_balances_power_at_order_1(modules: Modules) -> None:
+def test_power_balance_of_a_first_order_method_has_order_1(modules: Modules) -> None:
     text = ORDER_1.replace('["euler", "dp8"]', '"euler"')
-    (row,) = (r for r in checked(text, modules).results if r.name == "power balance")
+    (row,) = (r for r in check_text(text, modules).results if r.name == "power balance")
     assert row.error == pytest.approx(1, abs=0.1) and row.limit == 0.5
 
 
-def test_scenes_are_the_same_for_the_same_number() -> None:
+def test_scenes_are_reproducible_for_a_seed() -> None:
     assert scene_text(7) == scene_text(7) != scene_text(8)
     texts = [scene_text(k) for k in range(300)]
     words = ["[[body]]", "[inputs]", "signal", "dot(", "*t)", "friction", "tanh", "batch = true"]
@@ -470,14 +474,14 @@ def test_scenes_are_the_same_for_the_same_number() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(43))
 def test_random_scenes_pass(tmp_path: Path, seed: int) -> None:
-    found = outcome(seed, False, tmp_path)
-    assert found.outcome == "passed", (found, scene_text(seed))
+    result = outcome(seed, False, tmp_path)
+    assert result.outcome == "passed", (result, scene_text(seed))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [*range(23), 2710186, 2710244])
-def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
-    """Unless what was negated changes no value, or is refused at once."""
-    found = outcome(seed, True, tmp_path)
-    assert found.outcome in ("caught", "unchanged", "refused"), (found, scene_text(seed))
-    assert found.outcome == "caught" or seed not in (14, 2710186, 2710244)
+def test_random_scenes_with_a_negated_term_fail(tmp_path: Path, seed: int) -> None:
+    """Unless the negation changes no value, or is refused at once."""
+    result = outcome(seed, True, tmp_path)
+    assert result.outcome in ("caught", "unchanged", "refused"), (result, scene_text(seed))
+    assert result.outcome == "caught" or seed not in (14, 2710186, 2710244)

@@ -1,4 +1,4 @@
-"""The reference is held against trusted answers, against the tutorial and against mechanics."""
+"""The symbolic reference is compared with reference data, the tutorial and laws of mechanics."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ x, v = symbol("x"), symbol("x_dot")
 def states(
     reference: SymbolicReference, count: int = 5
 ) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Random q, qd and t."""
+    """Return random q, qd and t."""
     random = np.random.default_rng(1)
     n = len(reference.system.q)
     return [(*random.uniform(0.3, 2.0, (2, n)), random.uniform(0, 3)) for _ in range(count)]
@@ -57,7 +57,7 @@ FEW_MEASURED = ("cartpole_drop_tutorialP", "double_pendulum_regular", "coulomb_f
 
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *FEW_MEASURED))
-def test_rk4_makes_the_errors_that_an_independent_rk4_made(name: str) -> None:
+def test_error_of_rk4_is_that_of_an_independent_rk4(name: str) -> None:
     measured = cases()[name]["rk4_measured"][0]
     steps = measured["steps"]
     _, q, _ = derive(case_system(name)).simulate(h=measured["h"], steps=steps)
@@ -72,7 +72,7 @@ def test_rk4_converges_with_order_4() -> None:
 
 
 @pytest.mark.parametrize(("name", "case"), tiers(ALIKE.items(), *FEW_ALIKE))
-def test_scene_has_the_physics_of_the_case(name: str, case: str) -> None:
+def test_scene_has_the_equations_of_the_case(name: str, case: str) -> None:
     scene, trusted = scene_system(name), case_system(case)
     mine, theirs = derive(scene), derive(trusted)
     assert [(c.start, c.rate) for c in scene.coordinates] == [
@@ -85,7 +85,7 @@ def test_scene_has_the_physics_of_the_case(name: str, case: str) -> None:
         )
 
 
-def test_every_scene_is_compared_with_a_case_or_made_of_bodies() -> None:
+def test_every_scene_has_a_case_or_bodies() -> None:
     """Those with constraints are compared in test_constrained_scenes.py."""
     for file in SCENES.glob("*.toml"):
         text = file.read_text(encoding="utf-8")
@@ -93,7 +93,7 @@ def test_every_scene_is_compared_with_a_case_or_made_of_bodies() -> None:
 
 
 @pytest.mark.parametrize("name", tiers(ALIKE, *FEW_ALIKE))
-def test_what_must_be_true(name: str) -> None:
+def test_properties_of_the_equations_of_motion(name: str) -> None:
     """D = D^T > 0; bias = C qd + g; Ddot - 2C + dD/dt is skew; d jacobi/dt = power."""
     reference = derive(scene_system(name))
     system = reference.system
@@ -111,7 +111,7 @@ def test_what_must_be_true(name: str) -> None:
         here = values | dict(zip((*system.q, *system.qd, t), (*q, *qd, at), strict=True))
         rates = np.array((D_dot + reference.D.diff(t)).subs(here), float)
         np.testing.assert_allclose(rates - 2 * C, -(rates - 2 * C).T, atol=1e-12)
-        # along the motion: from half a small step before to half a step after, by RK4
+        # Along the motion, from half a small step before to half a step after, by RK4.
         h, qdd = 1e-4, reference.acceleration(q, qd, at)
         np.testing.assert_allclose(D @ qdd + bias, tau, atol=1e-11 * max(1, np.abs(bias).max()))
         after, before = (reference.step(q, qd, s * h / 2, at) for s in (1, -1))
@@ -124,7 +124,7 @@ def test_what_must_be_true(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_tutorials_own_figures() -> None:
+def test_values_of_the_tutorial() -> None:
     """D = [[4, -2 cos q2], [-2 cos q2, 8/3]], C = [[0, 2 sin(q2) q2_dot], [0, 0]], g = ..."""
     system = scene_system("cartpole_tutorial")
     numbers = {p.symbol: sympy.Rational(str(p.value)) for p in system.parameters}
@@ -143,7 +143,7 @@ def test_the_tutorials_own_figures() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kapitza_pendulum", "cartpole_driven"])
-def test_simplified_means_the_same(name: str) -> None:
+def test_simplified_equations_have_the_same_values(name: str) -> None:
     reference = derive(scene_system(name))
     short = simplified(reference)
     for name in ("D", "C", "g", "bias", "tau", "kinetic", "energy", "jacobi", "power"):
@@ -155,8 +155,8 @@ def test_simplified_means_the_same(name: str) -> None:
         assert short.D[0] == symbol("m") * symbol("l") ** 2
 
 
-def test_all_parts_of_a_general_kinetic_energy() -> None:
-    """K = m(t) v^2/2 + a(x, t) v + b(x): every term against d/dt dK/dv - dK/dx by hand."""
+def test_all_terms_of_a_general_kinetic_energy() -> None:
+    """K = m(t) v^2/2 + a(x, t) v + b(x): compare every term with d/dt dK/dv - dK/dx by hand."""
     k, c, u = symbol("k"), symbol("c"), symbol("u")
     system = System.make(
         "general", [x], (1 + t) * v**2 / 2 + x**2 * t * v + x**3, k * x**2 / 2,
@@ -173,7 +173,7 @@ def test_all_parts_of_a_general_kinetic_energy() -> None:
     assert sympy.expand(reference.power - ((u * x - c * v) * v - v**2 / 2 - x**2 * v)) == 0
 
 
-def test_inputs_parameters_and_rows() -> None:
+def test_inputs_parameters_and_batches() -> None:
     reference = derive(scene_system("cartpole_driven"))
     q, qd = [0.0, 3.0], [0.1, 0.2]
     assert reference.evaluate("signals", q, qd, 2.0) == pytest.approx([0.01 * math.sin(2)])
@@ -188,7 +188,7 @@ def test_inputs_parameters_and_rows() -> None:
     assert all(later > sooner for sooner, later in pairwise(times))
 
 
-def test_no_real_value_is_nan() -> None:
+def test_complex_values_are_nan() -> None:
     reference = derive(System.make("fall", [x], v**2 / 2, 1 / x + sympy.log(x)))
     assert math.isnan(reference.evaluate("potential", [0.0]))
     assert np.isnan(reference.evaluate("g", [0.0])).all()
@@ -203,7 +203,7 @@ def test_no_real_value_is_nan() -> None:
     [
         v**4,
         sympy.sqrt(1 - v**2),
-        pytest.param(v**2 * sympy.tanh(v), marks=pytest.mark.slow),  # simplified for a second
+        pytest.param(v**2 * sympy.tanh(v), marks=pytest.mark.slow),  # simplification takes a second
         abs(v) ** 3,
     ],
 )
@@ -212,7 +212,7 @@ def test_kinetic_energy_must_be_quadratic(kinetic: sympy.Expr) -> None:
         derive(System.make("strange", [x], kinetic))
 
 
-def test_a_hidden_quadratic_is_seen() -> None:
+def test_quadratic_energy_in_disguise_is_accepted() -> None:
     hidden = (v**4 - x**4) / (v**2 + x**2) / 2 + (sin(v) ** 2 + cos(v) ** 2)
     assert derive(System.make("hidden", [x], hidden)).D[0] == 1
 
@@ -224,7 +224,7 @@ def test_derivation_is_quick() -> None:
     assert time.perf_counter() - start < 1
 
 
-def test_terms_multiplied_out() -> None:
+def test_terms_are_expanded() -> None:
     q, qd = symbol("q"), symbol("q_dot")
     s = System.make("shallow", {q: 1e-3}, qd**2 / 2 - qd * sin(q), 2e4 * (1 - cos(q)) - q / 7)
     answer = derive(s)
@@ -234,8 +234,8 @@ def test_terms_multiplied_out() -> None:
     assert abs(answer.evaluate("potential", at["q"])) < 1e-6 * terms
 
 
-def test_power_that_cancels_has_terms() -> None:
-    """A bead on a hoop that turns by what is written: its energy doesn't know the time."""
+def test_cancelling_power_has_terms() -> None:
+    """A bead on a hoop with prescribed rotation: its energy does not depend on time."""
     q, qd, w = symbol("q"), symbol("q_dot"), 6.0
     at = (sin(q) * cos(w * t), sin(q) * sin(w * t), -cos(q))
     K = sum((x.diff(q) * qd + x.diff(t)) ** 2 for x in at) / 2
@@ -246,9 +246,9 @@ def test_power_that_cancels_has_terms() -> None:
     assert answer.terms("power", s) > terms
 
 
-def test_where_D_is_singular_there_is_no_acceleration() -> None:
-    """Of one state, and of some among others."""
+def test_acceleration_is_nan_if_D_is_singular() -> None:
+    """For one state, and for one of several."""
     reference = derive(System.make("pole", {x: 1.0}, x**2 * v**2 / 2, x**3))
     assert math.isnan(reference.acceleration([0.0], [1.0])[0])
-    found = reference.acceleration([[0.0], [2.0]], [[1.0], [1.0]], params={})
-    assert np.isnan(found[0, 0]) and found[1, 0] == pytest.approx(-3.5)
+    accelerations = reference.acceleration([[0.0], [2.0]], [[1.0], [1.0]], params={})
+    assert np.isnan(accelerations[0, 0]) and accelerations[1, 0] == pytest.approx(-3.5)

@@ -1,4 +1,4 @@
-"""Taylor arithmetic is held against the equations written out, closed forms and mpmath."""
+"""Taylor arithmetic is compared with written-out equations, closed forms and mpmath."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ x, v = symbol("x"), symbol("x_dot")
 
 
 def states(system: System, rows: int = 4, seed: int = 0) -> dict[str, Any]:
-    """Random states as rows, with parameters around their defaults."""
+    """Return random states as rows, with parameters around their defaults."""
     random = np.random.default_rng(seed)
     return {
         "q": random.uniform(0.2, 1.2, (rows, len(system.q))),
@@ -47,9 +47,9 @@ def states(system: System, rows: int = 4, seed: int = 0) -> dict[str, Any]:
 
 
 def assert_alike(system: System, tolerance: float = 1e-12, rows: int = 4) -> None:
-    """Every value to a few thousand roundings of the terms that it is made of.
+    """Compare every value within a few thousand roundings of its terms.
 
-    Those of C and the forces are as large as D times rates, where they cancel to less.
+    The terms of C and of the forces are as large as D times rates, even if they cancel.
     """
     plain, quick = derive(system), TaylorReference(system)
     at = states(system, rows)
@@ -62,11 +62,11 @@ def assert_alike(system: System, tolerance: float = 1e-12, rows: int = 4) -> Non
     energy = sizes["kinetic"] + sizes["potential"]
     sizes |= dict.fromkeys(("energy", "jacobi"), energy) | {"power": force * speed}
     for name in NAMES:
-        expected, found = plain.evaluate(name, **at), quick.evaluate(name, **at)
-        assert found.shape == expected.shape, name
-        assert found.dtype == expected.dtype
+        expected, computed = plain.evaluate(name, **at), quick.evaluate(name, **at)
+        assert computed.shape == expected.shape, name
+        assert computed.dtype == expected.dtype
         np.testing.assert_allclose(
-            found, expected, rtol=0, atol=tolerance * sizes[name], err_msg=name
+            computed, expected, rtol=0, atol=tolerance * sizes[name], err_msg=name
         )
 
 
@@ -75,7 +75,9 @@ def everything() -> System:
 
 
 def chain(links: int) -> System:
-    """Point masses on rods in relative angles: positions as definitions, K by their rates."""
+    """Return point masses on rods in relative angles: positions as definitions, K from their
+    rates.
+    """
     q = [symbol(f"q{k}") for k in range(1, links + 1)]
     g, m, length = symbol("g"), symbol("m"), symbol("l")
     definitions: dict[Any, Any] = {}
@@ -93,7 +95,7 @@ def chain(links: int) -> System:
     )  # fmt: skip
 
 
-# --- against equations written out ----------------------------------------------------------------
+# --- comparison with written-out equations --------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", tiers(ALIKE, *FEW_ALIKE))
@@ -111,7 +113,7 @@ def test_chains(links: int) -> None:
     assert_alike(chain(links), rows=2)
 
 
-def test_all_parts_of_a_general_kinetic_energy() -> None:
+def test_all_terms_of_a_general_kinetic_energy() -> None:
     """Gyroscopic terms, a part without velocities, explicit time in D and in a definition."""
     y, w, k, u = symbol("y"), symbol("y_dot"), symbol("k"), symbol("u")
     point = symbol("point")
@@ -136,7 +138,7 @@ FUNCTIONS = [
 
 @st.composite
 def expressions(draw: st.DrawFn, leaves: tuple[Any, ...], depth: int = 3) -> Any:
-    """Sums, products, powers and tame functions of the leaves."""
+    """Draw sums, products, powers and smooth functions of the leaves."""
     if depth == 0 or draw(st.integers(0, 4)) == 0:
         return draw(st.sampled_from(leaves))
     inner = expressions(leaves, depth - 1)
@@ -157,11 +159,11 @@ MANY = settings(max_examples=20, deadline=None, derandomize=True)
 @MANY
 @drawn(st.data())
 def test_many_random_systems(data: st.DataObject) -> None:
-    look_at_a_random_system(data)
+    compare_a_random_system(data)
 
 
-def look_at_a_random_system(data: st.DataObject) -> None:
-    """Points at random formulas of two coordinates, the time and each other."""
+def compare_a_random_system(data: st.DataObject) -> None:
+    """Compare points at random formulas of two coordinates, the time and each other."""
     y, (a, b) = symbol("y"), (symbol("a"), symbol("b"))
     first = data.draw(expressions((x, y, t, sympy.Rational(1, 3))))
     second = data.draw(expressions((x, y, a), 2))
@@ -173,11 +175,11 @@ def look_at_a_random_system(data: st.DataObject) -> None:
     assert_alike(system, tolerance=1e-11, rows=2)
 
 
-# --- against closed forms and mpmath --------------------------------------------------------------
+# --- comparison with closed forms and mpmath ------------------------------------------------------
 
 
 def absolute_chain(n: int) -> System:
-    """n point masses on massless rods, in the rods' angles against the vertical."""
+    """Return n point masses on massless rods, in the absolute angles of the rods."""
     q = [symbol(f"q{k}") for k in range(n)]
     masses = [Parameter(f"m{k}", 1 + 0.1 * k) for k in range(n)]
     lengths = [Parameter(f"l{k}", 0.5 + 0.03 * k) for k in range(n)]
@@ -197,13 +199,13 @@ def absolute_chain(n: int) -> System:
     )  # fmt: skip
 
 
-def test_a_chain_of_20_masses_has_its_closed_form() -> None:
+def test_chain_of_20_masses_agrees_with_the_closed_form() -> None:
     """D_ij = mu_ij l_i l_j cos(q_i - q_j), C_ij = mu_ij l_i l_j sin(q_i - q_j) qd_j.
 
     mu_ij is the mass that hangs below both; bias = C qd + g.
     """
     n = 20
-    found, random = TaylorReference(absolute_chain(n)), np.random.default_rng(3)
+    reference, random = TaylorReference(absolute_chain(n)), np.random.default_rng(3)
     m, length = 1 + 0.1 * np.arange(n), 0.5 + 0.03 * np.arange(n)
     below = np.cumsum(m[::-1])[::-1]
     i = np.arange(n)
@@ -213,18 +215,18 @@ def test_a_chain_of_20_masses_has_its_closed_form() -> None:
         D, sines = (mu * f(np.subtract.outer(q, q)) for f in (np.cos, np.sin))
         g = 9.81 * below * length * np.sin(q)
         close = {"rtol": 0, "atol": 1e-13 * np.max(mu) * n}
-        np.testing.assert_allclose(found.evaluate("D", q), D, **close)
-        np.testing.assert_allclose(found.evaluate("C", q, qd), sines * qd, **close)
-        np.testing.assert_allclose(found.evaluate("g", q), g, rtol=1e-13)
-        np.testing.assert_allclose(found.evaluate("bias", q, qd), sines @ qd**2 + g, **close)
+        np.testing.assert_allclose(reference.evaluate("D", q), D, **close)
+        np.testing.assert_allclose(reference.evaluate("C", q, qd), sines * qd, **close)
+        np.testing.assert_allclose(reference.evaluate("g", q), g, rtol=1e-13)
+        np.testing.assert_allclose(reference.evaluate("bias", q, qd), sines @ qd**2 + g, **close)
         np.testing.assert_allclose(
-            found.acceleration(q, qd), np.linalg.solve(D, -sines @ qd**2 - g), rtol=1e-10
+            reference.acceleration(q, qd), np.linalg.solve(D, -sines @ qd**2 - g), rtol=1e-10
         )
         energy = qd @ D @ qd / 2 - 9.81 * below * length @ np.cos(q)
-        assert found.evaluate("energy", q, qd) == pytest.approx(energy, rel=1e-13)
+        assert reference.evaluate("energy", q, qd) == pytest.approx(energy, rel=1e-13)
 
 
-# a formula of x and the same for mpmath
+# a formula of x, and the same with mpmath
 FORMULAS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "sin": (sin(x), mpmath.sin),
     "cos": (cos(x), mpmath.cos),
@@ -263,10 +265,10 @@ def test_first_and_second_derivatives(name: str) -> None:
     """K = ydot^2/2 and P = y of y(x): D = y'^2, g = y', bias = y' y'' v^2 + y', C = y' y'' v."""
     formula, exact = FORMULAS[name]
     y, p = symbol("y"), symbol("p")
-    made = System.make("free", [x], dot(y) ** 2 / 2, y, definitions={y: x}, parameters={p: 1.7})
-    # as it stands: what jumps is refused in an energy, and its rules serve in forces
-    found = TaylorReference(
-        replace(made, definitions=tuple((name, formula) for name, _ in made.definitions))
+    system = System.make("free", [x], dot(y) ** 2 / 2, y, definitions={y: x}, parameters={p: 1.7})
+    # Without validation: energies refuse discontinuous functions, whose rules are used in forces.
+    reference = TaylorReference(
+        replace(system, definitions=tuple((name, formula) for name, _ in system.definitions))
     )
     for at in (0.3, 0.9):
         with mpmath.workdps(40):
@@ -276,37 +278,37 @@ def test_first_and_second_derivatives(name: str) -> None:
             "bias": slope * bend * 4 + slope, "kinetic": 2 * slope**2,
         }.items():  # fmt: skip
             size = abs(value) + slope**2 + abs(slope) * (1 + abs(bend))
-            assert np.ravel(found.evaluate(name, [at], [2.0])) == pytest.approx(
+            assert np.ravel(reference.evaluate(name, [at], [2.0])) == pytest.approx(
                 expected, rel=1e-13, abs=1e-14 * size
             ), name
 
 
-# --- what is broken is seen -----------------------------------------------------------------------
+# --- detection of errors --------------------------------------------------------------------------
 
 
-def _bent(function: Callable[..., Any], by: Callable[..., Any]) -> Callable[..., Any]:
+def _changed(function: Callable[..., Any], by: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *args, **how: by(function(*args, **how))
 
 
-def _without(*names: str) -> Callable[[taylor.Jet], taylor.Jet]:
+def _remove_parts(*names: str) -> Callable[[taylor.Jet], taylor.Jet]:
     return lambda jet: {name: part for name, part in jet.items() if name not in names}
 
 
 BREAKAGES: dict[str, tuple[str, Callable[..., Any]]] = {
-    "rates of gradients in products": ("_times", _without("xs")),
-    "rates of momenta": ("_times", _without("vs")),
-    "rates of D": ("_times", _without("vvs")),
-    "the skew part of C": ("_times", _without("N")),
+    "rates of gradients in products": ("_times", _remove_parts("xs")),
+    "rates of momenta": ("_times", _remove_parts("vs")),
+    "rates of D": ("_times", _remove_parts("vvs")),
+    "the skew part of C": ("_times", _remove_parts("N")),
     "the skew part's sign": ("_with_transpose", lambda m: None if m is None else abs(m)),
-    "bends of functions": ("_chain", _without("xs")),
-    "the time's share": ("_rate", _without("vs")),
+    "bends of functions": ("_chain", _remove_parts("xs")),
+    "the time's share": ("_rate", _remove_parts("vs")),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BREAKAGES)
-def test_a_rule_left_out_is_seen(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_rule_is_detected(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     name, by = BREAKAGES[what]
-    broken = _bent(getattr(taylor, name), by)
+    broken = _changed(getattr(taylor, name), by)
     monkeypatch.setattr(taylor, name, broken)
     if name == "_rate":
         monkeypatch.setattr(taylor, "RULES", {**taylor.RULES, "dot": broken})
@@ -318,32 +320,32 @@ def test_a_rule_left_out_is_seen(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     "function", [s for s in taylor.FUNCTIONS if s not in (sympy.Abs, sympy.sign)]
 )
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_wrong_sign_in_a_function_is_seen(
+def test_wrong_sign_in_a_function_is_detected(
     function: Any, which: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of its value, its first or its second derivative."""
+    """The sign of its value, its first or its second derivative."""
     right = taylor.FUNCTIONS[function]
 
     def wrong(at: Any) -> Any:
-        found = list(right(at))
-        found[which] = -found[which]
-        return tuple(found)
+        derivatives = list(right(at))
+        derivatives[which] = -derivatives[which]
+        return tuple(derivatives)
 
     monkeypatch.setattr(taylor, "FUNCTIONS", {**taylor.FUNCTIONS, function: wrong})
     with pytest.raises(AssertionError):
         test_first_and_second_derivatives(function.__name__)
 
 
-# --- what can't be had ----------------------------------------------------------------------------
+# --- refusals -------------------------------------------------------------------------------------
 
 
-def test_what_has_no_rate_is_refused() -> None:
+def test_expressions_without_a_rate_are_refused() -> None:
     a, u = symbol("a"), symbol("u")
     for inside, words in ((x * v, "velocities"), (u * x, "inputs"), (dot(sin(t)), "a dot")):
-        made = System.make("odd", [x], v**2, 0, definitions={a: inside}, inputs=[u])
-        made = replace(made, potential=dot(a) * x)
+        system = System.make("odd", [x], v**2, 0, definitions={a: inside}, inputs=[u])
+        system = replace(system, potential=dot(a) * x)
         with pytest.raises(EomcError, match=f"hangs on {words}"):
-            TaylorReference(made)
+            TaylorReference(system)
 
 
 @pytest.mark.parametrize(
@@ -355,51 +357,51 @@ def test_kinetic_energy_must_be_quadratic(kinetic: Any) -> None:
 
 
 def test_unknown_functions_are_refused() -> None:
-    made = replace(System.make("odd", [x], v**2, 0), potential=sympy.gamma(x))
+    system = replace(System.make("odd", [x], v**2, 0), potential=sympy.gamma(x))
     with pytest.raises(EomcError, match=r"derivatives of gamma\(x\) are not known"):
-        TaylorReference(made)
+        TaylorReference(system)
 
 
-def test_no_real_value_is_nan_in_its_row_alone() -> None:
-    made = TaylorReference(System.make("fall", [x], v**2 / 2, 1 / x + sympy.log(x)))
-    found = made.evaluate("g", [[0.0], [-1.0], [2.0]])
-    assert np.isnan(found[0]).all()
-    assert found[2] == pytest.approx(-1 / 4 + 1 / 2)
-    assert np.isnan(made.evaluate("potential", [-1.0]))
+def test_complex_value_is_nan_in_its_row_only() -> None:
+    reference = TaylorReference(System.make("fall", [x], v**2 / 2, 1 / x + sympy.log(x)))
+    values = reference.evaluate("g", [[0.0], [-1.0], [2.0]])
+    assert np.isnan(values[0]).all()
+    assert values[2] == pytest.approx(-1 / 4 + 1 / 2)
+    assert np.isnan(reference.evaluate("potential", [-1.0]))
     edge = TaylorReference(System.make("edge", [x], dot(abs(x)) ** 2 + v**2, 0))
     assert np.isnan(edge.evaluate("bias", [0.0], [1.0])).all()
     edge = TaylorReference(System.make("edge", [x], v**2, abs(x)))
     assert edge.evaluate("g", [0.0]) == 0
 
 
-def test_parameters_that_are_zero_divide_quietly() -> None:
+def test_division_by_zero_parameters_issues_no_warnings() -> None:
     k = symbol("k")
-    made = TaylorReference(
+    reference = TaylorReference(
         System.make("zero", [x], v**2, x / k + sympy.log(k) + x**k, parameters={k: 0})
     )
-    assert np.isnan(made.evaluate("g", [1.0])).all()
-    assert made.evaluate("D", [1.0]) == 2
+    assert np.isnan(reference.evaluate("g", [1.0])).all()
+    assert reference.evaluate("D", [1.0]) == 2
 
 
-# --- the interface --------------------------------------------------------------------------------
+# --- interface ------------------------------------------------------------------------------------
 
 
 def test_rows_are_states() -> None:
-    """Many at once, in blocks, one alone, and the plain reference's rows."""
+    """Compare many states, states in blocks, single states, and rows of the symbolic reference."""
     system = scene_system("cartpole_driven")
     plain, quick = derive(system), TaylorReference(system)
     at = states(system, 7)
     u = np.linspace(-1, 1, 7)[:, None]
-    for given in (None, u):
+    for inputs in (None, u):
         for name in NAMES:
-            rows = quick.evaluate(name, **at, u=given)
+            rows = quick.evaluate(name, **at, u=inputs)
             for i in (0, 6):
                 q, qd, when = at["q"][i], at["qd"][i], at["t"][i]
                 params = {p: values[i] for p, values in at["params"].items()}
-                one = (q, qd, when, None if given is None else given[i], params)
+                one = (q, qd, when, None if inputs is None else inputs[i], params)
                 np.testing.assert_allclose(quick.evaluate(name, *one), rows[i], rtol=1e-14)
                 np.testing.assert_array_equal(
-                    plain.evaluate(name, *one), plain.evaluate(name, **at, u=given)[i]
+                    plain.evaluate(name, *one), plain.evaluate(name, **at, u=inputs)[i]
                 )
     many = states(system, 40_000)
     np.testing.assert_array_equal(
@@ -414,7 +416,7 @@ def test_rows_are_states() -> None:
         quick.evaluate("D", at["q"][0], params={"mc": 5.0})
 
 
-def test_runs_are_those_of_the_plain_reference() -> None:
+def test_runs_equal_those_of_the_symbolic_reference() -> None:
     system = scene_system("cartpole_driven")
     plain, quick = derive(system), TaylorReference(system)
     for one, other in zip(plain.simulate(steps=20), quick.simulate(steps=20), strict=True):
@@ -426,7 +428,7 @@ def test_runs_are_those_of_the_plain_reference() -> None:
     np.testing.assert_allclose(q[:, 1], alone, rtol=1e-14)
 
 
-def test_the_size_decides() -> None:
+def test_size_selects_the_reference() -> None:
     assert isinstance(symbolic.reference_for(scene_system("heavy_top")), SymbolicReference)
     assert isinstance(symbolic.reference_for(chain(2)), SymbolicReference)
     assert symbolic.is_small(chain(3))
@@ -436,13 +438,13 @@ def test_the_size_decides() -> None:
 @pytest.mark.slow
 def test_fifty_links_are_quick() -> None:
     system = chain(50)
-    begun = time.perf_counter()
-    found = TaylorReference(system)
+    start_time = time.perf_counter()
+    reference = TaylorReference(system)
     q = np.full(50, 0.1)
-    found.acceleration(q, q)  # D, bias and tau: some 0.02 s
-    assert time.perf_counter() - begun < 1
-    D, C = found.evaluate("D", q), found.evaluate("C", q, q)
+    reference.acceleration(q, q)  # D, bias and tau: about 0.02 s
+    assert time.perf_counter() - start_time < 1
+    D, C = reference.evaluate("D", q), reference.evaluate("C", q, q)
     assert np.all(np.linalg.eigvalsh(D) > 0)
-    balance = C @ q + found.evaluate("g", q) - found.evaluate("bias", q, q)
-    assert np.max(np.abs(balance)) < 1e-13 * np.max(np.abs(found.evaluate("bias", q, q))) * 50
-    assert math.isfinite(found.evaluate("jacobi", q, q))
+    balance = C @ q + reference.evaluate("g", q) - reference.evaluate("bias", q, q)
+    assert np.max(np.abs(balance)) < 1e-13 * np.max(np.abs(reference.evaluate("bias", q, q))) * 50
+    assert math.isfinite(reference.evaluate("jacobi", q, q))

@@ -1,4 +1,4 @@
-"""Shorter forms are equal, and those of a textbook where there is one."""
+"""Simplified forms are equal, and those of textbooks where these exist."""
 
 import random
 
@@ -13,7 +13,7 @@ v, w = symbols("v w", real=True)
 
 
 @pytest.mark.parametrize(
-    ("given", "short"),
+    ("expression", "expected"),
     [
         (m * r**2 * sin(a) ** 2 + m * r**2 * cos(a) ** 2, m * r**2),
         (r * cos(a) * cos(b) + r * sin(a) * sin(b), r * cos(a - b)),
@@ -24,8 +24,8 @@ v, w = symbols("v w", real=True)
         ((m + k) * v**2 * cos(a) ** 2 + (m + k) * v**2 * sin(a) ** 2, (k + m) * v**2),
     ],
 )
-def test_textbook_forms(given: sympy.Expr, short: sympy.Expr) -> None:
-    assert simplify_trig(given, (v, w)) == short
+def test_textbook_forms(expression: sympy.Expr, expected: sympy.Expr) -> None:
+    assert simplify_trig(expression, (v, w)) == expected
 
 
 @pytest.mark.slow
@@ -49,14 +49,14 @@ def test_forms_are_equal_and_no_longer() -> None:
     for _ in range(25):
         terms = [sympy.Mul(*pick.choices(parts, k=pick.randint(1, 6))) for _ in range(6)]
         e = sympy.Add(*(pick.randint(-3, 3) * y for y in terms))
-        made = simplify_trig(e, (v, w))
-        assert abs((made - e).xreplace(at).evalf(40)) < 1e-30, e
-        assert made.count_ops() <= e.count_ops()
+        simplified = simplify_trig(e, (v, w))
+        assert abs((simplified - e).xreplace(at).evalf(40)) < 1e-30, e
+        assert simplified.count_ops() <= e.count_ops()
 
 
 def test_coefficients_of_rates() -> None:
     e = sympy.expand((r * v * cos(a) + w) ** 2) + k * x
-    found = coefficients(e, (v, w))
-    assert found == [(v**2, r**2 * cos(a) ** 2), (v * w, 2 * r * cos(a)), (w**2, 1), (1, k * x)]
+    terms = coefficients(e, (v, w))
+    assert terms == [(v**2, r**2 * cos(a) ** 2), (v * w, 2 * r * cos(a)), (w**2, 1), (1, k * x)]
     assert coefficients(sympy.tanh(v), (v, w)) is None
     assert coefficients(sympy.S.Zero, (v, w)) == []
