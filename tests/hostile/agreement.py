@@ -1,4 +1,4 @@
-"""The same numbers everywhere: compilers, levels, registers, machines, Pythons, forms, precisions.
+"""Compare results across compilers, levels, vector widths, machines, Pythons, forms and precisions.
 
     python tests/hostile/agreement.py                 the table of all scenes
     python tests/hostile/agreement.py cartpole
@@ -6,9 +6,9 @@
 
 Each way of compiling a scene is compared with the reference, SymPy's derivation evaluated by NumPy:
 accelerations at random states, relative to the largest of their state, and the end of a run of RK4,
-relative to how far things are; both in units of the last digit. A batch is compared with the runs
-one by one, and with itself in three threads, which has to be the same bits. Other machines are
-those whose cross compiler and QEMU are installed; there a batch goes in three parts, not threads.
+relative to the scale of the state; both in units in the last place. A batch is compared with
+separate runs, and with a run in three threads, which must give equal bits. Other machines are those
+whose cross compiler and QEMU are installed; there a batch runs in three parts instead of threads.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from eomc.verify import symbolic
 NAMES = ("cartpole", "double_pendulum", "furuta_pendulum", "spring_pendulum", "four_bar")
 PLAIN = ("-fno-math-errno", "-fno-trapping-math")
 STATES, STEPS, FEW = 40, 200, 20
-LIMIT = 100.0  # units of the last digit
+LIMIT = 100.0  # units in the last place
 
 
-def ways() -> Iterator[tuple[str, str, str]]:
-    """A compiler, its flags, and a name for both."""
+def compiler_variants() -> Iterator[tuple[str, str, str]]:
+    """Yield a compiler, its flags, and a name for both."""
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    found = {name: shutil.which(name) for name in ("gcc", "clang-14", "clang")}
-    for name, path in found.items():
-        if path is None or (name == "clang" and found["clang-14"]):
+    compilers = {name: shutil.which(name) for name in ("gcc", "clang-14", "clang")}
+    for name, path in compilers.items():
+        if path is None or (name == "clang" and compilers["clang-14"]):
             continue
         for level in ("-O0", "-O1", "-O2", "-O3"):
             yield path, f"{level} -march=native", f"{name} {level} native"
@@ -68,29 +68,29 @@ MACHINES = {
 }
 
 
-def elsewhere() -> Iterator[tuple[str, str, str, str]]:
-    """A cross compiler, its flags, what runs its programs, and a name for all."""
+def cross_compiler_variants() -> Iterator[tuple[str, str, str, str]]:
+    """Yield a cross compiler, its flags, the emulator of its programs, and a name for all."""
     for machine, (gcc, qemu) in MACHINES.items():
-        found, run = shutil.which(gcc), shutil.which(qemu)
-        if found and run:
+        compiler, run = shutil.which(gcc), shutil.which(qemu)
+        if compiler and run:
             for level in ("-O0", "-O2", "-O3"):
-                yield found, level, run, f"gcc {level} {machine}"
+                yield compiler, level, run, f"gcc {level} {machine}"
 
 
 class Scene:
-    """One scene in one precision, and what the reference says of it."""
+    """One scene in one precision, and the values of the reference."""
 
     def __init__(self, name: str, real: str) -> None:
         text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
         more = f'[run]\nbatch = true\nreal = "{real}"\n'
-        made = from_scene(parse(text.replace("[run]\n", more), f"{name}.toml"))
-        self.system = assembled(made)
+        system = from_scene(parse(text.replace("[run]\n", more), f"{name}.toml"))
+        self.system = assembled(system)
         self.sources = eomc.sources(self.system, EXTENSION)
         answer = symbolic.derive(self.system)
         draw, n = np.random.default_rng(1), len(self.system.coordinates)
         start = np.array([(c.start, c.rate) for c in self.system.coordinates]).T
         states = start[0] + draw.uniform(-1, 1, (STATES, n)), draw.normal(size=(STATES, n))
-        if self.system.constraints:  # somewhere on them
+        if self.system.constraints:  # states that satisfy the constraints
             q, qd = answer.project(start[0] + states[0] / 20, states[1])
             fine = np.isfinite(q).all(1) & (np.abs(q - start[0]).max(1) < 1)
             states = q[fine], qd[fine]
@@ -101,8 +101,10 @@ class Scene:
         self.end = np.array([q[-1], qd[-1]])
         self.real, self.eps = real, float(np.finfo(kind).eps)
 
-    def off(self, m: ModuleType) -> tuple[float, float, float, bool]:
-        """Accelerations, a run and a batch, in last digits; whether threads give the same bits."""
+    def errors(self, m: ModuleType) -> tuple[float, float, float, bool]:
+        """Return errors of accelerations, a run and a batch, and whether threads give equal
+        bits.
+        """
         call: Any = m
         a = np.array([call.acceleration(*s) for s in zip(self.q, self.qd, strict=True)], float)
         run = call.simulate(steps=STEPS, every=STEPS, method="rk4")
@@ -114,24 +116,24 @@ class Scene:
         batch = np.asarray(one.q[:, -1], float), np.array([x.q[-1] for x in each], float)
         return *self._judged(a, np.array([run.q[-1], run.qd[-1]], float), *batch), same
 
-    def off_elsewhere(
+    def errors_on_another_machine(
         self, gcc: str, flags: str, run: str, form: str, place: Path
     ) -> tuple[float, float, float, bool]:
-        """The same of a program for another machine, which an emulator runs."""
+        """Return the same for a program for another machine, run by an emulator."""
         at, name, n = "fast/" if form == "fast" else "", self.system.name, self.q.shape[1]
         write_files(self.sources.embeddable, place)
         words = [compiler.standard(form), *flags.split(), *PLAIN, "-static", f"-I{place / at}"]
-        given = {"HEADER": f"<{name}.h>", "SCENE": name, "SIZE": n, "NUMBER": self.real}
-        given["INPUTS"] = len(self.system.inputs)
-        words += [f"-D{macro}={value}" for macro, value in given.items()]
+        macros = {"HEADER": f"<{name}.h>", "SCENE": name, "SIZE": n, "NUMBER": self.real}
+        macros["INPUTS"] = len(self.system.inputs)
+        words += [f"-D{macro}={value}" for macro, value in macros.items()]
         files = [Path(__file__).with_suffix(".c"), place / f"{at}{name}.c"]
         subprocess.run([gcc, *words, *files, "-lm", "-o", place / "run"], check=True)
-        asked = map(str, (len(self.q), STEPS, repr(self.system.run.h), FEW))
+        sizes = map(str, (len(self.q), STEPS, repr(self.system.run.h), FEW))
         states = "\n".join(map(repr, np.hstack([self.q, self.qd]).ravel().tolist()))
-        done = subprocess.run(
-            [run, place / "run", *asked], input=states, capture_output=True, text=True, check=True
+        process = subprocess.run(
+            [run, place / "run", *sizes], input=states, capture_output=True, text=True, check=True
         )
-        *numbers, same = map(float, done.stdout.split())
+        *numbers, same = map(float, process.stdout.split())
         k = self.q.size
         a, end, *batch = np.split(np.array(numbers), [k, k + 2 * n, 2 * k + 2 * n])
         one, each = (x.reshape(-1, n) for x in batch)
@@ -140,56 +142,60 @@ class Scene:
     def _judged(
         self, a: np.ndarray, end: np.ndarray, batch: np.ndarray, each: np.ndarray
     ) -> tuple[float, float, float]:
-        """In last digits, of accelerations, the end of a run, a batch beside runs one by one."""
+        """Return the errors of accelerations, of the end of a run, and of a batch relative to
+        single runs.
+        """
         off_a = np.max(np.abs(a - self.a) / np.max(np.abs(self.a), axis=1, keepdims=True))
         off_run = np.max(np.abs(end - self.end) / np.max(np.abs(self.end), axis=1, keepdims=True))
         off_batch = np.max(np.abs(batch - each) / (1 + np.abs(each)))
         return off_a / self.eps, off_run / self.eps, off_batch / self.eps
 
 
-def told(what: str, off: Sequence[float], same: bool) -> bool:
-    """Print a row; whether all is near enough."""
-    fine = bool(max(off) <= LIMIT) and same
-    numbers = "".join(f"{x:9.3g}" for x in off)
+def print_row(what: str, errors: Sequence[float], same: bool) -> bool:
+    """Print a row; return True if all errors are within the limit."""
+    fine = bool(max(errors) <= LIMIT) and same
+    numbers = "".join(f"{x:9.3g}" for x in errors)
     print(f"{what}{numbers}  {'same' if same else 'OTHER'}{'' if fine else '  FAR'}", flush=True)
     return fine
 
 
 def main(arguments: Sequence[str]) -> int:
-    """1 where something is farther off than LIMIT, or threads give other bits."""
+    """Return 1 if an error exceeds LIMIT or threads change bits."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scenes", nargs="*", help=" ".join(NAMES))
     parser.add_argument("--brief", action="store_true", help="three ways of compiling alone")
     parser.add_argument("--python", action="append", default=[], help="another, which has eomc")
     parser.add_argument("--own", action="store_true", help="one way, of this Python, and no title")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
     fine = True
-    if not given.own:
+    if not options.own:
         what = "accelerations, run, batch beside runs; threads the same bits"
         print(f"units of the last digit: {what}\n", flush=True)
-    rows, others = list(ways()), list(elsewhere())
-    if given.own:
+    rows, others = list(compiler_variants()), list(cross_compiler_variants())
+    if options.own:
         version = ".".join(map(str, sys.version_info[:2]))
         (cc, flags, called), others = rows[2], []
         rows = [(cc, flags, f"{called}, {version}")]
-    elif given.brief:
+    elif options.brief:
         rows, others = [rows[0], rows[3], rows[4]], others[1:2]
-    for name in given.scenes or NAMES:
+    for name in options.scenes or NAMES:
         for real in ("double", "float"):
-            made = Scene(name, real)
+            scene = Scene(name, real)
             for form in ("plain", "fast"):
                 what = f"{name:16} {real:7} {form:6}"
                 for cc, flags, called in rows:
                     os.environ["CC"], os.environ["EOMC_CFLAGS"] = cc, " ".join([flags, *PLAIN])
                     with tempfile.TemporaryDirectory() as place:
-                        *off, same = made.off(built(made.sources, Path(place) / "x", form))
-                    fine &= told(f"{what} {called:26}", off, same)
+                        *errors, same = scene.errors(built(scene.sources, Path(place) / "x", form))
+                    fine &= print_row(f"{what} {called:26}", errors, same)
                 for gcc, flags, run, called in others:
                     with tempfile.TemporaryDirectory() as place:
-                        *off, same = made.off_elsewhere(gcc, flags, run, form, Path(place))
-                    fine &= told(f"{what} {called:26}", off, same)
-        for python in given.python:
+                        *errors, same = scene.errors_on_another_machine(
+                            gcc, flags, run, form, Path(place)
+                        )
+                    fine &= print_row(f"{what} {called:26}", errors, same)
+        for python in options.python:
             own = subprocess.run([python, __file__, name, "--own"], check=False)
             fine &= own.returncode == 0
     return 0 if fine else 1

@@ -1,7 +1,8 @@
-"""The quick tier with the oldest versions that pyproject.toml allows, in an environment of its own.
+"""Run the quick tier with the oldest versions that pyproject.toml allows, in an environment of its
+own.
 
-python tests/hostile/bounds.py                       all of it
-python tests/hostile/bounds.py tests/verify -n 2     some, as pytest takes it
+    python tests/hostile/bounds.py                       all of it
+    python tests/hostile/bounds.py tests/verify -n 2     a part, with arguments of pytest
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ PLACE = ROOT / "build" / "hostile" / "oldest"
 
 
 def oldest() -> list[str]:
-    """Each requirement of a run, of pages and of the tests at its lower bound."""
+    """Return each requirement of runs, pages and tests at its lower bound."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *optional["plot"], *optional["test"]]
-    return [text.replace(">=", "==") for text in wanted if re.fullmatch(r"[\w-]+>=[\d.]+", text)]
+    requirements = [*project["dependencies"], *optional["plot"], *optional["test"]]
+    return [
+        text.replace(">=", "==") for text in requirements if re.fullmatch(r"[\w-]+>=[\d.]+", text)
+    ]
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The status of pytest."""
+    """Return the status of pytest."""
     venv.create(PLACE, with_pip=True)
     python = str(PLACE / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--quiet"]

@@ -4,10 +4,10 @@
     python tests/hostile/calls.py --threads 8                 eight threads, one module
     python tests/hostile/calls.py --only 4711                 one call again
 
-A call returns, or raises ValueError, TypeError, MemoryError, the module's MotionError, each with
-words. Anything else is a find: another exception, an end of the process, more than a gigabyte. A
-call that is not over after STOP seconds gets a Ctrl-C, and has to end within PATIENCE. Some calls
-are made in a fork, some while a timer's signals arrive.
+A call must return, or raise ValueError, TypeError, MemoryError or the module's MotionError with a
+message. Anything else is a finding: another exception, termination of the process, more than a
+gigabyte of memory. A call that takes longer than STOP seconds receives Ctrl-C, and must then end
+within PATIENCE. Some calls run in a forked process, some while timer signals arrive.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Late(KeyboardInterrupt):
 
 
 def module(name: str) -> ModuleType:
-    """One of SCENES, built."""
+    """Build and load one of SCENES."""
     file, more = SCENES[name]
     text = (ROOT / file).read_text(encoding="utf-8").replace("[run]\n", "[run]\n" + more)
     os.environ.setdefault("EOMC_CFLAGS", "-O1")
@@ -68,8 +68,8 @@ def module(name: str) -> ModuleType:
 # --- arguments ------------------------------------------------------------------------------------
 
 
-class Liar:
-    """Has a length, and nothing else."""
+class LengthOnly:
+    """An object with a length that is no array."""
 
     def __len__(self) -> int:
         return 2
@@ -79,7 +79,7 @@ class Liar:
 
 
 def hostile(draw: random.Random, good: Any) -> Any:
-    """What nobody should give; often near to what was good."""
+    """Return an invalid value, often similar to the valid one."""
     size = np.size(good) if isinstance(good, np.ndarray) else 2
     shape = np.shape(good) if isinstance(good, np.ndarray) else (2,)
     zeros = np.zeros(shape)
@@ -98,21 +98,22 @@ def hostile(draw: random.Random, good: Any) -> Any:
         lambda: lambda *a: np.full(9, np.nan), lambda: np.float16(0.5), lambda: np.int8(3),
         lambda: np.broadcast_to(0.5, shape), lambda: memoryview(bytes(8 * size)), lambda: 1e308,
         lambda: 10**12, lambda: 1e-300, lambda: -0.0, lambda: "\ud800", lambda: slice(3),
-        lambda: np.zeros((10**3, size)), lambda: np.empty((0, size)), lambda: Liar(), lambda: ...,
+        lambda: np.zeros((10**3, size)), lambda: np.empty((0, size)), lambda: LengthOnly(),
+        lambda: ...,
         lambda: np.zeros((size, 3))[:, 1],
     ]  # fmt: skip
     return draw.choice(makes)()
 
 
 class Author:
-    """Writes the calls of one module: number k is always the same."""
+    """Generates the calls of one module, reproducibly by number."""
 
     def __init__(self, m: ModuleType) -> None:
         self.m, self.n, self.nu = m, len(m.coordinates), len(m.inputs)
         self.names = [n for n in m.__all__ if callable(getattr(m, n)) and n not in OTHER]
 
     def call(self, draw: random.Random) -> tuple[str, dict[str, Any]]:
-        """Which function, and its arguments by name."""
+        """Return the function's name and its arguments by name."""
         import inspect
 
         name = draw.choice([*self.names, *["simulate"] * 4])
@@ -121,30 +122,30 @@ class Author:
         signature = inspect.signature(getattr(self.m, name))
         many = name not in SINGLE and draw.random() < 0.2
         rows = draw.randint(1, 5)
-        given: dict[str, Any] = {}
+        arguments: dict[str, Any] = {}
         for key, parameter in signature.parameters.items():
             if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 continue
             if parameter.default is not parameter.empty and draw.random() < 0.6:
                 continue
-            made = self.good(key, name, draw, rows if many else 0)
-            if made is not LEFT_OUT:
-                given[key] = made
-        if name in ("simulate", "simulate_batch") and not {"steps", "duration"} & set(given):
-            given["steps"] = draw.randint(0, 30)
+            value = self.good(key, name, draw, rows if many else 0)
+            if value is not LEFT_OUT:
+                arguments[key] = value
+        if name in ("simulate", "simulate_batch") and not {"steps", "duration"} & set(arguments):
+            arguments["steps"] = draw.randint(0, 30)
         if name == "simulate" and draw.random() < 0.002:
-            given = {"steps": 10**12, "every": 10**12}  # until it is stopped
-        for key in list(given):
+            arguments = {"steps": 10**12, "every": 10**12}  # until it is interrupted
+        for key in list(arguments):
             if draw.random() < 0.08:
-                given[key] = hostile(draw, given[key])
+                arguments[key] = hostile(draw, arguments[key])
         if draw.random() < 0.02:
-            given[draw.choice(["z", "q0", "steps", "x"])] = hostile(draw, 1.0)
-        if draw.random() < 0.02 and given:
-            del given[draw.choice(list(given))]
-        return name, given
+            arguments[draw.choice(["z", "q0", "steps", "x"])] = hostile(draw, 1.0)
+        if draw.random() < 0.02 and arguments:
+            del arguments[draw.choice(list(arguments))]
+        return name, arguments
 
     def good(self, key: str, name: str, draw: random.Random, rows: int) -> Any:
-        """A value as users give it, or LEFT_OUT."""
+        """Return a valid value, or LEFT_OUT."""
         n, real = self.n, np.random.default_rng(draw.getrandbits(32))
         shape = (rows, n) if rows or (name.endswith("_batch") and key in ("q0", "qd0")) else (n,)
         shape = (3, n) if shape == (0, n) else shape
@@ -195,7 +196,7 @@ LEFT_OUT = object()
 
 
 class Calls:
-    """Makes calls, and keeps what they do that they should not."""
+    """Makes calls, and stores the findings."""
 
     def __init__(self, names: Sequence[str], seed: int) -> None:
         self.authors = {name: Author(module(name)) for name in names}
@@ -205,29 +206,31 @@ class Calls:
         self.latest = 0.0  # after a Ctrl-C
         self.memory = _peak()
 
-    def drawn(self, k: int) -> tuple[ModuleType, str, dict[str, Any], random.Random]:
-        """Call number k."""
+    def draw_call(self, k: int) -> tuple[ModuleType, str, dict[str, Any], random.Random]:
+        """Return call number k."""
         draw = random.Random(f"{self.seed} call {k}")
         author = self.authors[draw.choice(sorted(self.authors))]
         return author.m, *author.call(draw), draw
 
     def make(self, k: int, alone: bool = True) -> None:
-        """Call number k. alone: in the main thread, where signals come."""
-        m, name, given, draw = self.drawn(k)
-        if not alone and any(key in given and _long(given[key]) for key in ("steps", "duration")):
-            return  # Ctrl-C goes to the main thread
+        """Make call number k. alone: in the main thread, which receives signals."""
+        m, name, arguments, draw = self.draw_call(k)
+        if not alone and any(
+            key in arguments and _long(arguments[key]) for key in ("steps", "duration")
+        ):
+            return  # Ctrl-C reaches the main thread only
         if alone and draw.random() < 0.002:
-            self.in_a_fork(k, m, name, given)
+            self.in_a_fork(k, m, name, arguments)
             return
-        every = 0.001 if draw.random() < 0.1 else 0.0  # signals all the while
+        every = 0.001 if draw.random() < 0.1 else 0.0  # signals during the whole call
         began = time.perf_counter()
         if alone:
             Interrupts.until = began + STOP
             signal.setitimer(signal.ITIMER_REAL, every or STOP, every or STOP)
         try:
-            getattr(m, name)(**given)
+            getattr(m, name)(**arguments)
             self.outcomes["result"] += 1
-        except KeyboardInterrupt:  # a run has its own, with what was done
+        except KeyboardInterrupt:  # an interrupted run has its own exception, with the rows so far
             self.latest = max(self.latest, time.perf_counter() - Interrupts.heard)
             self.outcomes["interrupted"] += 1
             if time.perf_counter() - Interrupts.heard > PATIENCE:
@@ -241,7 +244,7 @@ class Calls:
             if isinstance(fault, np.linalg.LinAlgError):
                 self.keep(k, traceback.format_exc())
         except BaseException as fault:
-            # of a function that was given
+            # raised by a function passed as argument
             if traceback.extract_tb(fault.__traceback__)[-1].filename != __file__:
                 self.keep(k, traceback.format_exc())
         finally:
@@ -253,14 +256,14 @@ class Calls:
             self.memory = _peak()
             self.keep(k, f"{name}: {_peak() / 2**20:.0f} MB")
 
-    def in_a_fork(self, k: int, m: ModuleType, name: str, given: dict[str, Any]) -> None:
-        """The call in a child, which has to end by itself."""
+    def in_a_fork(self, k: int, m: ModuleType, name: str, arguments: dict[str, Any]) -> None:
+        """Make the call in a child process, which must end by itself."""
         child = os.fork()
         if child == 0:
             signal.alarm(20)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             with contextlib.suppress(Exception):
-                getattr(m, name)(**{**given, **({"steps": 9} if "steps" in given else {})})
+                getattr(m, name)(**{**arguments, **({"steps": 9} if "steps" in arguments else {})})
             os._exit(0)
         _, status = os.waitpid(child, 0)
         self.outcomes["in a fork"] += 1
@@ -268,12 +271,12 @@ class Calls:
             self.keep(k, f"{name}: a fork ended with {status}")
 
     def keep(self, k: int, words: str) -> None:
-        """Print a find, once for each last line of its words."""
+        """Print a finding, once for each last line of its traceback."""
         key = words.strip().splitlines()[-1][:60]
         if key not in self.found:
             self.found[key] = words
-            _, name, given, _ = self.drawn(k)
-            print(f"\n--- call {k} of seed {self.seed}: {name}({given})\n{words}", flush=True)
+            _, name, arguments, _ = self.draw_call(k)
+            print(f"\n--- call {k} of seed {self.seed}: {name}({arguments})\n{words}", flush=True)
 
 
 def _long(value: Any) -> bool:
@@ -281,14 +284,14 @@ def _long(value: Any) -> bool:
 
 
 class Interrupts:
-    """What the timer's signals do: nothing, until a call has taken STOP seconds."""
+    """Handler of timer signals: it does nothing until a call has taken STOP seconds."""
 
     until = 0.0
     heard = 0.0
 
     @classmethod
     def ring(cls, *_: Any) -> None:
-        """The handler."""
+        """Handle a signal."""
         if time.perf_counter() >= cls.until:
             cls.heard = time.perf_counter()
             cls.until = cls.heard + 60
@@ -302,7 +305,7 @@ def _peak() -> int:
 def run(
     names: Sequence[str], first: int, count: int, seed: int, threads: int, shared: mmap.mmap
 ) -> int:
-    """All calls; what is made now stands in `shared`. 1 where something was found."""
+    """Make all calls; `shared` holds the current numbers. Return 1 if there are findings."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGALRM, Interrupts.ring)
     calls = Calls(names, seed)
@@ -322,9 +325,9 @@ def run(
             thread.start()
         for thread in crowd:
             thread.join()
-    told = ", ".join(f"{n} {what}" for what, n in calls.outcomes.most_common())
+    summary = ", ".join(f"{n} {what}" for what, n in calls.outcomes.most_common())
     print(
-        f"{count} calls in {time.monotonic() - began:.0f} s by {threads} threads: {told}; "
+        f"{count} calls in {time.monotonic() - began:.0f} s by {threads} threads: {summary}; "
         f"{len(calls.found)} finds; {calls.latest:.3f} s after a Ctrl-C at most; "
         f"memory {_peak() / 2**20:.0f} MB"
     )
@@ -332,28 +335,28 @@ def run(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """1 where something was found, 2 where the process ended."""
+    """Return 1 if there are findings, 2 if the process terminated."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scenes", nargs="*", help=" ".join(SCENES))
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--only", type=int, metavar="N", help="that call alone")
-    given = parser.parse_args(arguments)
-    names = given.scenes or list(SCENES)
-    first, count = (0, given.count) if given.only is None else (given.only, 1)
+    options = parser.parse_args(arguments)
+    names = options.scenes or list(SCENES)
+    first, count = (0, options.count) if options.only is None else (options.only, 1)
     for name in names:
         module(name)
     sys.stdout.flush()
-    # in a child, so that an end of the process is seen, and which calls were being made
-    with mmap.mmap(-1, 8 * max(given.threads, 1)) as shared:
+    # In a child process, so that its termination and the calls in progress can be reported.
+    with mmap.mmap(-1, 8 * max(options.threads, 1)) as shared:
         child = os.fork()
         if child == 0:
             status = 3
-            # where a call hangs, its place is told
-            faulthandler.dump_traceback_later(100 + given.count / 100, exit=True)
+            # prints the traceback of a call that hangs
+            faulthandler.dump_traceback_later(100 + options.count / 100, exit=True)
             try:
-                status = run(names, first, count, given.seed, given.threads, shared)
+                status = run(names, first, count, options.seed, options.threads, shared)
             except BaseException:
                 traceback.print_exc()
             sys.stdout.flush()
@@ -361,8 +364,8 @@ def main(arguments: Sequence[str]) -> int:
             os._exit(status)
         _, status = os.waitpid(child, 0)
         if os.WIFSIGNALED(status):
-            now = [struct.unpack("q", shared[8 * i : 8 * i + 8])[0] for i in range(given.threads)]
-            which = f"in calls {now}, seed {given.seed}"
+            now = [struct.unpack("q", shared[8 * i : 8 * i + 8])[0] for i in range(options.threads)]
+            which = f"in calls {now}, seed {options.seed}"
             print(f"the process ended by signal {os.WTERMSIG(status)} {which}")
             return 2
         return os.waitstatus_to_exitcode(status)

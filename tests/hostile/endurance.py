@@ -1,14 +1,13 @@
-"""Builds, runs and checks in a loop: memory, handles, threads and files stay as they are.
+"""Build, run and check in a loop: memory, handles, threads and files must stay constant.
 
     python tests/hostile/endurance.py --minutes 15
 
-One process reads, derives and builds scenes that are new each round, runs and checks modules that
-it loaded once, and is refused what is wrong. A fork loads and checks what was built: Python never
-unloads an extension. After two fifths of the rounds, when caches are full, nothing may grow.
-
-A leak is what is in use: Python's blocks and what malloc has given out are judged, and the pages of
-the process itself once malloc has given back what is free. That is 5 to 9 MB of 96, of which pages
-are touched sooner or later; pages of libraries are the kernel's to keep or drop.
+One process reads, derives and builds scenes that are new in each round, runs and checks modules
+that it loaded once, and reads invalid scenes. A forked process loads and checks the new builds,
+because Python never unloads an extension. After two fifths of the rounds, when caches are full,
+nothing may grow. Memory in use is judged: Python's blocks and malloc's allocations, and the pages
+of the process itself after malloc has returned free ones. These are 5 to 9 MB of 96, of which pages
+are touched sooner or later; the kernel may keep or drop pages of libraries.
 """
 
 from __future__ import annotations
@@ -38,24 +37,24 @@ from eomc.base.errors import SceneError
 from eomc.verify.check import check
 
 EVENT = '[[event]]\nname = "low"\nwhen = "theta"\n'
-ASKED = 'batch = true\nlinearize = true\nmethod = ["rk4", "dp8"]\n'
+OPTIONS = 'batch = true\nlinearize = true\nmethod = ["rk4", "dp8"]\n'
 BUILT = {  # under [run], and at the end
     "simple_pendulum": ("", EVENT),
-    "cartpole_driven": (ASKED, ""),
+    "cartpole_driven": (OPTIONS, ""),
     "pendulum_xy": ("", ""),
     "suspension": ("", ""),
 }
-MORE = 0.01  # of memory, objects and heap, from the third fifth of the rounds to the last
-LEAST = 1 << 20  # bytes that allocators hold or not
+MORE = 0.01  # growth of memory, objects and heap, from the third fifth of the rounds to the last
+LEAST = 1 << 20  # bytes, allowed noise of allocators
 WRONG = 'eomc = 1\nname = "wrong"\n[coordinates]\nx = { start = "y" }\n[energy]\nkinetic = "x"'
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What this process has: its own bytes in memory, objects, bytes in use of C's heap, and more.
+    """Resources of this process: memory, objects, allocated bytes of the C heap, and more.
 
-    memory: without what malloc holds and nobody uses. objects: blocks of Python's allocator. heap:
-    0 where the C library does not tell. handles that are open, threads, children, files left.
+    memory: without free memory that malloc holds. objects: blocks of Python's allocator. heap: 0 if
+    the C library does not report it. Also open handles, threads, child processes, and files.
     """
 
     memory: int
@@ -68,7 +67,7 @@ class Sample:
 
 
 class _MallInfo(ctypes.Structure):
-    """What mallinfo2 of glibc returns, all of size_t."""
+    """Result of glibc's mallinfo2, all of type size_t."""
 
     _fields_ = tuple(
         (name, ctypes.c_size_t)
@@ -80,7 +79,9 @@ class _MallInfo(ctypes.Structure):
 
 
 def _heap() -> int:
-    """Bytes that malloc has given out, mapped ones too; what is free is given back."""
+    """Return the bytes allocated by malloc, including mapped ones, after free memory is
+    returned.
+    """
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallinfo2"):
         return 0
@@ -91,7 +92,7 @@ def _heap() -> int:
 
 
 def sample(folder: Path) -> Sample:
-    """Now. folder: where all files of the loop lie, temporary ones too."""
+    """Return the current sample. folder: contains all files of the loop, also temporary ones."""
     gc.collect()
     objects, heap = sys.getallocatedblocks(), _heap()
     status = Path("/proc/self/status").read_text(encoding="ascii")
@@ -103,13 +104,14 @@ def sample(folder: Path) -> Sample:
         len(list(Path("/proc/self/fd").iterdir())),
         len(tasks),
         sum(len((task / "children").read_text(encoding="ascii").split()) for task in tasks),
-        # builds of other versions of a scene are kept up to a number: tests/toolchain/test_cache.py
+        # Builds of other versions of a scene are stored up to a limit:
+        # tests/toolchain/test_cache.py.
         sum(1 for file in folder.rglob("*") if ".builds" not in file.parts),
     )
 
 
-def grown(samples: Sequence[Sample]) -> list[str]:
-    """What has grown from the third fifth of the samples to the last, in words."""
+def growth_messages(samples: Sequence[Sample]) -> list[str]:
+    """Return messages about growth from the third fifth of the samples to the last."""
     fifth = len(samples) // 5
     early, late = samples[2 * fifth : 3 * fifth], samples[-fifth:]
     slack = {"memory": LEAST, "objects": 0, "heap": 0}
@@ -130,12 +132,14 @@ class Loop:
     def __init__(self, folder: Path) -> None:
         self.folder, self.root = folder, folder / "build"
         os.environ["EOMC_CFLAGS"] = "-O0"
-        self.made = {name: eomc.read(self.scene(name, 0)) for name in BUILT}
-        self.loaded = {name: eomc.load(made, folder / "own") for name, made in self.made.items()}
+        self.systems = {name: eomc.read(self.scene(name, 0)) for name in BUILT}
+        self.loaded = {
+            name: eomc.load(system, folder / "own") for name, system in self.systems.items()
+        }
         self.samples: list[Sample] = []
 
     def scene(self, name: str, number: int) -> Path:
-        """The file of a scene, another one for each number."""
+        """Write the file of a scene, which differs for each number."""
         run, end = BUILT[name]
         text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
         assert "\n[run]\n" in text and "[constants]" not in text
@@ -145,7 +149,9 @@ class Loop:
         return file
 
     def round(self) -> None:
-        """Each scene built anew, one checked in a fork; each loaded module run, one checked."""
+        """Build each scene again, check one in a forked process; run each loaded module, check
+        one.
+        """
         number = len(self.samples)
         for k, name in enumerate(BUILT):
             file = self.scene(name, number + 1)
@@ -157,7 +163,7 @@ class Loop:
         for name, module in self.loaded.items():
             self._run(module)
             if number % len(BUILT) == list(BUILT).index(name):
-                report = check(self.made[name], module, states=4)
+                report = check(self.systems[name], module, states=4)
                 assert report.passed, report.table()
         self.samples.append(sample(self.folder))
 
@@ -189,8 +195,8 @@ class Loop:
         raise AssertionError("a wrong scene was built")
 
 
-def ran(folder: Path, seconds: float) -> list[Sample]:
-    """Samples of rounds for so long, ten at least."""
+def run_rounds(folder: Path, seconds: float) -> list[Sample]:
+    """Return samples of at least ten rounds, and of all rounds within the time."""
     os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
     loop, end = Loop(folder), time.monotonic() + seconds
     while time.monotonic() < end or len(loop.samples) < 10:
@@ -199,17 +205,17 @@ def ran(folder: Path, seconds: float) -> list[Sample]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """1 where something has grown."""
+    """Return 1 if something has grown."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=15)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        samples = ran(Path(folder), 60 * given.minutes)
+        samples = run_rounds(Path(folder), 60 * options.minutes)
     fifth = len(samples) // 5
     for at in (0, fifth, 2 * fifth, 3 * fifth, 4 * fifth, len(samples) - 1):
         print(f"round {at}: {samples[at]}")
-    print(f"{len(samples)} rounds: " + ("; ".join(grown(samples)) or "flat"))
-    return int(bool(grown(samples)))
+    print(f"{len(samples)} rounds: " + ("; ".join(growth_messages(samples)) or "flat"))
+    return int(bool(growth_messages(samples)))
 
 
 if __name__ == "__main__":

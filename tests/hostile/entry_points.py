@@ -1,12 +1,13 @@
-"""Random bytes as arguments of every function of a scene's header, under ASan and UBSan.
+"""Random bytes as arguments of every function of a scene's header, with ASan and UBSan.
 
     python tests/hostile/entry_points.py --seconds 60           each scene, plain and fast
     python tests/hostile/entry_points.py four_bar --form fast --seed 3
 
-The driver is made from the header: arrays are as long as it says, numbers are ordinary in half of
-the inputs, and in the other half infinite, not numbers, huge and tiny too. With clang libFuzzer
-leads it to new branches; with gcc the bytes are random alone. Besides what sanitizers see, a
-function that returns OK must leave finite results, and one that does not what it was given.
+The driver is generated from the header: arrays have the documented lengths, numbers are ordinary in
+half of the inputs; in the other half some are infinite, NaN, huge or tiny. With clang, libFuzzer
+guides it to new branches; with gcc the bytes are random. Besides errors reported by sanitizers, a
+function that returns OK must leave finite results, and one that does not must leave its arguments
+unchanged.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LOCAL = HERE / "corpus" / "scene"
 SANITIZERS = "address,undefined,float-cast-overflow"
-INPUTS = 400_000  # a second's worth and more where there is no libFuzzer
+INPUTS = 400_000  # at least a second's worth without libFuzzer
 
-# scenes of their own name or of the corpus, and what stands under [run] besides
+# scenes of this name or of the corpus, and lines added under [run]
 VARIANTS: dict[str, tuple[str, str]] = {
     "cartpole_driven": ("cartpole_driven", 'method = ["rk4", "dp8"]\nbatch = true\n'),
     "double_pendulum": (
@@ -53,7 +54,7 @@ VARIANTS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Argument:
-    """One of a prototype: what stands before its name, and how long an array it is."""
+    """An argument of a prototype: the text before its name, and its array length."""
 
     kind: str
     name: str
@@ -70,23 +71,23 @@ class Function:
 
 
 def functions(header: str, scene: str) -> Iterator[Function]:
-    """All of a header."""
+    """Yield all prototypes of a header."""
     bare = re.sub(r"/\*.*?\*/", "", header, flags=re.S)
-    for found in re.finditer(rf"^(\w+) ({scene}_\w+)\(([^;]*?)\);", bare, re.M | re.S):
-        arguments = tuple(_argument(text) for text in found[3].split(","))
-        yield Function(found[1], found[2], arguments)
+    for match in re.finditer(rf"^(\w+) ({scene}_\w+)\(([^;]*?)\);", bare, re.M | re.S):
+        arguments = tuple(_argument(text) for text in match[3].split(","))
+        yield Function(match[1], match[2], arguments)
 
 
 def _argument(text: str) -> Argument:
-    found = re.fullmatch(r"\s*(.*?)\s*(\w+)\s*(?:\[(.*)\])?\s*", " ".join(text.split()))
-    assert found is not None, text
-    return Argument(found[1], found[2], found[3] or "")
+    match = re.fullmatch(r"\s*(.*?)\s*(\w+)\s*(?:\[(.*)\])?\s*", " ".join(text.split()))
+    assert match is not None, text
+    return Argument(match[1], match[2], match[3] or "")
 
 
-# --- the driver -----------------------------------------------------------------------------------
+# --- driver ---------------------------------------------------------------------------------------
 
-# what an argument is called, and what stands for it; {R} the element type, {N} and {n} the prefixes
-BESIDE = {
+# Names of scalar arguments and their values; {R} is the element type, {N} and {n} the prefixes.
+SCALARS = {
     "steps": "up_to(24)", "every": "up_to(5)", "count": "up_to(9)", "room": "up_to(80)",
     "first": "byte() % 3 ? up_to(9) : 1099511627776L", "u_stride": "byte() % 2 ? {nu} : 0",
     "u_instance": "byte() % 2 ? {nu}*(steps + 1) : 0", "u_step": "byte() % 2 ? {nu} : 0",
@@ -99,7 +100,7 @@ ARRAYS = {
 
 
 class Driver:
-    """The text of the driver of one header."""
+    """Generates the driver of one header."""
 
     def __init__(self, scene: str, header: str) -> None:
         self.n, self.N = scene, scene.upper()
@@ -109,7 +110,7 @@ class Driver:
         self.nu = f"{self.N}_NU" if f"{self.N}_NU" in header else "0"
 
     def text(self) -> str:
-        """All of it."""
+        """Return the whole text."""
         cases = "\n".join(self._case(k, f) for k, f in enumerate(self.functions))
         return (
             f"#define REAL {self.real}\n#include <{self.n}.h>\n#include <entry_points.h>\n\n"
@@ -130,24 +131,24 @@ class Driver:
         batch, adaptive = f.name.endswith("_batch"), f.name.endswith("_adaptive")
         rows = "2*steps" if adaptive else "count*row_count" if batch else "(steps + 1)"
         lines = []
-        for name in BESIDE:  # in this order: some are made of others
+        for name in SCALARS:  # in this order, because some depend on others
             if name in names:
-                value = BESIDE[name].format(nu=self.nu)
+                value = SCALARS[name].format(nu=self.nu)
                 lines.append(f"const long {name} = {value};")
         many = f.name.endswith("_adaptive_batch")
         if many:
             lines.append("const long row_count = up_to(6);")
         elif batch:
-            lines[:] = [x.replace(BESIDE["first"], "up_to(9)") for x in lines]
+            lines[:] = [x.replace(SCALARS["first"], "up_to(9)") for x in lines]
             lines.append("const long row_count = (first + steps)/(every ? every : 1) + 2;")
         if "times" in names:
             lines.append("const int asked = byte() % 2;")
             rows = rows if many else "(asked ? count : 2*steps)"
-        made = [self._value(f, a, rows, batch) for a in f.arguments]
+        values = [self._value(f, a, rows, batch) for a in f.arguments]
         results = [
-            (a, name) for a, (name, _) in zip(f.arguments, made, strict=True) if self._result(a)
+            (a, name) for a, (name, _) in zip(f.arguments, values, strict=True) if self._result(a)
         ]
-        lines += [text for _, text in made if text]
+        lines += [text for _, text in values if text]
         row_count = "row_count" if many else "count"
         if many:
             lines.append(
@@ -158,7 +159,7 @@ class Driver:
                 f"{{ REAL at = *a_t; long i; for (i = 0; a_times && i < {row_count}; i++) "
                 "a_times[i] = at += (REAL)ldexp(1.0, -(int)(byte() % 30)); }"
             )
-        call = f"{f.name}({', '.join(name for name, _ in made)})"
+        call = f"{f.name}({', '.join(name for name, _ in values)})"
         before = [(name, self._size(a)) for a, name in results]
         for name, size in before:
             lines.append(f"REAL *was_{name} = copied({name}, {size});")
@@ -170,7 +171,7 @@ class Driver:
         if f.result.endswith("_status"):
             lines = [f"const int status = (int){call};"]
             if f.name.endswith("_step") or f.name.endswith("_project"):
-                # what comes in need not be finite
+                # inputs need not be finite
                 fine = " && ".join(f"finite_all(was_{n}, {s})" for n, s in before) or "1"
                 lines.append(f"const int fine = {fine};")
             else:
@@ -180,7 +181,7 @@ class Driver:
                 for n, s in before
             ]
         if f.result == "long":
-            # by a memory, and perhaps cut in two
+            # with a workspace, and possibly in two parts
             again = f"if (byte() % 2 && *a_status == {self.N}_OK) (void){call};"
             fresh = "if (byte() % 3 == 0) a_memory = space(sizeof *a_memory);"
             lines = [
@@ -192,22 +193,24 @@ class Driver:
             fine = " && ".join(f"finite_all(was_{n}, {s})" for n, s in before)
             if any(a.name == "t" and a.kind == f"{self.real} *" for a in f.arguments):
                 fine += " && isfinite(before_t)"
-            lines.append(f"if ({fine}) {{ {' '.join(self._kept(f, n, s) for n, s in before)} }}")
+            lines.append(
+                f"if ({fine}) {{ {' '.join(self._check_finite(f, n, s) for n, s in before)} }}"
+            )
             return lines
         again = [f"if (byte() % 2) (void){call};"] if f.name.endswith("_adaptive_batch") else []
         return [f"(void){call};", *again]
 
     def _stepped(self, f: Function) -> list[str]:
-        """Steps of fixed size, in which events are seen, in place of adaptive ones."""
+        """Return steps of fixed size with event location, as a substitute for adaptive ones."""
         steps = [x.name for x in self.functions if x.name.endswith("_step")]
         if not (f.name.endswith("_adaptive") and self.fixed):
             return []
         return [f"if (a_memory && byte() % 2) a_memory->step = {one};" for one in steps]
 
-    def _kept(self, f: Function, name: str, size: str) -> str:
+    def _check_finite(self, f: Function, name: str, size: str) -> str:
         what = f'"{f.name}", "a run left what is not finite"'
-        said = f"(int)*a_status, {name}, was_{name}, {size}"
-        return f"if (!finite_all({name}, {size})) broken({what}, {said});"
+        arguments = f"(int)*a_status, {name}, was_{name}, {size}"
+        return f"if (!finite_all({name}, {size})) broken({what}, {arguments});"
 
     def _result(self, a: Argument) -> bool:
         return bool(a.size) and a.kind == self.real
@@ -216,7 +219,7 @@ class Driver:
         return f"(long)({a.size})"
 
     def _value(self, f: Function, a: Argument, rows: str, batch: bool) -> tuple[str, str]:
-        """What is handed over, and the line that makes it."""
+        """Return the expression that is passed, and the line that defines it."""
         R, name, own = self.real, a.name, f"a_{a.name}"
         if a.kind == "long":
             return name, ""
@@ -227,12 +230,12 @@ class Driver:
             return own, f"const {R} {own} = ({R}){'small_number()' if small else 'number()'};"
         if name == "p":
             count = "(p_instance ? count : 1)" if batch else "1"
-            made = f"{self.n}_params *{own} = "
+            text = f"{self.n}_params *{own} = "
             default = "" if batch else f"byte() % 2 ? ({self.n}_params *)&{self.n}_defaults : "
-            return own, f"{made}{default}parameters({count});"
+            return own, f"{text}{default}parameters({count});"
         if name == "memory" and batch:
-            made = f"space((size_t)(count + 1)*sizeof *{own})"
-            return own, f"{f.name.removesuffix('_batch')}_memory *{own} = {made};"
+            text = f"space((size_t)(count + 1)*sizeof *{own})"
+            return own, f"{f.name.removesuffix('_batch')}_memory *{own} = {text};"
         if name == "memory":
             return own, f"{f.name.removesuffix('_run')}_memory *{own} = NULL;"
         if name == "status":
@@ -244,15 +247,15 @@ class Driver:
             return own, f"long *{own} = space((size_t)({count})*sizeof *{own});"
         if name == "held":
             fill = f"for (i = 0; {own} && i < 2*{self.N}_NQ; i++) {own}[i] = (int)(byte() % 2);"
-            made = f"byte() % 2 ? space(2*{self.N}_NQ*sizeof *{own}) : NULL"
-            return own, f"int *{own} = {made}; {{ int i; {fill} }}"
+            text = f"byte() % 2 ? space(2*{self.N}_NQ*sizeof *{own}) : NULL"
+            return own, f"int *{own} = {text}; {{ int i; {fill} }}"
         if name == "which":
-            made = f"space((size_t)({'count*' if batch else ''}room)*sizeof *{own})"
-            return own, f"int *{own} = byte() % 2 ? {made} : NULL;"
+            text = f"space((size_t)({'count*' if batch else ''}room)*sizeof *{own})"
+            return own, f"int *{own} = byte() % 2 ? {text} : NULL;"
         return self._reals(f, a, rows, batch)
 
     def _reals(self, f: Function, a: Argument, rows: str, batch: bool) -> tuple[str, str]:
-        """An array of numbers."""
+        """Return an array of numbers."""
         R, name, own = self.real, a.name, f"a_{a.name}"
         if a.size:
             filled = a.kind.startswith("const") or name in ("q", "qd")
@@ -272,8 +275,8 @@ class Driver:
             return own, f"{R} *{own} = given(count*{self.N}_NQ);"
         if name == "t":
             count = "count + 1" if batch else "1"
-            made = f"{R} *{own} = given({count})"
-            return own, f"{made}; const {R} before_t = *{own}; (void)before_t;"
+            text = f"{R} *{own} = given({count})"
+            return own, f"{text}; const {R} before_t = *{own}; (void)before_t;"
         if name == "times":
             return own, f"{R} *{own} = asked ? given({'row_count' if batch else 'count'}) : NULL;"
         if name in ARRAYS:
@@ -287,7 +290,7 @@ class Driver:
 
 
 def scene_text(name: str) -> str:
-    """Of a scene or of VARIANTS."""
+    """Return the text of a scene or of one of VARIANTS."""
     base, more = VARIANTS.get(name, (name, ""))
     file = next(
         f / f"{base}.toml" for f in (LOCAL, ROOT / "scenes") if (f / f"{base}.toml").exists()
@@ -301,7 +304,7 @@ def scene_text(name: str) -> str:
 
 
 def compilers() -> Iterator[tuple[list[str], bool]]:
-    """Commands, and whether they have libFuzzer."""
+    """Yield commands, and whether they have libFuzzer."""
     for name in ("clang", "clang-14", "clang-15", "clang-16", "clang-19"):
         if path := shutil.which(name):
             with tempfile.TemporaryDirectory() as place:
@@ -317,7 +320,7 @@ def compilers() -> Iterator[tuple[list[str], bool]]:
 
 
 def built(name: str, form: str, folder: Path) -> tuple[Path, bool]:
-    """The driver of a scene, compiled, and whether libFuzzer is in it."""
+    """Compile the driver of a scene; return its path and whether it contains libFuzzer."""
     system = assembled(from_scene(parse(scene_text(name), f"{name}.toml")))
     for file, text in eomc.sources(system, "_none").files.items():
         if file.endswith((".c", ".h")):
@@ -339,14 +342,14 @@ def built(name: str, form: str, folder: Path) -> tuple[Path, bool]:
         words.append("-march=native")
     words += ["-fsanitize=fuzzer"] if fuzzer else ["-DALONE"]
     files = ["driver.c", f"{at}/{system.name}.c", "-lm", "-o", "driver"]
-    done = subprocess.run([*command, *words, *files], cwd=folder, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
+    process = subprocess.run([*command, *words, *files], cwd=folder, capture_output=True, text=True)
+    if process.returncode:
+        raise RuntimeError(process.stderr)
     return folder / "driver", fuzzer
 
 
-def fuzzed(name: str, form: str, seconds: int, seed: int, folder: Path) -> tuple[bool, str]:
-    """Whether nothing was found, and what the driver told."""
+def run_driver(name: str, form: str, seconds: int, seed: int, folder: Path) -> tuple[bool, str]:
+    """Run a driver; return whether there are no findings, and its output."""
     driver, fuzzer = built(name, form, folder)
     grown = ROOT / "build" / "hostile" / "corpus" / f"c_{name}_{form}"
     grown.mkdir(parents=True, exist_ok=True)
@@ -360,8 +363,8 @@ def fuzzed(name: str, form: str, seconds: int, seed: int, folder: Path) -> tuple
         "ASAN_OPTIONS": "detect_leaks=0",
         "UBSAN_OPTIONS": "print_stacktrace=1",
     }
-    # by a shell: the peak of memory that Linux tells of a program is at least its parent's
-    done = subprocess.run(
+    # Run by a shell, because the peak memory that Linux reports is at least that of the parent.
+    process = subprocess.run(
         ["sh", "-c", '"$@" & wait $!', "sh", str(driver), *words],
         cwd=folder,
         capture_output=True,
@@ -369,35 +372,35 @@ def fuzzed(name: str, form: str, seconds: int, seed: int, folder: Path) -> tuple
         env=with_own,
         errors="replace",
     )
-    return done.returncode == 0, done.stderr
+    return process.returncode == 0, process.stderr
 
 
 def main(arguments: Sequence[str]) -> int:
-    """1 where something was found."""
+    """Return 1 if there are findings."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scenes", nargs="*", help=" ".join(VARIANTS))
     parser.add_argument("--form", choices=["plain", "fast"])
     parser.add_argument("--seconds", type=int, default=20, help="each")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="where the drivers are left")
-    given = parser.parse_args(arguments)
-    found, calls = 0, 0
-    for name in given.scenes or VARIANTS:
-        for form in [given.form] if given.form else ["plain", "fast"]:
+    options = parser.parse_args(arguments)
+    findings, calls = 0, 0
+    for name in options.scenes or VARIANTS:
+        for form in [options.form] if options.form else ["plain", "fast"]:
             with tempfile.TemporaryDirectory() as place:
                 folder = Path(place)
-                if given.keep:
-                    folder = given.keep / f"{name}_{form}"
+                if options.keep:
+                    folder = options.keep / f"{name}_{form}"
                     folder.mkdir(parents=True, exist_ok=True)
-                good, words = fuzzed(name, form, given.seconds, given.seed, folder)
+                good, words = run_driver(name, form, options.seconds, options.seed, folder)
             count = re.search(r"^CALLS (\d+).*$", words, re.M)
             calls += int(count[1]) if count else 0
             print(f"{name}, {form}: {count[0].lower() if count else 'ended early'}", flush=True)
             if not good:
-                found += 1
+                findings += 1
                 print(words[-6000:], flush=True)
-    print(f"in all {calls} calls, {found} finds")
-    return int(bool(found))
+    print(f"in all {calls} calls, {findings} finds")
+    return int(bool(findings))
 
 
 if __name__ == "__main__":

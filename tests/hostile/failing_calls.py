@@ -1,13 +1,13 @@
-"""Calls of the system that fail in builds and runs: quotas of users, full disks, damaged ones.
+"""System calls that fail in builds and runs: user quotas, full disks, damaged disks.
 
-    python tests/hostile/failing_calls.py               each call, and all from each on
-    python tests/hostile/failing_calls.py --every 8     each eighth of them
+    python tests/hostile/failing_calls.py               each call, and all calls from each on
+    python tests/hostile/failing_calls.py --every 8     every eighth of them
 
-A first build is watched by strace (Linux), which lists the calls that change or read a file of the
-build's folder. Each of these then fails in a build of its own, or fails with all like it that come
-after, as a quota has it. The build says so or succeeds; the module that is there is the old one or
-the new one, whole; nothing is left beside it, nor among temporary files; the next build makes the
-new one. So with what the compilers call, and with the file that `eomc run --out` replaces.
+strace (Linux) lists the calls of a first build that change or read a file of the build's folder.
+Each of these then fails in a build of its own, alone or with all later calls of its kind, as with a
+quota. The build must report the error or succeed; the module that exists afterwards is the old or
+the new one, complete; no other or temporary files remain; the next build makes the new one. The
+same holds for calls of the compilers, and for the file that `eomc run --out` replaces.
 """
 
 from __future__ import annotations
@@ -42,27 +42,28 @@ from eomc.toolchain import compiler
 
 CHANGES = ("openat", "write", "rename", "mkdir")
 QUOTA, FULL, DAMAGED = "EDQUOT", "ENOSPC", "EIO"
-# an openat that fails from then on would also fail where files are only read, as no quota does
+# If every later openat failed, reading would fail too, unlike with a quota.
 FAULTS = [(call, QUOTA, then) for call in CHANGES for then in ("", "+") if call + then != "openat+"]
 FAULTS += [("rename", FULL, ""), ("mkdir", FULL, ""), ("read", DAMAGED, "")]
 COMPILERS = [("write", QUOTA, "+"), ("write", FULL, ""), ("read", DAMAGED, "")]
-ANY_TRACER = 0x59616D61, -1  # prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY): Yama may forbid it
+# prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY), because Yama may forbid tracing
+ANY_TRACER = 0x59616D61, -1
 ANSWER = 1 << 16  # bytes
-NEVER = 65_535  # the largest that strace takes
+NEVER = 65_535  # the largest number that strace accepts
 
 
 @dataclass(frozen=True)
 class Call:
-    """The n-th call of that name, from 1 on."""
+    """The n-th call of that name, counted from 1."""
 
     name: str
     n: int
 
 
-def watched(work: Callable[[], object], how: Sequence[str]) -> tuple[str, str]:
-    """What `work` returns or raises, from a fork that strace watches: ("done" or "raised", words).
+def run_traced(work: Callable[[], object], how: Sequence[str]) -> tuple[str, str]:
+    """Return ("done" or "raised", text) of `work`, run in a forked process under strace.
 
-    No call of the system tells of it: that might fail.
+    The result is passed through shared memory, because system calls might fail.
     """
     answer = mmap.mmap(-1, ANSWER)
     reading, writing = os.pipe()
@@ -72,12 +73,12 @@ def watched(work: Callable[[], object], how: Sequence[str]) -> tuple[str, str]:
             import ctypes
 
             ctypes.CDLL(None).prctl(*ANY_TRACER, 0, 0, 0)
-        os.read(reading, 1)  # until it is watched
+        os.read(reading, 1)  # until strace is attached
         try:
-            told = ["done", str(work())]
+            result = ["done", str(work())]
         except BaseException as fault:
-            told = ["raised", f"{type(fault).__name__}: {fault}"]
-        text = json.dumps(told).encode()
+            result = ["raised", f"{type(fault).__name__}: {fault}"]
+        text = json.dumps(result).encode()
         answer[: len(text)] = text
         os._exit(0)
     strace = subprocess.Popen(
@@ -103,13 +104,13 @@ def watched(work: Callable[[], object], how: Sequence[str]) -> tuple[str, str]:
 
 
 def calls(log: Path, folder: Path) -> Iterator[Call]:
-    """Those that change or read a file under `folder` and succeed, of a log of strace's."""
+    """Yield successful calls that change or read a file under `folder`, from a log of strace."""
     counts: Counter[str] = Counter()
     for line in log.read_text(errors="replace").splitlines():
-        found = re.match(r"(\w+)\((.*)\) = (-?\d+)", line)
-        if not found:
+        match = re.match(r"(\w+)\((.*)\) = (-?\d+)", line)
+        if not match:
             continue
-        name, arguments, result = found.groups()
+        name, arguments, result = match.groups()
         counts[name] += 1
         only_read = name == "openat" and "O_CREAT" not in arguments
         if str(folder) in arguments and int(result) >= 0 and not only_read:
@@ -120,9 +121,9 @@ EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 
 
 def files(folder: Path) -> list[Path]:
-    """All below but bytecode and the builds of other versions that are kept."""
-    found = (f for f in folder.rglob("*") if ".builds" not in f.relative_to(folder).parts)
-    return [f for f in found if f.is_file() and f.suffix != ".pyc"]
+    """Return all files below but bytecode and stored builds of other versions."""
+    paths = (f for f in folder.rglob("*") if ".builds" not in f.relative_to(folder).parts)
+    return [f for f in paths if f.is_file() and f.suffix != ".pyc"]
 
 
 class Failing:
@@ -130,7 +131,7 @@ class Failing:
 
     def __init__(self, folder: Path) -> None:
         os.environ["EOMC_CFLAGS"] = "-O0"
-        sys.pycache_prefix = None  # bytecode goes with the module that `renew` removes
+        sys.pycache_prefix = None  # bytecode is removed by `renew` with the module
         self.folder = folder.resolve()
         self.root, self.kept = self.folder / "build", self.folder / "kept"
         self.scene, self.log = self.folder / "simple_pendulum.toml", self.folder / "log"
@@ -142,32 +143,32 @@ class Failing:
         eomc.build(self.scene, self.kept)
         self.scene.write_text(CHANGED, encoding="utf-8")
         self.renew()
-        eomc.build(self.scene, self.root)  # and all is imported
+        eomc.build(self.scene, self.root)  # and imports everything
 
     def renew(self) -> None:
-        """The old module, as it was built, and no temporary files."""
+        """Restore the old module as it was built, and remove temporary files."""
         shutil.rmtree(self.root, ignore_errors=True)
         for file in self.temporary.iterdir():
             file.unlink(missing_ok=True)
         shutil.copytree(self.kept, self.root)
 
-    def listed(self, work: Callable[[], object], folder: Path) -> list[Call]:
-        """The calls of `work` that touch a file under `folder`."""
+    def list_calls(self, work: Callable[[], object], folder: Path) -> list[Call]:
+        """Return the calls of `work` that touch a file under `folder`."""
         names = ",".join((*CHANGES, "read"))
-        watched(work, ["-y", "-s", "0", "-o", str(self.log), "-e", f"trace={names}"])
+        run_traced(work, ["-y", "-s", "0", "-o", str(self.log), "-e", f"trace={names}"])
         return list(calls(self.log, folder))
 
     def fail(
         self, work: Callable[[], object], folder: Path, call: Call, error: str, then: str
     ) -> tuple[str, str]:
-        """What comes of it where that call fails, and, by "+", those of its name after it.
+        """Run `work` with that call failing and, if `then` is "+", all later ones of its name.
 
-        ("elsewhere", words) where pipes of compilers, which are read in more or fewer parts each
-        time, made it another call.
+        The result is ("elsewhere", text) if it became another call, because pipes of compilers are
+        read in a varying number of parts.
         """
         inject = f"inject={call.name}:error={error}:when={call.n}{then}"
         log = ["-y", "-s", "0", "-o", str(self.log)]
-        how, words = watched(work, [*log, "-e", f"trace={call.name}", "-e", inject])
+        how, words = run_traced(work, [*log, "-e", f"trace={call.name}", "-e", inject])
         lines = self.log.read_text(errors="replace").splitlines()
         hit = next((line for line in lines if "(INJECTED)" in line), "")
         return (how if str(folder) in hit else "elsewhere"), words
@@ -178,11 +179,11 @@ class Failing:
         return eomc.build(self.scene, self.root).name
 
     def builds(self, every: int) -> str:
-        """Each call of Python's own."""
+        """Let each call of the build itself fail."""
         self.renew()
-        found, tried = self.listed(self.build, self.root), Counter[str]()
+        build_calls, tried = self.list_calls(self.build, self.root), Counter[str]()
         for name, error, then in FAULTS:
-            for call in [c for c in found if c.name == name][::every]:
+            for call in [c for c in build_calls if c.name == name][::every]:
                 self.renew()
                 how, words = self.fail(self.build, self.root, call, error, then)
                 if how == "elsewhere":
@@ -193,7 +194,7 @@ class Failing:
         return ", ".join(f"{n} {name}" for name, n in tried.items())
 
     def compilers(self, most: int) -> str:
-        """The n-th call of each process of a compiler, at most so many; the last does not come."""
+        """Let the n-th call of each process of a compiler fail, for at most so many n."""
         tried: Counter[str] = Counter()
         real = " ".join(compiler.find_compiler().command)
         for name, error, then in COMPILERS:
@@ -205,7 +206,7 @@ class Failing:
                 self.renew()
                 os.environ["CC"] = script(self.folder / "cc", text)
                 try:
-                    how, words = watched(self.build, ["-o", "/dev/null", "-e", "trace=none"])
+                    how, words = run_traced(self.build, ["-o", "/dev/null", "-e", "trace=none"])
                 finally:
                     del os.environ["CC"]
                 self.judge(f"compilers: {name} {n}{then} {error}", how, words, "")
@@ -214,12 +215,15 @@ class Failing:
         return ", ".join(f"{n} {name}" for name, n in tried.items())
 
     def judge(self, when: str, how: str, words: str, error: str) -> None:
-        """Words, and the old module or the new one; mended by the next build."""
-        said = os.strerror(getattr(errno, error)) if error else ""
+        """Check the message, that the module is the old or the new one, and that the next build
+        repairs it.
+        """
+        message = os.strerror(getattr(errno, error)) if error else ""
         if how == "raised":
             assert re.match(r"(EomcError|FolderError|SceneError): ", words), (when, words)
-            assert said in words, words
-            if "rename" not in when or "+" not in when:  # nothing moves back where nothing moves
+            assert message in words, words
+            # Without renaming, the old module is not restored.
+            if "rename" not in when or "+" not in when:
                 self.as_before(when)
         g = gravity(self.root)
         kind = "old" if abs(g - OLD) < 1e-3 else "new" if abs(g - 2 * OLD) < 2e-3 else ""
@@ -231,7 +235,7 @@ class Failing:
         assert abs(gravity(self.root) - 2 * OLD) < 2e-3, when
 
     def as_before(self, when: str) -> None:
-        """Each file, with its date."""
+        """Check that each file is as before, including its date."""
         one, other = (
             {f.relative_to(folder): (f.read_bytes(), f.stat().st_mtime_ns) for f in files(folder)}
             for folder in (self.kept, self.root)
@@ -246,31 +250,33 @@ class Failing:
     # --- runs ---------------------------------------------------------------------------------
 
     def run(self, out: Path) -> str:
-        """`eomc run --out` of a module that is there: its status, and what it says."""
-        told = StringIO()
+        """Run `eomc run --out` with an existing module; return its status and error output."""
+        stderr = StringIO()
         words = ["run", self.scene, "--build", self.root, "--duration", "0.2", "--out", out]
-        with redirect_stdout(StringIO()), redirect_stderr(told):
+        with redirect_stdout(StringIO()), redirect_stderr(stderr):
             try:
                 command.main(args=[str(w) for w in words], prog_name="eomc")
             except SystemExit as end:
-                return f"{end.code or 0} {told.getvalue()}"
-        return f"0 {told.getvalue()}"
+                return f"{end.code or 0} {stderr.getvalue()}"
+        return f"0 {stderr.getvalue()}"
 
     def runs(self, every: int) -> str:
-        """Each call on a file of rows that was there before: the old rows, or the new ones."""
+        """Let each call on an existing file of results fail: it must contain the old or the new
+        ones.
+        """
         place, tried = self.folder / "rows", Counter[str]()
         place.mkdir()
-        # what is replaced is a file of the same kind: others are refused
+        # The replaced file has the same format: others are refused.
         for suffix, old in ((".csv", b"old"), (".npz", EMPTY_ZIP)):
             out = place / f"rows{suffix}"
             self.renew()
             eomc.build(self.scene, self.root)
             self.run(out)
             whole = _content(out)
-            found = self.listed(lambda out=out: self.run(out), place)
+            run_calls = self.list_calls(lambda out=out: self.run(out), place)
             for name, error, then in FAULTS:
-                # reads are those of the check of what is replaced, whose faults end in a refusal
-                for call in [c for c in found if c.name == name != "read"][::every]:
+                # Reads belong to the check of the replaced file, whose errors end in a refusal.
+                for call in [c for c in run_calls if c.name == name != "read"][::every]:
                     out.write_bytes(old)
                     before = _content(out)
                     how, words = self.fail(lambda out=out: self.run(out), place, call, error, then)
@@ -291,7 +297,7 @@ class Failing:
 
 
 def _content(file: Path) -> bytes:
-    """Of an archive what it holds: it is dated."""
+    """Return the content; of an archive its members, because archives contain dates."""
     data = file.read_bytes()
     if data[:2] != b"PK":
         return data
@@ -302,20 +308,20 @@ def _content(file: Path) -> bytes:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """An AssertionError where something was lost."""
+    """Run all; raise AssertionError if data is lost."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th call alone")
     parser.add_argument(
         "--compilers", type=int, default=12, metavar="N", help="their first N calls"
     )
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         failing = Failing(Path(folder))
-        print(f"builds: {failing.builds(given.every)}: {dict(failing.outcomes)}", flush=True)
+        print(f"builds: {failing.builds(options.every)}: {dict(failing.outcomes)}", flush=True)
         failing.outcomes.clear()
-        told = failing.compilers(given.compilers)
-        print(f"compilers: {told}: {dict(failing.outcomes)}", flush=True)
-        print(f"runs: {failing.runs(given.every)}", flush=True)
+        count = failing.compilers(options.compilers)
+        print(f"compilers: {count}: {dict(failing.outcomes)}", flush=True)
+        print(f"runs: {failing.runs(options.every)}", flush=True)
     return 0
 
 

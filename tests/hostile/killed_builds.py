@@ -2,12 +2,12 @@
 
     python tests/hostile/killed_builds.py                  at every change, then at 100 moments
     python tests/hostile/killed_builds.py --moments 1000
-    python tests/hostile/killed_builds.py --full 40        on a disk with room for less and less
+    python tests/hostile/killed_builds.py --full 40        on disks with decreasing space
 
-A good module is there, and its scene has changed. After each kill the module that is there has to
-be the old one or the new one, whole; the next build makes the new one, and the next that has
-something to do leaves nothing else. A disk may be out of bytes or of files; the build says so, and
-leaves nothing behind. The disk is in memory, mounted in a namespace of its own (unshare, Linux).
+A valid module exists, and its scene has changed. After each kill the module must be the old or the
+new one, complete; the next build makes the new one, and the next build that compiles removes all
+other files. A disk may be out of bytes or of inodes; the build reports it and leaves no files. The
+disk is in memory, mounted in its own namespace (unshare, Linux).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ OLD = 8.2548  # its g at 1 rad
 
 
 class Killed:
-    """A folder with a module, builds in forks that are killed, and what they leave."""
+    """A folder with a module, and builds in forked processes that are killed."""
 
     def __init__(self, folder: Path) -> None:
         os.environ["EOMC_CFLAGS"] = "-O0"
@@ -56,27 +56,27 @@ class Killed:
         self.outcomes: Counter[str] = Counter()
 
     def renew(self) -> None:
-        """The old module, whole, and a scene that has changed."""
+        """Restore the old module and a scene that has changed."""
         if self.root.exists() and leftovers(self.root):
-            time.sleep(1)  # compilers of a build that was killed write on
+            time.sleep(1)  # compilers of a killed build continue to write
         self.scene.write_text(TEXT, encoding="utf-8")
         eomc.build(self.scene, self.root)
         assert leftovers(self.root) == [], leftovers(self.root)
         self.scene.write_text(CHANGED, encoding="utf-8")
 
     def at_change(self, n: int, kinds: set[str]) -> bool:
-        """Whether a build had an n-th change of a file; it was killed just before it."""
+        """Kill a build just before its n-th change of a file; return True if there was one."""
         self.renew()
 
         def build() -> None:
-            seen = 0
+            count = 0
 
             def audit(event: str, args: tuple[Any, ...]) -> None:
-                nonlocal seen
+                nonlocal count
                 if event not in kinds or (event == "open" and not (args[2] or 0) & WRITES):
                     return
-                seen += 1
-                if seen == n:
+                count += 1
+                if count == n:
                     os.kill(os.getpid(), signal.SIGKILL)
 
             sys.addaudithook(audit)
@@ -90,7 +90,7 @@ class Killed:
         return True
 
     def at_moment(self, seconds: float) -> None:
-        """Killed so long after it began, unless it was over."""
+        """Kill a build after some seconds, unless it has ended."""
         self.renew()
         child = os.fork()
         if child == 0:
@@ -103,7 +103,7 @@ class Killed:
         self.judge(f"{seconds:.3f} s")
 
     def on_full_disks(self, steps: int) -> str:
-        """What was done and found, in a line: bytes, then files, are less by a part each time."""
+        """Build with decreasing space, then with fewer inodes; return a summary."""
         self.root.mkdir(exist_ok=True)
         self._mount("size=64m,nr_inodes=4096")
         for step in range(steps):
@@ -127,16 +127,18 @@ class Killed:
         subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", self.root], check=True)
 
     def judge(self, when: str) -> None:
-        """Old or new, and mended by the next build."""
-        found = gravity(self.root)
-        kind = "old" if abs(found - OLD) < 1e-3 else "new" if abs(found - 2 * OLD) < 2e-3 else ""
-        assert kind, f"at {when} the module was neither: g = {found}"
+        """Check that the module is the old or the new one, and that the next build makes the new
+        one.
+        """
+        value = gravity(self.root)
+        kind = "old" if abs(value - OLD) < 1e-3 else "new" if abs(value - 2 * OLD) < 2e-3 else ""
+        assert kind, f"at {when} the module was neither: g = {value}"
         self.outcomes[kind] += 1
         eomc.build(self.scene, self.root)
         assert abs(gravity(self.root) - 2 * OLD) < 2e-3, when
 
     def everything(self, kinds: set[str], moments: int, seed: int) -> str:
-        """What was done and found, in a line."""
+        """Run all tests; return a summary."""
         changes = 0
         while self.at_change(changes + 1, kinds):
             changes += 1
@@ -147,31 +149,31 @@ class Killed:
         draw = random.Random(seed)
         for _ in range(moments):
             self.at_moment(draw.uniform(0, 1.1 * whole))
-        told = ", ".join(f"{n} {what}" for what, n in self.outcomes.most_common())
-        return f"killed at {changes} changes of files and {moments} moments: {told}"
+        summary = ", ".join(f"{n} {what}" for what, n in self.outcomes.most_common())
+        return f"killed at {changes} changes of files and {moments} moments: {summary}"
 
 
 def main(arguments: Sequence[str]) -> int:
-    """An AssertionError where something was lost."""
+    """Run all; raise AssertionError if data is lost."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--moments", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--full", type=int, metavar="N", help="so many sizes of full disks")
     parser.add_argument("--renames", action="store_true", help="at renames alone, not each change")
-    given = parser.parse_args(arguments)
-    if given.full and "EOMC_ALONE" not in os.environ:
+    options = parser.parse_args(arguments)
+    if options.full and "EOMC_ALONE" not in os.environ:
         own = [sys.executable, __file__, *arguments]
         return subprocess.run([*ALONE, *own], env=os.environ | {"EOMC_ALONE": "1"}).returncode
     with tempfile.TemporaryDirectory() as folder:
-        if given.full:
+        if options.full:
             killed = Killed(Path(folder))
             try:
-                print(killed.on_full_disks(given.full))
+                print(killed.on_full_disks(options.full))
             finally:
                 subprocess.run(["umount", killed.root], check=True)
             return 0
-        kinds = RENAMES if given.renames else CHANGES
-        print(Killed(Path(folder)).everything(kinds, given.moments, given.seed))
+        kinds = RENAMES if options.renames else CHANGES
+        print(Killed(Path(folder)).everything(kinds, options.moments, options.seed))
     return 0
 
 

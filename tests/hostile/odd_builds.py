@@ -1,11 +1,11 @@
-"""Builds in odd surroundings: many at once, no HOME, umasks, clocks, two generators, two Pythons.
+"""Builds in unusual environments: concurrent, no HOME, umasks, clocks, two generators, two Pythons.
 
     python tests/hostile/odd_builds.py
     python tests/hostile/odd_builds.py --python PATH    another Python that has eomc, too
 
-Each ends well or says why; the module that is there is an old one or a new one, whole, and nothing
-is left beside it. Clocks are those that dated the module that was there. Commands go without the
-rights of root to read and write what modes forbid, where setpriv (Linux) can take them.
+Each build succeeds or reports the reason; the module is an old or a new one, complete, and no other
+files remain. Clocks date the existing module. Commands run without root's permission to override
+file modes if setpriv (Linux) can drop it.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from eomc.toolchain import cache
 
 AT_ONCE, TURNS = 20, 4
 UMASKS = (0o000, 0o022, 0o077, 0o277, 0o777)
-# before 1970 began anywhere but in UTC; what 31 and 32 bits can't say; the year 2400
+# Before 1970 west of UTC; beyond 31 and 32 bits; the year 2400.
 CLOCKS = (0, 1, 2**31, 2**32 + 10, 13_569_465_600)
 RIGHTS = "-dac_override,-dac_read_search"
 
 
-class Odd:
-    """A folder with a module, its scene, and one of the same name that is another."""
+class UnusualBuilds:
+    """A folder with a module, its scene, and a different scene of the same name."""
 
     def __init__(self, folder: Path) -> None:
         os.environ["EOMC_CFLAGS"] = "-O0"
@@ -48,20 +48,20 @@ class Odd:
         self.renew()
 
     def renew(self) -> None:
-        """The first scene's module."""
+        """Build the first scene."""
         eomc.build(self.scene, self.root)
-        assert self.found() == "old"
+        assert self.module_kind() == "old"
 
-    def found(self) -> str:
-        """Whose module is there; nothing is beside it."""
+    def module_kind(self) -> str:
+        """Return whose module exists; no other files may remain."""
         g = gravity(self.root)
         kind = "old" if abs(g - OLD) < 1e-3 else "new" if abs(g - 2 * OLD) < 2e-3 else ""
         libraries = list((self.root / "simple_pendulum").glob("_simple_pendulum_*"))
         assert kind and leftovers(self.root) == [] and len(libraries) == 1, (g, libraries)
         return kind
 
-    def together(self, works: Sequence[Callable[[], object]]) -> None:
-        """All at once, in processes; none fails."""
+    def run_concurrently(self, works: Sequence[Callable[[], object]]) -> None:
+        """Run all at the same time, in processes; none may fail."""
         running = [get_context("fork").Process(target=work) for work in works]
         for process in running:
             process.start()
@@ -70,80 +70,84 @@ class Odd:
         assert [p.exitcode for p in running] == [0] * len(running)
 
     def build(self, scene: Path, generator: str = "") -> None:
-        """By another version of the generator, where one is named."""
+        """Build, with another version of the generator if one is named."""
         if generator:
             cache.generator_digest = lambda: generator  # type: ignore[assignment]
         eomc.build(scene, self.root)
 
     def command(
-        self, *words: object, python: str = sys.executable, umask: int = -1, **given: str | None
+        self, *words: object, python: str = sys.executable, umask: int = -1, **variables: str | None
     ) -> tuple[int, str]:
-        """The status and the words of `eomc`; given: of the environment, None: without it."""
-        environment = {**os.environ, **given}
+        """Run `eomc`; return its status and output. variables: of the environment, None removes
+        one.
+        """
+        environment = {**os.environ, **variables}
         rights = ["setpriv", f"--bounding-set={RIGHTS}"] if _setpriv() else []
-        done = subprocess.run(
+        process = subprocess.run(
             [*rights, Path(python).parent / "eomc", *map(str, words), "--build", self.root],
             env={k: v for k, v in environment.items() if v is not None}, umask=umask,
             cwd=self.folder, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=120,
         )  # fmt: skip
-        assert "Traceback" not in done.stderr, done.stderr
-        return done.returncode, done.stderr
+        assert "Traceback" not in process.stderr, process.stderr
+        return process.returncode, process.stderr
 
-    # --- what is odd --------------------------------------------------------------------------
+    # --- unusual environments -----------------------------------------------------------------
 
     def at_once(self) -> str:
-        """So many of one scene; then of two scenes of one name, by two generators."""
-        self.together([lambda: self.build(self.other)] * AT_ONCE)
-        assert self.found() == "new"
+        """Build one scene in many processes; then two scenes of one name with two generators."""
+        self.run_concurrently([lambda: self.build(self.other)] * AT_ONCE)
+        assert self.module_kind() == "new"
         works = [
             lambda k=k: self.build((self.scene, self.other)[k % 2], f"version {k % 4 // 2}")
             for k in range(AT_ONCE)
         ]
-        self.together(works)
-        self.found()
+        self.run_concurrently(works)
+        self.module_kind()
         return f"{AT_ONCE} builds of one scene, {AT_ONCE} of two by two generators"
 
     def generators(self) -> str:
-        """In turns."""
+        """Alternate between generators."""
         for turn in range(2 * TURNS):
-            self.together([lambda turn=turn: self.build(self.other, f"version {turn % 2}")])
-            assert self.found() == "new"
+            self.run_concurrently([lambda turn=turn: self.build(self.other, f"version {turn % 2}")])
+            assert self.module_kind() == "new"
         return f"{2 * TURNS} builds by two generators in turns"
 
     def homes(self) -> str:
-        """None, one that is not there, one that is a file."""
+        """No HOME, a missing one, and one that is a file."""
         homes = (None, "/nowhere/at/all", str(self.scene))
         for home in homes:
             self.renew()
             assert self.command("build", self.other, HOME=home) == (0, "")
-            assert self.found() == "new"
+            assert self.module_kind() == "new"
             assert self.command("run", self.other, HOME=home)[0] == 0
         return f"{len(homes)} builds and runs without a good HOME"
 
     def umasks(self) -> str:
-        """Those that forbid the user to read or write what he has made are told by what fails."""
-        told = []
+        """Umasks that make the user's own files unreadable or unwritable lead to an error
+        message.
+        """
+        messages = []
         for umask in UMASKS:
             self.renew()
             status, words = self.command("build", self.other, umask=umask)
-            assert self.found() == ("old" if status else "new"), (oct(umask), words)
+            assert self.module_kind() == ("old" if status else "new"), (oct(umask), words)
             assert status in (0, 2) and (not status or "Permission denied" in words), words
-            told.append(f"{umask:03o} {'refused' if status else 'built'}")
-        return "umasks " + ", ".join(told)
+            messages.append(f"{umask:03o} {'refused' if status else 'built'}")
+        return "umasks " + ", ".join(messages)
 
     def clocks(self) -> str:
-        """Python knows bytecode by the date of its source."""
+        """Python recognises stale bytecode by the date of its source."""
         for stamp in CLOCKS:
             self.renew()
             for file in (self.root / "simple_pendulum").rglob("*"):
                 os.utime(file, (stamp, stamp))
-            assert self.found() == "old"
+            assert self.module_kind() == "old"
             eomc.build(self.other, self.root)
-            assert self.found() == "new", stamp
+            assert self.module_kind() == "new", stamp
         return f"{len(CLOCKS)} dates of the old module"
 
     def pythons(self, other: str) -> str:
-        """In turns, then at once: each runs the module that it has built."""
+        """Alternate, then run at the same time: each Python runs the module that it has built."""
         for turn in range(2 * TURNS):
             python = (sys.executable, other)[turn % 2]
             status, words = self.command("run", self.other, python=python)
@@ -152,28 +156,28 @@ class Odd:
             lambda python=python: self.command("run", self.other, python=python)[0] and sys.exit(1)
             for python in (sys.executable, other) * TURNS
         ]
-        self.together(both)
+        self.run_concurrently(both)
         self.renew()
         return f"{4 * TURNS} runs by two Pythons, in turns and at once"
 
 
 def _setpriv() -> bool:
-    asked = ["setpriv", f"--bounding-set={RIGHTS}", "true"]
-    return bool(shutil.which("setpriv")) and subprocess.run(asked, check=False).returncode == 0
+    command = ["setpriv", f"--bounding-set={RIGHTS}", "true"]
+    return bool(shutil.which("setpriv")) and subprocess.run(command, check=False).returncode == 0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """An AssertionError where something is lost."""
+    """Run all; raise AssertionError if data is lost."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--python", help="another, beside which `eomc` lies")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        odd = Odd(Path(folder))
+        odd = UnusualBuilds(Path(folder))
         for work in (odd.at_once, odd.generators, odd.homes, odd.umasks, odd.clocks):
             odd.renew()
             print(work(), flush=True)
-        if given.python:
-            print(odd.pythons(os.path.abspath(given.python)), flush=True)
+        if options.python:
+            print(odd.pythons(os.path.abspath(options.python)), flush=True)
     return 0
 
 

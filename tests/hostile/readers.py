@@ -1,13 +1,14 @@
-"""Coverage-guided fuzzing of all that reads text: scenes, formulas, robot files, command lines.
+"""Coverage-guided fuzzing of all readers of text: scenes, formulas, robot files, command lines.
 
     make fuzz                                            each target in turn, without end
     python tests/hostile/readers.py scene --seconds 60 --seed 1
-    python tests/hostile/readers.py scene --show FILE    what one input does
+    python tests/hostile/readers.py scene --show FILE    the result of one input
 
-An input is accepted, or refused by the project's own error that names the file. A find is anything
-else: another exception, more than SECONDS, more than MEMORY. Each is printed once, with its
-traceback, and kept with its input in build/hostile/finds. Seeds are the committed corpus, the
-scenes and the bad scenes; what reaches new lines is kept in build/hostile/corpus for the next time.
+An input is accepted, or refused with an EomcError that names the file. Anything else is a finding:
+another exception, more than SECONDS, more than MEMORY. Each finding is printed once with its
+traceback, and stored with its input in build/hostile/finds. Seeds are the committed corpus, the
+scenes and the bad scenes; inputs that reach new lines are stored in build/hostile/corpus for the
+next time.
 """
 
 from __future__ import annotations
@@ -45,23 +46,23 @@ with atheris.instrument_imports(include=["eomc"]):
 
 HERE = Path(__file__).parent
 TESTS, ROOT = HERE.parent, HERE.parents[1]
-KEPT = ROOT / "build" / "hostile"
-SECONDS = 10.0  # that one input may take
+OUTPUT_FOLDER = ROOT / "build" / "hostile"
+SECONDS = 10.0  # allowed for one input
 MEMORY = 2**30  # bytes that all inputs together may add
-SYMPY_FROM = 12  # bodies of a robot whose scene is not made symbols: that takes seconds, rightly
+SYMPY_FROM = 12  # with so many bodies a scene is not derived, because that takes seconds
 
-Target = Callable[[bytes], bool]  # whether it was accepted
+Target = Callable[[bytes], bool]  # returns whether the input was accepted
 
 
 class Slow(BaseException):
     """An input that takes longer than SECONDS."""
 
 
-# --- what is fuzzed -------------------------------------------------------------------------------
+# --- targets --------------------------------------------------------------------------------------
 
 
 def formula(data: bytes) -> bool:
-    """A formula, or a fault with a place in it."""
+    """Parse a formula; a syntax error must contain a position."""
     text = data.decode("utf-8", "replace")
     try:
         formulas.parse(text)
@@ -72,22 +73,22 @@ def formula(data: bytes) -> bool:
 
 
 def read(data: bytes) -> bool:
-    """A scene, without SymPy."""
+    """Read a scene, without SymPy."""
     return _accepted(lambda: parse(data, "fuzz.toml"), "fuzz.toml")
 
 
 def scene(data: bytes) -> bool:
-    """A scene, as a system of SymPy's."""
+    """Read a scene, as a system with SymPy."""
     return _accepted(lambda: from_scene(parse(data, "fuzz.toml")), "fuzz.toml")
 
 
 def urdf_file(data: bytes) -> bool:
-    """A URDF, and what is made of it: the scene of a robot is a scene."""
+    """Read a URDF; the scene written from it must be valid."""
     return _robot(data, urdf.read)
 
 
 def mjcf_file(data: bytes) -> bool:
-    """An MJCF model, likewise; nothing that it includes is there."""
+    """Read an MJCF model, likewise; included files do not exist."""
     return _robot(data, lambda path: mjcf.read(path, include=b"include" in data))
 
 
@@ -98,7 +99,7 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     def stopped(robot: Any) -> Any:
         return edit.with_joint_stops(robot) if limits.joint_stops(robot) else robot
 
-    def made() -> None:
+    def convert() -> None:
         robot = reader(path)
         for change in (lambda r: r, edit.with_nearest_inertias, stopped):
             text = scene_text.scene_text(preparation.prepare_for_scene(change(robot)))
@@ -106,11 +107,11 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
             if len(robot.bodies) < SYMPY_FROM:
                 from_scene(read_back)
 
-    return _accepted(made, "fuzz")
+    return _accepted(convert, "fuzz")
 
 
 def command(data: bytes) -> bool:
-    """A command line, in a folder of its own: status 0, 1, 2, or 130 where a run was cut short."""
+    """Run a command line in its own folder: status 0, 1, 2, or 130 if a run was interrupted."""
     words = [w for w in map(_harmless, data.decode("utf-8", "replace").split("\n")) if w][:12]
     out, err, status = io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -119,7 +120,7 @@ def command(data: bytes) -> bool:
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 1
         except Slow:
-            # as long a run as was asked for, or reports and checks of as many steps
+            # Some commands run as long as requested.
             if not {"run", "report", "check"} & set(words):
                 raise
     assert status in (0, 1, 2, 130), status
@@ -129,13 +130,15 @@ def command(data: bytes) -> bool:
 
 
 def _harmless(word: str) -> str:
-    """A word that names nothing outside the folder."""
+    """Replace words that name something outside the folder."""
     word = re.sub(r"[/\0]", "_", word)
     return "" if ".." in word or word.startswith("~") else word
 
 
 def _accepted(work: Callable[[], object], name: str) -> bool:
-    """What is refused names the file, or the robot, which is called as the file unless it says."""
+    """Run `work`; a refusal must name the file or the robot, which has the file's name by
+    default.
+    """
     try:
         work()
     except EomcError as fault:
@@ -152,7 +155,7 @@ TARGETS: dict[str, Target] = {
 }  # fmt: skip
 
 
-# --- mutations that keep most of the grammar ------------------------------------------------------
+# --- mutations that preserve most of the grammar --------------------------------------------------
 
 TOKEN = re.compile(r'"[^"\n]*"|\w+|\s+|.', re.S)
 HOSTILE = """-1 0 1 1e-300 1e300 1e400 nan inf -inf 0x10 1_0 9999999999 9**9**9 "" [] {} [[]] true t
@@ -162,16 +165,16 @@ pi "world" "\\u0000" x_dot dot( ( ) [i] [n-1] "i = 1..n" "i = 1..99999" é 𝐱 
 
 
 def seeds(name: str) -> list[Path]:
-    """The folders that a run begins with."""
+    """Return the folders with the initial inputs."""
     place = "scene" if name == "read" else name
-    found = [HERE / "corpus" / place]
+    folders = [HERE / "corpus" / place]
     if place == "scene":
-        found += [ROOT / "scenes", TESTS / "scene" / "bad", TESTS / "report" / "pictured"]
-    return found
+        folders += [ROOT / "scenes", TESTS / "scene" / "bad", TESTS / "report" / "pictured"]
+    return folders
 
 
 def everything(name: str) -> list[bytes]:
-    """All seeds."""
+    """Return all initial inputs."""
     files = [file for folder in seeds(name) for file in sorted(folder.iterdir())]
     return [file.read_bytes() for file in files if file.suffix not in (".py", ".txt")]
 
@@ -181,7 +184,7 @@ def _fine(name: str, data: bytes) -> bool:
 
 
 def pool(name: str) -> tuple[list[str], list[str]]:
-    """Tokens and lines of all seeds."""
+    """Return tokens and lines of all initial inputs."""
     texts = [data.decode("utf-8", "replace") for data in everything(name)]
     lines = sorted({line for text in texts for line in text.split("\n") if line.strip()})
     tokens = {t for line in lines for t in TOKEN.findall(line) if t.strip()}
@@ -194,20 +197,20 @@ def _options(name: str) -> list[str]:
     import click
 
     context = click.Context(main)
-    found = list(COMMANDS)
+    words = list(COMMANDS)
     for each in COMMANDS:
-        made = main.get_command(context, each)
-        assert made is not None
-        for parameter in made.params:
+        subcommand = main.get_command(context, each)
+        assert subcommand is not None
+        for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
-                found += parameter.opts
+                words += parameter.opts
             if isinstance(parameter.type, click.Choice):
-                found += map(str, parameter.type.choices)
-    return found
+                words += map(str, parameter.type.choices)
+    return words
 
 
 class Mutator:
-    """A few changes of tokens, values and lines, half the time of a valid seed; or of bytes."""
+    """Applies some changes of tokens, values and lines, mostly to a valid seed; or of bytes."""
 
     def __init__(self, name: str) -> None:
         self.tokens, self.lines = pool(name)
@@ -218,7 +221,7 @@ class Mutator:
         part = draw.random()
         if part < 0.2:
             return bytes(atheris.Mutate(data, most))
-        if part < 0.45:  # what has reached new lines is mostly faulty
+        if part < 0.45:  # inputs that reached new lines are mostly invalid
             data = draw.choice(self.valid)
         text = data.decode("utf-8", "replace")
         for _ in range(draw.choice([1, 1, 1, 2, 2, 4])):
@@ -254,7 +257,7 @@ class Mutator:
             case 2:
                 tokens[at] = draw.choice(tokens)
             case 3:
-                # "x" stays in quotes, so that what is in them is read
+                # Text in quotes stays quoted, so that it is parsed.
                 inside = tokens[at].startswith('"') and len(tokens[at]) > 1
                 new = draw.choice(self.tokens).strip('"')
                 tokens[at] = f'"{new}"' if inside else new
@@ -271,7 +274,7 @@ class Mutator:
 
 
 class Run:
-    """Calls a target, and keeps what it does that it should not."""
+    """Calls a target, and stores the findings."""
 
     def __init__(self, name: str, seconds: float, most: int) -> None:
         self.name, self.target, self.most = name, TARGETS[name], most
@@ -300,22 +303,22 @@ class Run:
             self.leave()
 
     def keep(self, data: bytes, fault: BaseException) -> None:
-        """Print and keep a find, once for each place."""
+        """Print and store a finding, once for each position in the code."""
         places = [f"{f.filename}:{f.lineno}" for f in traceback.extract_tb(fault.__traceback__)]
         own = [p for p in places if "/eomc/" in p] or places
         key = f"{type(fault).__name__} {own[-1] if own else ''}"
         self.found[key] = self.found.get(key, 0) + 1
         if self.found[key] > 1:
             return
-        folder = KEPT / "finds"
+        folder = OUTPUT_FOLDER / "finds"
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / f"{self.name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
         file.write_bytes(data)
-        told = "".join(traceback.format_exception(fault))
-        print(f"\n--- a find, kept as {file}\n{told}", file=sys.stderr, flush=True)
+        text = "".join(traceback.format_exception(fault))
+        print(f"\n--- a find, kept as {file}\n{text}", file=sys.stderr, flush=True)
 
     def leave(self) -> None:
-        """The line of the record, and the end of the process: libFuzzer has none of its own."""
+        """Print the final line and end the process: libFuzzer prints none."""
         seconds = time.monotonic() - self.began
         print(
             f"{self.name}: {self.count} inputs in {seconds:.0f} s, {self.accepted} accepted, "
@@ -339,7 +342,9 @@ def _slow(_: int, __: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def folder_of_its_own(name: str) -> Iterator[None]:
-    """Where commands write: with a scene, a robot, and the scene's module, so that runs run."""
+    """Change into a folder with a scene, a robot, and the scene's module, so that commands can
+    run.
+    """
     with tempfile.TemporaryDirectory() as place:
         os.chdir(place)
         if name == "command":
@@ -349,13 +354,13 @@ def folder_of_its_own(name: str) -> Iterator[None]:
             Path("bad.toml").write_text("eomc = 1\n", encoding="utf-8")
             with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
                 main.main(args=["build", "simple_pendulum.toml"], prog_name="eomc")
-            os.environ["CC"] = "false"  # what has to be compiled is not: that takes seconds
+            os.environ["CC"] = "false"  # compilation fails, because it would take seconds
         yield
 
 
 def fuzz(name: str, seconds: float, seed: int, runs: int) -> None:
-    """Does not return."""
-    grown = KEPT / "corpus" / ("scene" if name == "read" else name)
+    """Fuzz a target; does not return."""
+    grown = OUTPUT_FOLDER / "corpus" / ("scene" if name == "read" else name)
     grown.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")
     sys.stdin = io.StringIO()
@@ -364,7 +369,7 @@ def fuzz(name: str, seconds: float, seed: int, runs: int) -> None:
         sys.argv[0], str(grown), *map(str, seeds(name)), f"-seed={seed}", "-timeout=0",
         "-max_len=20000", "-rss_limit_mb=0", "-verbosity=0", "-len_control=0",
     ]  # fmt: skip
-    run = Run(name, seconds, runs or -1)  # libFuzzer's own -runs= ends without a word
+    run = Run(name, seconds, runs or -1)  # libFuzzer's own -runs= ends without output
     with folder_of_its_own(name):
         atheris.Setup(words, run, custom_mutator=Mutator(name))
         atheris.Fuzz()
@@ -372,27 +377,27 @@ def fuzz(name: str, seconds: float, seed: int, runs: int) -> None:
 
 
 def show(name: str, file: Path) -> None:
-    """What one input does."""
+    """Print the result of one input."""
     data = file.read_bytes()
     with folder_of_its_own(name):
         TARGETS[name](data)
     print("accepted, or refused by name")
 
 
-def asked(arguments: Sequence[str]) -> None:
-    """The command."""
+def run_command(arguments: Sequence[str]) -> None:
+    """Parse the arguments and run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("target", choices=[*TARGETS])
     parser.add_argument("--seconds", type=float, default=0.0, help="0: without end")
     parser.add_argument("--seed", type=int, default=1, help="0: another each time")
     parser.add_argument("--runs", type=int, default=0, help="so many inputs at most")
     parser.add_argument("--show", type=Path, metavar="FILE")
-    given = parser.parse_args(arguments)
-    if given.show:
-        show(given.target, given.show.resolve())
+    options = parser.parse_args(arguments)
+    if options.show:
+        show(options.target, options.show.resolve())
     else:
-        fuzz(given.target, given.seconds, given.seed, given.runs)
+        fuzz(options.target, options.seconds, options.seed, options.runs)
 
 
 if __name__ == "__main__":
-    asked(sys.argv[1:])
+    run_command(sys.argv[1:])

@@ -1,4 +1,4 @@
-"""Random calls of modules from Python, some hostile; `python tests/hostile/calls.py` has more."""
+"""Random calls of modules from Python, some hostile; `python tests/hostile/calls.py` makes more."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 CALLS = Path(__file__).parent / "calls.py"
 
 
-def told(*words: str) -> str:
+def run_calls(*words: str) -> str:
     ran = subprocess.run(
         [sys.executable, str(CALLS), *words], capture_output=True, text=True, timeout=280
     )
@@ -22,9 +22,9 @@ def told(*words: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", ["1", "8"])
-def test_calls_return_or_say_what_is_wrong(threads: str) -> None:
-    """One in a few hundred is of 10**12 steps, and gets a Ctrl-C."""
-    words = told("--count", "12000", "--threads", threads, "--seed", "5")
+def test_calls_return_or_raise_with_a_message(threads: str) -> None:
+    """One in a few hundred has 10**12 steps, and receives Ctrl-C."""
+    words = run_calls("--count", "12000", "--threads", threads, "--seed", "5")
     assert "12000 calls" in words and " 0 finds" in words
     counts = {what: int(n) for n, what in re.findall(r"(\d+) ([\w ]+)[,;]", words)}
     assert counts["result"] > 5000 and counts["ValueError"] > 2000
@@ -33,8 +33,8 @@ def test_calls_return_or_say_what_is_wrong(threads: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_does_not_say_is_found(tmp_path: Path) -> None:
-    """A module whose fault is another exception."""
+def test_other_exceptions_are_findings(tmp_path: Path) -> None:
+    """Use a module that raises an unexpected exception."""
     code = (
         f"import sys; sys.path.insert(0, {str(CALLS.parent)!r})\n"
         "import calls\n"

@@ -1,4 +1,4 @@
-"""A minute of tests/hostile/endurance.py, and what it would say of a leak."""
+"""A minute of tests/hostile/endurance.py, and its detection of leaks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from endurance import LEAST, Sample, grown, ran, sample
+from endurance import LEAST, Sample, growth_messages, run_rounds, sample
 from forks import in_a_fork
 
 STEADY = Sample(
@@ -14,40 +14,40 @@ STEADY = Sample(
 )
 
 
-def test_what_grows_is_told() -> None:
+def test_growth_is_reported() -> None:
     warm = [replace(STEADY, memory=k << 20, files=5 * k) for k in range(50, 90)]
-    assert grown([*warm, *[STEADY] * 60]) == []
+    assert growth_messages([*warm, *[STEADY] * 60]) == []
     steps = {"memory": LEAST // 10, "objects": 300, "heap": 20_000, "handles": 1, "threads": 1}
     for name, step in (steps | {"children": 1, "files": 1}).items():
         leak = [replace(STEADY, **{name: getattr(STEADY, name) + k * step}) for k in range(50)]
-        (words,) = grown(leak)
+        (words,) = growth_messages(leak)
         assert words.startswith(f"{name}: ")
 
 
 @pytest.mark.slow
-def test_what_is_in_use_is_seen_and_what_is_free_is_not(tmp_path: Path) -> None:
+def test_memory_in_use_is_measured_without_free_memory(tmp_path: Path) -> None:
     if not sample(tmp_path).heap:
         pytest.skip("this C library does not tell what it has given out")
 
-    def seen() -> list[int]:
-        before, kept = sample(tmp_path), [bytearray(50_000) for _ in range(400)]
-        held = sample(tmp_path)
-        del kept
+    def measure() -> list[int]:
+        before, blocks = sample(tmp_path), [bytearray(50_000) for _ in range(400)]
+        in_use = sample(tmp_path)
+        del blocks
         after = sample(tmp_path)
         return [
             getattr(now, name) - getattr(before, name)
-            for now in (held, after)
+            for now in (in_use, after)
             for name in ("memory", "heap")
         ]
 
-    how, found = in_a_fork(seen, 60)
-    assert how == "done" and isinstance(found, list)
-    assert found[:2] == pytest.approx([20e6, 20e6], rel=0.1), found
-    assert found[2:] == pytest.approx([0, 0], abs=1e6), found
+    how, differences = in_a_fork(measure, 60)
+    assert how == "done" and isinstance(differences, list)
+    assert differences[:2] == pytest.approx([20e6, 20e6], rel=0.1), differences
+    assert differences[2:] == pytest.approx([0, 0], abs=1e6), differences
 
 
 @pytest.mark.slow
 def test_nothing_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", "cc")  # else what was compiled is kept, for other tests
-    how, words = in_a_fork(lambda: grown(ran(tmp_path, 60)), 600)
+    monkeypatch.setenv("CC", "cc")  # otherwise compiled files would be stored for other tests
+    how, words = in_a_fork(lambda: growth_messages(run_rounds(tmp_path, 60)), 600)
     assert (how, words) == ("done", [])

@@ -1,6 +1,6 @@
-"""Random bytes as arguments of every function of some headers, under sanitizers.
+"""Random bytes as arguments of every function of some headers, with sanitizers.
 
-`python tests/hostile/entry_points.py --seconds 600` is the same for longer.
+`python tests/hostile/entry_points.py --seconds 600` runs longer.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from pathlib import Path
 import entry_points
 import pytest
 from conftest import needs
-from entry_points import VARIANTS, Driver, fuzzed
+from entry_points import VARIANTS, Driver, run_driver
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("form", ["plain", "fast"])
 @pytest.mark.parametrize("name", VARIANTS)
-def test_no_argument_harms(name: str, form: str, tmp_path: Path) -> None:
+def test_no_argument_causes_errors(name: str, form: str, tmp_path: Path) -> None:
     needs("gcc")
-    good, words = fuzzed(name, form, 3, 1, tmp_path)
+    good, words = run_driver(name, form, 3, 1, tmp_path)
     assert good, words[-4000:]
     assert "CALLS" in words
 
@@ -32,19 +32,19 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("what", FAULTS)
-def test_faults_are_found(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_detected(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needs("gcc")
     right, wrong = FAULTS[what]
     plain = entry_points.eomc.sources
 
-    def broken(*given: str) -> object:
-        made = plain(*given)
-        assert right in made.files["bouncer.c"]
-        made.files["bouncer.c"] = made.files["bouncer.c"].replace(right, wrong)
-        return made
+    def broken(*args: str) -> object:
+        sources = plain(*args)
+        assert right in sources.files["bouncer.c"]
+        sources.files["bouncer.c"] = sources.files["bouncer.c"].replace(right, wrong)
+        return sources
 
     monkeypatch.setattr(entry_points.eomc, "sources", broken)
-    good, words = fuzzed("bouncer", "plain", 5, 1, tmp_path)
+    good, words = run_driver("bouncer", "plain", 5, 1, tmp_path)
     assert not good
     assert "heap-buffer-overflow" in words or "BROKEN PROMISE" in words, words[-2000:]
 

@@ -1,4 +1,6 @@
-"""Some calls of builds, compilers and runs fail: words, old module or new, nothing behind."""
+"""Some system calls of builds, compilers and runs fail: message, old or new module, no other
+files.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,13 @@ from conftest import needs
 
 
 @pytest.mark.slow
-def test_a_call_that_fails_loses_nothing() -> None:
+def test_failing_call_loses_no_data() -> None:
     strace = needs("strace")
     trial = subprocess.run([strace, "-o", "/dev/null", "true"], capture_output=True, text=True)
     if trial.returncode:
         pytest.skip(f"strace can't watch here: {trial.stderr}")
     command = [sys.executable, failing_calls.__file__, "--every", "16", "--compilers", "2"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "'old, raised': " in done.stdout and "'new, done': " in done.stdout
-    assert done.stdout.count("\n") == 3
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "'old, raised': " in process.stdout and "'new, done': " in process.stdout
+    assert process.stdout.count("\n") == 3

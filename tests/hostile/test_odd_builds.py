@@ -1,21 +1,21 @@
-"""Builds at once, without HOME, by odd umasks, dates, generators; by another Python a command."""
+"""Concurrent builds, builds without HOME, with unusual umasks, dates and generators."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from odd_builds import Odd
+from odd_builds import UnusualBuilds
 
 
 @pytest.fixture
-def odd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Odd:
+def odd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UnusualBuilds:
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
     monkeypatch.delenv("CC", raising=False)
-    return Odd(tmp_path)
+    return UnusualBuilds(tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["at_once", "generators", "homes", "umasks", "clocks"])
-def test_odd_surroundings_lose_nothing(what: str, odd: Odd) -> None:
+def test_unusual_environments_lose_no_data(what: str, odd: UnusualBuilds) -> None:
     assert getattr(odd, what)()

@@ -1,4 +1,4 @@
-"""What reads text is fuzzed for some seconds each; `make fuzz` goes on without end."""
+"""Readers of text are fuzzed for some seconds each; `make fuzz` continues without end."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ HERE = Path(__file__).parent
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["formula", "read", "scene", "urdf", "mjcf", "command"])
-def test_readers_refuse_or_accept(target: str) -> None:
-    """Any other exception, ten seconds for one input or a gigabyte is a find: status 1."""
+def test_readers_accept_or_refuse_with_a_message(target: str) -> None:
+    """Any other exception, ten seconds for one input or a gigabyte is a finding: status 1."""
     if importlib.util.find_spec("atheris") is None:
         pytest.skip("atheris is not installed")
     command = [sys.executable, str(HERE / "readers.py"), target, "--seconds", "20"]
