@@ -1,4 +1,4 @@
-"""Scenes and motions for tests of pictures: prescribed, so that nothing is derived or compiled."""
+"""Scenes and prescribed motions for tests of pictures; nothing is derived or compiled."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ ROBOTS = {
     "kinova": "/kinova.urdf", "panda": "/panda.urdf", "so101": "/so101.urdf",
     "solo12": "/solo12.urdf", "talos_arm": "/talos_left_arm.urdf", "ur5": "/ur5_robot.urdf",
 }  # fmt: skip
-FREE = ("anymal", "solo12")  # on no ground
+FREE = ("anymal", "solo12")  # these stand on no ground
 
 
 def scene(name: str) -> Scene:
-    """A scene of ours, or of a robot file."""
+    """Return a scene of eomc or of a robot file."""
     if (file := OWN / f"{name}.urdf").exists():
         return robot(file)
     if name in ROBOTS:
@@ -36,33 +36,33 @@ def scene(name: str) -> Scene:
 
 
 def robot(file: Path, free: bool = False) -> Scene:
-    """The scene of a URDF, as eomc import writes it."""
-    made = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
-    return parse(scene_text.scene_text(preparation.prepare_for_scene(made)))
+    """Return the scene of a URDF as eomc import writes it."""
+    model = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
+    return parse(scene_text.scene_text(preparation.prepare_for_scene(model)))
 
 
 def robot_data(name: str) -> Path:
-    """A URDF of example-robot-data; skips the test where that is not installed."""
+    """Return a URDF of example-robot-data; skip the test if it is not installed."""
     try:
-        found = [f for f in files("example-robot-data") or () if str(f).endswith(name)]
+        matches = [f for f in files("example-robot-data") or () if str(f).endswith(name)]
     except PackageNotFoundError:
         pytest.skip('example-robot-data is not there: pip install ".[robots]"')
-    return Path(str(found[0].locate()))
+    return Path(str(matches[0].locate()))
 
 
-def system(made: Scene, title: str = "") -> Any:
-    """What pictures ask of a System."""
+def system(model: Scene, title: str = "") -> Any:
+    """Return the attributes of a System that pictures use."""
     return SimpleNamespace(
-        scene=made, picture_scene=None, name=made.name, title=title or made.title, outputs=(),
-        coordinates=made.coordinates, parameters=(*made.parameters,), inputs=(), q=made.coordinates,
-        discrete=(),
+        scene=model, picture_scene=None, name=model.name, title=title or model.title, outputs=(),
+        coordinates=model.coordinates, parameters=(*model.parameters,), inputs=(),
+        q=model.coordinates, discrete=(),
     )  # fmt: skip
 
 
-def motion(made: Scene, seconds: float = 2.0, rows: int = 121) -> Any:
-    """A motion of each coordinate about its start, as a run has it."""
+def motion(model: Scene, seconds: float = 2.0, rows: int = 121) -> Any:
+    """Return a run in which each coordinate oscillates about its initial value."""
     t = np.linspace(0, seconds, rows)
-    start = np.array(made.start()[0])
+    start = np.array(model.start()[0])
     rates = 1 + 0.37 * np.arange(len(start)) % 2
     q = start + 0.4 * np.sin(np.outer(t, rates))
     return SimpleNamespace(t=t, q=q, qd=0 * q, energy=1 + 0 * t, outputs={})
@@ -101,7 +101,7 @@ def chain() -> Scene:
 
 
 def humanoid(limbs: int = 5, joints: int = 6) -> Scene:
-    """A free trunk with limbs of revolute joints: as many freedoms as a humanoid has."""
+    """Return a free trunk with limbs of revolute joints, with the freedoms of a humanoid."""
     names = [f"a{k}{j}" for k in range(limbs) for j in range(joints)]
     base = ["x", "y", "z", "yaw", "pitch", "roll"]
     lines = ["eomc = 1", 'name = "humanoid"', "gravity = [0, 0, -9.81]", "[coordinates]"]

@@ -1,4 +1,4 @@
-"""The page of a motion: one file, no network, text that is data; films, and what they need."""
+"""The page of a motion is one file without network access; films and their requirements."""
 
 import base64
 import itertools
@@ -21,13 +21,13 @@ from eomc.report.timeline import Timeline, choose_instances, find_system, select
 EVIL = "</script><img src=x onerror=alert(1)>"
 
 
-def page(made, title="", **how):
-    return animation.page([Timeline(system(made, title), motion(made, **how))])
+def page(model, title="", **how):
+    return animation.page([Timeline(system(model, title), motion(model, **how))])
 
 
 def data(text):
-    (found,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', text)
-    return json.loads(found)
+    (content,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', text)
+    return json.loads(content)
 
 
 def values(packed, shape=(-1,)):
@@ -35,18 +35,18 @@ def values(packed, shape=(-1,)):
     return packed["middle"] + levels.reshape(shape) * packed["scale"]
 
 
-def times(given):
-    """The times of the rows of a run on a page."""
-    return np.frombuffer(base64.b64decode(given["rows"]), dtype="<f8")
+def times(run_data):
+    """Return the times of the rows of a run on a page."""
+    return np.frombuffer(base64.b64decode(run_data["rows"]), dtype="<f8")
 
 
-def test_nothing_is_asked_of_a_network():
+def test_page_needs_no_network():
     text = page(scene("cartpole"))
     assert "default-src 'none'" in text
     assert not re.findall(r"https?:|//[a-z]+\.|@import|url\(|\bsrc=|\bhref=|<link|fetch\(", text)
 
 
-def test_titles_are_text():
+def test_titles_are_escaped():
     text = animation.page(
         [Timeline(system(scene("cartpole"), EVIL), motion(scene("cartpole")))] * 2
     )
@@ -55,7 +55,7 @@ def test_titles_are_text():
     assert "<img" not in page(scene("cartpole"), title=EVIL)
 
 
-def test_names_in_the_data_are_text():
+def test_names_in_the_data_are_escaped():
     run = motion(scene("cartpole"))
     odd = system(scene("cartpole"))
     odd.coordinates = [SimpleNamespace(name="x", unit=EVIL), SimpleNamespace(name="y", unit="a<b")]
@@ -63,48 +63,48 @@ def test_names_in_the_data_are_text():
     assert "<img" not in text and data(text)
 
 
-def test_positions_are_those_of_the_run_to_the_stated_resolution():
-    made = scene("cartpole")
-    run = motion(made)
-    given = data(animation.page([Timeline(system(made), run)]))["runs"][0]
-    shown = draw_mechanism(system(made), run.t, run.q)
-    d = given["drawing"]
+def test_positions_agree_with_the_run_to_the_stated_resolution():
+    model = scene("cartpole")
+    run = motion(model)
+    run_data = data(animation.page([Timeline(system(model), run)]))["runs"][0]
+    shown = draw_mechanism(system(model), run.t, run.q)
+    d = run_data["drawing"]
     moving = values(d["moving"], (len(run.t), d["count"], 2))
     (box,) = [m for m in d["marks"] if m[0] == "box"]
     (own,) = [m for m in shown.marks if m.kind == "box"]
     assert np.abs(moving[:, box[1:]] - shown.points[:, own.points]).max() <= d["moving"]["scale"]
     assert d["moving"]["scale"] < 1e-4
-    assert np.array_equal(times(given), run.t)
-    _, (theta,), (energy,) = given["panels"]
+    assert np.array_equal(times(run_data), run.t)
+    _, (theta,), (energy,) = run_data["panels"]
     assert np.abs(values(theta) - run.q[:, 1]).max() <= theta["scale"] and energy["scale"] == 1
 
 
-def test_points_that_stand_are_written_once():
+def test_fixed_points_are_written_once():
     d = data(page(scene("kepler_orbit")))["runs"][0]["drawing"]
     assert d["fixed"] == [[0, 0]] and d["count"] == 1
 
 
-@pytest.mark.parametrize("made", [chain, humanoid])
-def test_ten_seconds_are_less_than_a_megabyte(made):
-    text = page(made(), seconds=10.0, rows=10_001)
+@pytest.mark.parametrize("model", [chain, humanoid])
+def test_page_of_ten_seconds_is_smaller_than_a_megabyte(model):
+    text = page(model(), seconds=10.0, rows=10_001)
     assert len(text) < 1_000_000
-    given = data(text)["runs"][0]
-    assert given["smooth"] and len(times(given)) >= 500
+    run_data = data(text)["runs"][0]
+    assert run_data["smooth"] and len(times(run_data)) >= 500
 
 
-def test_long_runs_are_thinned_and_the_page_says_to_what():
+def test_page_states_the_thinning_of_long_runs():
     text = page(chain(), seconds=100.0, rows=100_001)
     assert len(text) < 1_000_000
     count = len(times(data(text)["runs"][0]))
     assert f"{count} rows, {(count - 1) / 100:.3g} a second" in text
 
 
-def test_it_plays_in_real_time_unless_that_would_be_nothing_to_see():
+def test_playback_is_in_real_time_unless_the_run_is_too_short_or_long():
     for seconds, speed in ((10, 1), (0.01, 0.01), (3600, 100)):
         assert data(page(scene("cartpole"), seconds=seconds))["speed"] == speed
 
 
-def test_a_run_of_one_row_and_what_is_not_finite():
+def test_run_of_one_row_and_non_finite_values():
     text = page(scene("cartpole"), rows=1)
     assert len(times(data(text)["runs"][0])) == 1
     packed = animation._quantize(np.array([1.0, np.nan, 3.0]))
@@ -115,10 +115,10 @@ def test_a_run_of_one_row_and_what_is_not_finite():
     ]
 
 
-def test_without_a_drawing_there_are_the_curves():
-    made = system(scene("cartpole"))
-    made.scene, made.definitions = None, ()
-    text = animation.page([Timeline(made, motion(scene("cartpole")))])
+def test_scene_without_a_drawing_has_curves():
+    drawing_input = system(scene("cartpole"))
+    drawing_input.scene, drawing_input.definitions = None, ()
+    text = animation.page([Timeline(drawing_input, motion(scene("cartpole")))])
     assert 'class="stage"' not in text and text.count('class="panel"') == 3
 
 
@@ -128,7 +128,7 @@ def test_many_coordinates_share_panels_by_unit():
     assert text.count('class="name"') == 37
 
 
-def test_names_are_set_as_in_print():
+def test_names_are_typeset():
     assert html_name("theta_1", rate=True) == "θ\u0307<sub>1</sub>"
     assert html_name("arm_1", rate=True) == "arm\u02d9<sub>1</sub>"
     assert html_name("wrist_1_joint", rate=True) == "wrist 1 joint\u02d9"
@@ -140,16 +140,16 @@ def test_names_are_set_as_in_print():
 # --- of a built module ------------------------------------------------------------------------
 
 
-def test_a_loaded_module_knows_its_scene(modules, tmp_path):
+def test_loaded_module_has_its_scene(modules, tmp_path):
     run = modules("cartpole").simulate(duration=1.0, params={"l": 1.0})
     assert find_system(run).with_parameters({}).parameters[2].value == 1.0
-    made = run.animate(tmp_path / "a.html", run, title="Two")
+    result = run.animate(tmp_path / "a.html", run, title="Two")
     text = (tmp_path / "a.html").read_text()
-    assert text == made.page and "<h1>Two</h1>" in text and text.count('class="stage"') == 2
-    assert "srcdoc=" in made._repr_html_() and "<script" not in made._repr_html_()
+    assert text == result.page and "<h1>Two</h1>" in text and text.count('class="stage"') == 2
+    assert "srcdoc=" in result._repr_html_() and "<script" not in result._repr_html_()
 
 
-def test_without_its_scene_a_run_says_what_to_do(modules, tmp_path, monkeypatch):
+def test_run_without_its_scene_gives_a_remedy(modules, tmp_path, monkeypatch):
     run = modules("cartpole").simulate(duration=0.1)
     monkeypatch.setattr(run.model, "source", None, raising=False)
     with pytest.raises(EomcError, match=r"cartpole: .* load it with eomc.load, or give scene=PATH"):
@@ -159,21 +159,21 @@ def test_without_its_scene_a_run_says_what_to_do(modules, tmp_path, monkeypatch)
         run.animate(scene="scenes/chain.toml")
 
 
-def test_without_eomc_a_run_says_what_to_do(modules, monkeypatch):
+def test_run_without_eomc_gives_a_remedy(modules, monkeypatch):
     from importlib import import_module
 
     run = modules("cartpole").simulate(duration=0.1)
     shown = import_module(type(run).__module__.replace(".trajectory", ".package"))
 
-    def missing(name):
+    def raise_import_error(name):
         raise ModuleNotFoundError(name, name="eomc")
 
-    monkeypatch.setattr(shown, "import_module", missing)
+    monkeypatch.setattr(shown, "import_module", raise_import_error)
     with pytest.raises(ImportError, match=r"pip install \."):
         run.animate()
 
 
-def test_other_suffixes_and_folders_are_reported(tmp_path):
+def test_unsuitable_suffixes_and_folders_are_reported(tmp_path):
     runs = [SimpleNamespace()]
     with pytest.raises(EomcError, match=r"as \.html, \.gif or \.mp4"):
         animation.animate(runs, tmp_path / "a.avi")
@@ -186,7 +186,7 @@ def test_other_suffixes_and_folders_are_reported(tmp_path):
 
 @pytest.fixture(scope="module")
 def batch():
-    """Ten poles of different lengths; one of them stops half way."""
+    """Return ten poles of different lengths; one of them stops half way."""
     runs = batches.module("cartpole").simulate_batch(
         steps=400, params={"l": np.linspace(1.0, 3.0, 10)}
     )
@@ -195,42 +195,42 @@ def batch():
 
 
 def rows_of(batch, text):
-    """The rows of a batch that a page shows."""
+    """Return the rows of a batch that a page shows."""
     shown = times(data(text)["runs"][0])
     return np.rint(np.interp(shown, batch.t, np.arange(len(batch.t)))).astype(int)
 
 
-def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
-    made = batch.animate(tmp_path / "b.html", instances=[0, 4, 9])
+def test_instances_of_a_batch_are_overlaid(batch, tmp_path):
+    result = batch.animate(tmp_path / "b.html", instances=[0, 4, 9])
     text = (tmp_path / "b.html").read_text()
-    assert text == made.page and text.count('class="stage"') == 1
+    assert text == result.page and text.count('class="stage"') == 1
     assert "0: l = 1 m" in text and "9: l = 3 m, singular" in text
     d = data(text)["runs"][0]["drawing"]
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
     assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
     fifth = find_system(batch).with_parameters({"l": batch.parameter_values[4, 2]})
-    alone = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
+    drawing = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
-    path = alone.points[:, alone.paths[0].point]
+    path = drawing.points[:, drawing.paths[0].point]
     assert np.abs(moving[:, own] - path).max() <= d["moving"]["scale"]
 
 
-def test_an_instance_that_stopped_stands_where_it_did_and_its_curve_ends(batch):
-    given = data(batch.animate(instances=[9], names=["theta"]).page)["runs"][0]
-    d = given["drawing"]
+def test_stopped_instance_is_at_rest_and_its_curve_ends(batch):
+    run_data = data(batch.animate(instances=[9], names=["theta"]).page)["runs"][0]
+    d = run_data["drawing"]
     moving = values(d["moving"], (-1, d["count"], 2))
     half = len(moving) // 2 + 1
     assert np.ptp(moving[half:], axis=0).max() == 0 < np.ptp(moving[: half - 1], axis=0).max()
-    ((curve,),) = given["panels"]
+    ((curve,),) = run_data["panels"]
     levels = np.frombuffer(base64.b64decode(curve["data"]), dtype="<i2")
     assert (levels[half:] == -32768).all() and (levels[: half - 1] != -32768).all()
 
 
-def test_curves_of_a_batch_are_those_of_its_instances(batch):
+def test_curves_of_a_batch_agree_with_its_instances(batch):
     text = batch.animate(names=["theta", "theta_dot"]).page
     theta, rate = data(text)["runs"][0]["panels"]
-    shown = [0, 1, 3, 5, 7, 9]  # six, spread evenly
+    shown = [0, 1, 3, 5, 7, 9]  # six, evenly spaced
     for packed, k in zip(rate, shown, strict=True):
         own = batch.qd[k, rows_of(batch, text), 1]
         known = np.isfinite(own)
@@ -239,7 +239,7 @@ def test_curves_of_a_batch_are_those_of_its_instances(batch):
 
 
 @pytest.mark.parametrize("wrong", [0, -1, True, 1.5, "all", [], [[1]], [0, 10], [-1]])
-def test_instances_that_are_not_there_are_named(batch, wrong):
+def test_unknown_instances_are_refused(batch, wrong):
     with pytest.raises(EomcError, match="instances: give how many, or a list of some from 0 to 9"):
         batch.animate(instances=wrong)
 
@@ -256,56 +256,56 @@ def test_unknown_curves_of_a_batch_are_refused(batch):
 
 
 @pytest.mark.slow
-def test_a_batch_by_tolerance_moves_at_its_times(modules):
+def test_adaptive_batch_is_animated_at_its_times(modules):
     text = (SCENES / "cartpole.toml").read_text().replace('"cartpole"', '"fitted_poles"')
     many = modules.unoptimised(text.replace("[run]\n", "[run]\nbatch = true\ntolerance = 1e-6\n"))
     lengths = np.linspace(1.0, 2.0, 3)
     runs = many.simulate_batch(params={"l": lengths}, times=np.arange(61) / 60, tol=1e-6)
-    given = data(runs.animate(instances=[2, 0]).page)["runs"][0]
-    assert np.array_equal(times(given), runs.t)
-    (first, _) = given["panels"][1]
+    run_data = data(runs.animate(instances=[2, 0]).page)["runs"][0]
+    assert np.array_equal(times(run_data), runs.t)
+    (first, _) = run_data["panels"][1]
     assert np.abs(values(first) - runs.q[2, :, 1]).max() <= first["scale"]
 
 
-def test_a_batch_as_a_film(batch, tmp_path):
+def test_batch_is_written_as_a_film(batch, tmp_path):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     short = select_instances(batch, [0, 5])
     short.q, short.qd = short.q[:, :11], short.qd[:, :11]
     short.animate(tmp_path / "b.gif")
-    with image.open(tmp_path / "b.gif") as made:
-        counted = made.convert("RGB").getcolors(1 << 20)
+    with image.open(tmp_path / "b.gif") as image_file:
+        counted = image_file.convert("RGB").getcolors(1 << 20)
     assert max(counted)[1] == (255, 255, 255)
     colours = {c for _, c in counted}
-    assert any(r < 40 and b > 150 for r, _, b in colours)  # the first in blue
-    assert any(r > 180 and b < 60 for r, _, b in colours)  # the second in orange
+    assert any(r < 40 and b > 150 for r, _, b in colours)  # the first is blue
+    assert any(r > 180 and b < 60 for r, _, b in colours)  # the second is orange
 
 
 # --- films ------------------------------------------------------------------------------------
 
 
-def film(made, file, **how):
+def film(model, file, **how):
     from eomc.report import film
 
-    film.write_film([Timeline(system(made), motion(made, **how))], file, None)
+    film.write_film([Timeline(system(model), motion(model, **how))], file, None)
 
 
 @pytest.mark.slow
-def test_a_gif_has_a_picture_for_each_instant(tmp_path):
+def test_gif_has_a_frame_for_each_instant(tmp_path):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     film(scene("simple_pendulum"), tmp_path / "a.gif", seconds=0.2)
-    with image.open(tmp_path / "a.gif") as made:
-        assert made.n_frames == 6 and made.info["duration"] == 40  # ms
+    with image.open(tmp_path / "a.gif") as image_file:
+        assert image_file.n_frames == 6 and image_file.info["duration"] == 40  # ms
         pictures = []
         for k in range(6):
-            made.seek(k)
-            pictures.append(np.asarray(made.convert("L"), int)[60:])  # below the title
+            image_file.seek(k)
+            pictures.append(np.asarray(image_file.convert("L"), int)[60:])  # below the title
     changes = [np.abs(a - b).sum() for a, b in itertools.pairwise(pictures)]
-    assert min(changes) > max(changes) / 3  # it moves from each to the next
+    assert min(changes) > max(changes) / 3  # it moves between all frames
 
 
-def test_of_a_film_what_stands_is_drawn_once_and_all_is_in_view(monkeypatch):
+def test_film_draws_fixed_parts_once_and_fits_all_in_view(monkeypatch):
     matplotlib = pytest.importorskip("matplotlib")
     from eomc.report.film import Pictures
 
@@ -326,7 +326,7 @@ def test_of_a_film_what_stands_is_drawn_once_and_all_is_in_view(monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a script of sh stands for ffmpeg")
-def test_an_mp4_is_given_a_picture_for_each_instant(tmp_path, monkeypatch):
+def test_mp4_writer_receives_a_frame_for_each_instant(tmp_path, monkeypatch):
     matplotlib = pytest.importorskip("matplotlib")
     program = tmp_path / "ffmpeg"
     program.write_text('#!/bin/sh\nfor last; do :; done\ncat > "$last"\n')
@@ -337,7 +337,7 @@ def test_an_mp4_is_given_a_picture_for_each_instant(tmp_path, monkeypatch):
     assert (pictures[:, 0, 0] == 255).all() and (pictures[1] != pictures[2]).any()
 
 
-def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
+def test_failed_films_report_the_reason(tmp_path, monkeypatch):
     animations = pytest.importorskip("matplotlib.animation")
     monkeypatch.setattr(animations.FFMpegWriter, "isAvailable", classmethod(lambda _: False))
     with pytest.raises(EomcError, match=r"ffmpeg: install it, or write \.gif"):
@@ -352,7 +352,7 @@ def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
         write_film([Timeline(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
 
 
-def test_without_matplotlib_a_film_says_what_to_do(tmp_path, monkeypatch):
+def test_film_without_matplotlib_gives_a_remedy(tmp_path, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "matplotlib.animation", None)
@@ -403,40 +403,40 @@ def ball(modules):
     return modules.unoptimised(BOUNCING)
 
 
-def test_adaptive_runs_are_interpolated_and_keep_both_rows_of_a_jump(ball):
+def test_adaptive_runs_are_interpolated_with_both_rows_of_a_jump(ball):
     run = ball.simulate(tol=1e-9, duration=2.0)
-    given = data(run.animate().page)["runs"][0]
-    rows, impacts = times(given), run.events["impact"].t
-    assert len(run.t) < 50 and len(rows) >= 600 and given["smooth"]
+    run_data = data(run.animate().page)["runs"][0]
+    rows, impacts = times(run_data), run.events["impact"].t
+    assert len(run.t) < 50 and len(rows) >= 600 and run_data["smooth"]
     even = np.diff(np.unique(rows))
     assert even.max() < 1 / 60
     for t in impacts:
         assert np.count_nonzero(rows == t) == 2
-    ((y,), (x,), *_) = given["panels"]
+    ((y,), (x,), *_) = run_data["panels"]
     first = np.searchsorted(rows, impacts[0], side="right")
     exact = 1 - 9.81 * rows[:first] ** 2 / 2
     assert np.abs(values(y)[:first] - exact).max() <= y["scale"] + 1e-9
     assert np.abs(values(x) - (2e6 + 0.5 * rows)).max() <= x["scale"] + 1e-9
 
 
-def test_inputs_that_are_held_are_drawn_as_stairs(ball):
+def test_zero_order_hold_inputs_are_drawn_as_stairs(ball):
     table = np.arange(20.0)[:, None] % 3
-    held = ball.simulate(h=0.01, duration=1.0, u=table, control_period=0.05)
+    stepwise_run = ball.simulate(h=0.01, duration=1.0, u=table, control_period=0.05)
     own = ball.simulate(h=0.01, duration=1.0)
-    for run, stairs in ((held, True), (own, False)):
+    for run, stairs in ((stepwise_run, True), (own, False)):
         panels = data(run.animate().page)["runs"][0]["panels"]
         (wind,) = panels[2]
         assert wind["stairs"] is stairs and not panels[0][0]["stairs"]
 
 
-def test_a_notebook_shows_the_page_as_high_as_it_is(ball):
+def test_notebook_shows_the_page_in_full_height(ball):
     shown = ball.simulate(h=0.01, duration=0.1).animate()._repr_html_()
     height = float(re.search(r"height:([0-9.]+)em", shown)[1])
     assert height >= animation.PANEL_HEIGHT * 4 and "scrollHeight" in shown
 
 
 @pytest.mark.parametrize("how", [{"h": 0.01}, {"tol": 1e-9}])
-def test_a_picture_at_a_time_is_an_array_of_pixels(ball, how):
+def test_picture_at_a_time_is_an_array_of_pixels(ball, how):
     run = ball.simulate(duration=1.0, **how)
     image = run.render(0.333)
     assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3

@@ -1,4 +1,4 @@
-"""The report: what it measures compared with theory, and what the command prints and writes."""
+"""The report: its measurements compared with theory, and the output of its command."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def gcc() -> None:
 
 
 def oscillator() -> System:
-    """x = cos(3 t), and D = 1."""
+    """Return x = cos(3 t), with D = 1."""
     x, v = sympy.symbols("x x_dot")
     return System.make("oscillating", {x: 1.0}, v**2 / 2, 9 * x**2 / 2, h=0.01, duration=4.0)
 
@@ -57,8 +57,8 @@ def measured() -> WorkPrecisionReport:
 
 
 @pytest.mark.slow
-def test_errors_of_rk4_are_those_of_theory() -> None:
-    """x'' = -w^2 x: phase lag w t z^4/120 with z = w h; energy falls by w t z^5/72 of itself."""
+def test_errors_of_rk4_agree_with_theory() -> None:
+    """x'' = -w^2 x: phase lag w t z^4/120 with z = w h; relative loss of energy w t z^5/72."""
     rk4 = measured().lines[0]
     for p in rk4.points:
         z = 3 * p.h
@@ -67,26 +67,26 @@ def test_errors_of_rk4_are_those_of_theory() -> None:
             theory = np.max(np.abs(np.cos(np.linspace(0, 12, 2001) - lag)
                                    - np.cos(np.linspace(0, 12, 2001))))  # fmt: skip
             assert p.along == pytest.approx(theory, rel=0.15)
-            # of K + P = 9/2; K and P change by 9/2 each
+            # of K + P = 9/2, where K and P change by 9/2 each
             assert p.energy == pytest.approx(12 * z**5 / 72 / 2, rel=0.1)
             assert p.evaluations == 4 * p.steps
 
 
 @pytest.mark.slow
-def test_no_number_of_digits_is_left_out() -> None:
+def test_every_number_of_digits_is_reported() -> None:
     r = measured()
     rows = page.digit_rows(r)
     assert [row[0] for row in rows] == [str(d) for d in range(3, 16)]
     for row in rows:
         best = r.best(int(row[0]))
         assert row[1] == (best.method if best else "out of reach")
-    said = []
+    reported = []
     for words in page.recommendations(r):
         first, last = re.match(r"for (\d+)(?: to (\d+))? digits up to", words).groups()
-        said += range(int(first), int(last or first) + 1)
+        reported += range(int(first), int(last or first) + 1)
         reached = {r.best(d) for d in range(int(first), int(last or first) + 1)}
         assert len(reached) == 1 and (None in reached) == ("out of reach" in words)
-    assert said == [*range(3, 16)]
+    assert reported == [*range(3, 16)]
     rk4 = r.lines[0]
     coarse = replace(rk4, points=tuple(p for p in rk4.points if p.along > 1e-8))
     worse = replace(r, lines=(coarse,))
@@ -95,7 +95,7 @@ def test_no_number_of_digits_is_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_order_stability_and_rounding() -> None:
+def test_order_stability_and_rounding_are_measured() -> None:
     rk4, dp8 = measured().lines
     assert rk4.observed == pytest.approx(4, abs=0.3)
     assert dp8.observed == pytest.approx(8, abs=0.8)
@@ -111,29 +111,33 @@ def test_order_stability_and_rounding() -> None:
     assert 1e-17 < min(p.along for p in dp8.points) < 1e-13
 
 
-def test_what_is_recommended_is_the_quickest_that_is_good_enough() -> None:
+def test_recommended_stepper_is_the_quickest_with_enough_digits() -> None:
     r = measured()
     for digits in (3, 6, 9, 12):
-        found = r.best(digits)
-        assert found is not None and found.along <= 10.0**-digits
-        assert not any(p.along <= 10.0**-digits and p.seconds < found.seconds for p in r.points)
+        recommended = r.best(digits)
+        assert recommended is not None and recommended.along <= 10.0**-digits
+        assert not any(
+            p.along <= 10.0**-digits and p.seconds < recommended.seconds for p in r.points
+        )
         words = page.recommendation(r, digits)
-        assert words.startswith(f"for {digits} digits up to t = 4 s: {found.method} with h = ")
-        assert f"(4 s/{found.steps})" in words
+        assert words.startswith(
+            f"for {digits} digits up to t = 4 s: {recommended.method} with h = "
+        )
+        assert f"(4 s/{recommended.steps})" in words
     assert "out of reach" in page.recommendation(r, 17)
     best = r.best(12)
     assert best is not None and best.method == "dp8"
 
 
-def test_a_difference_of_an_oscillator_does_not_grow() -> None:
-    """In the norm of its energy it is turned only."""
+def test_perturbation_of_an_oscillator_does_not_grow() -> None:
+    """In the energy norm it only rotates."""
     g = measured().growth
     assert not g.wild and g.horizon == math.inf
     assert g.amplification[-1] == pytest.approx(1, rel=0.1)
 
 
-def test_what_grows_as_the_motion_does_is_not_chaos() -> None:
-    """x'' = x for 40 s: differences grow by e^40, and so does x, which keeps all its digits."""
+def test_growth_proportional_to_the_motion_is_not_chaos() -> None:
+    """x'' = x for 40 s: differences grow by e^40, and so does x, which loses no digit."""
     t = np.linspace(0, 40, 65)
     running = cost_of_digits._classify_growth(t, np.exp(t), 1e-3 * np.expm1(t), 1e-3 * np.exp(t))
     assert not running.wild and running.horizon == math.inf
@@ -144,8 +148,8 @@ def test_what_grows_as_the_motion_does_is_not_chaos() -> None:
 
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.slow
-def test_adaptive_steps_stand_beside_fixed_ones(tmp_path: Path) -> None:
-    """By tolerance; events, which the reference passes over, are left out."""
+def test_adaptive_steps_are_compared_with_fixed_ones(tmp_path: Path) -> None:
+    """Steps are by tolerance; events, which the reference ignores, are omitted."""
     x = sympy.Symbol("x")
     system = replace(oscillator(), events=(Event("middle", x, action="stop"),))
     r = cost_of_digits.measure(system, tmp_path, longest=0.005, methods=("rk4", "adaptive"))
@@ -156,10 +160,12 @@ def test_adaptive_steps_stand_beside_fixed_ones(tmp_path: Path) -> None:
         assert p.status == "ok" and p.along < 20 * p.tol + 2e-15
         assert p.h == pytest.approx(4 / p.steps)
     assert line.order == 16 and math.isnan(line.usable_h)
-    found = r.best(12)
-    assert found is not None and found.adaptive
+    recommended = r.best(12)
+    assert recommended is not None and recommended.adaptive
     words = page.recommendation(r, 12)
-    assert words.startswith(f"for 12 digits up to t = 4 s: adaptive steps with tol = {found.tol:g}")
+    assert words.startswith(
+        f"for 12 digits up to t = 4 s: adaptive steps with tol = {recommended.tol:g}"
+    )
     assert page.stepper_rows(r)[1][-3] == f"tol {min(line.points, key=lambda p: p.along).tol:g}"
     assert "Error against tolerance" in page.write_page(r)
     assert json.loads(json.dumps(page.as_dict(r), allow_nan=False))["lines"][0]["points"][0][
@@ -179,9 +185,9 @@ def test_condition_and_jumps_are_reported(tmp_path: Path) -> None:
     r = cost_of_digits.measure(system, tmp_path, longest=0.005, methods=("rk4",))
     assert r.condition[0] == pytest.approx(2e9, rel=1e-3)
     assert r.condition[1] == 0.0
-    said = " ".join(page.remarks(r))
-    assert "nearly singular at t = 0 s, x = 0, y = 0: condition number 2e+09" in said
-    assert "jump or bend (abs)" in said
+    remarks = " ".join(page.remarks(r))
+    assert "nearly singular at t = 0 s, x = 0, y = 0: condition number 2e+09" in remarks
+    assert "jump or bend (abs)" in remarks
     smooth = " ".join(page.remarks(measured()))
     assert (
         "D is regular: its condition number, once scaled to a diag" in smooth
@@ -213,19 +219,19 @@ class _Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_page_is_one_file_with_its_pictures() -> None:
+def test_page_is_one_file_with_its_pictures() -> None:
     pytest.importorskip("matplotlib")
     text = page.write_page(measured())
     read = _Page()
     read.feed(text)
     assert read.tags.count("svg") == 3 and "script" not in read.tags
-    assert all(link.startswith("#") for link in read.links)  # nothing from outside
+    assert all(link.startswith("#") for link in read.links)  # nothing external
     for words in page.recommendations(measured()):
         assert words in text
     assert text == page.write_page(measured())
 
 
-def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
+def test_page_is_written_without_matplotlib_and_latex2mathml(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
@@ -235,9 +241,11 @@ def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
     scene = tmp_path / "oscillating.toml"
     scene.write_text(OSCILLATING)
     (tmp_path / "oscillating").mkdir()
-    done = CliRunner().invoke(main, ["report", str(scene), "--build", str(tmp_path)])
-    assert done.exit_code == 0, done.output
-    assert "the page has no pictures, which need matplotlib: pip install matplotlib" in done.output
+    result = CliRunner().invoke(main, ["report", str(scene), "--build", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert (
+        "the page has no pictures, which need matplotlib: pip install matplotlib" in result.output
+    )
     text = (tmp_path / "oscillating" / "report.html").read_text()
     assert "The page has no pictures, which need matplotlib" in text
     assert "K, kinetic energy:" in text  # the equations as text
@@ -246,13 +254,13 @@ def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
 
 
 @pytest.mark.slow
-def test_names_are_escaped_on_the_page() -> None:
+def test_page_escapes_names() -> None:
     pytest.importorskip("matplotlib")
     text = page.write_page(replace(measured(), title="<script>"))
     assert "<script>" not in text and "&lt;script&gt;" in text
 
 
-def test_the_figures_as_json() -> None:
+def test_measurements_as_json() -> None:
     figures = json.loads(json.dumps(page.as_dict(measured()), allow_nan=False))
     assert [line["method"] for line in figures["lines"]] == ["rk4", "dp8"]
     assert figures["best"]["6"]["along"] <= 1e-6
@@ -263,26 +271,28 @@ def test_the_figures_as_json() -> None:
 
 
 @pytest.mark.parametrize(("mode", "steps"), [(0.0, 8), (10j, 128)])
-def test_the_first_steps_are_few_to_a_turn(
+def test_first_steps_are_few_per_revolution(
     mode: complex, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 12 radians at most, a quarter of that to be sure; a motion without modes has eight."""
-    asked, like = [], measured().lines[0].points[0]
+    """At most 12 radians, a quarter of that for safety; eight steps for a motion without modes."""
+    step_counts, like = [], measured().lines[0].points[0]
 
-    def point(_: object, __: object, name: str, duration: float, steps: int) -> WorkPrecisionPoint:
-        asked.append(steps)
+    def record_steps(
+        _: object, __: object, name: str, duration: float, steps: int
+    ) -> WorkPrecisionPoint:
+        step_counts.append(steps)
         return replace(like, seconds=math.inf)
 
-    monkeypatch.setattr(cost_of_digits, "_point", point)
-    given: Any = None
-    cost_of_digits._line(given, given, "gauss8", np.array([mode, -mode]), 400.0, 1.0)
-    assert asked == [steps]
+    monkeypatch.setattr(cost_of_digits, "_point", record_steps)
+    unused: Any = None
+    cost_of_digits._line(unused, unused, "gauss8", np.array([mode, -mode]), 400.0, 1.0)
+    assert step_counts == [steps]
 
 
-def test_a_stepper_without_a_digit_is_left_out_of_the_figure_of_energy() -> None:
+def test_stepper_without_a_digit_is_omitted_from_the_energy_figure() -> None:
     report, drawn = measured(), list[str]()
-    lost = tuple(replace(p, along=math.inf) for p in report.lines[0].points)
-    lines = (replace(report.lines[0], points=lost), report.lines[1])
+    inaccurate = tuple(replace(p, along=math.inf) for p in report.lines[0].points)
+    lines = (replace(report.lines[0], points=inaccurate), report.lines[1])
 
     class Axes:
         def semilogy(self, *_: Any, label: str, **__: Any) -> None:
@@ -295,24 +305,24 @@ def test_a_stepper_without_a_digit_is_left_out_of_the_figure_of_energy() -> None
     assert drawn == ["dp8"]
 
 
-def test_times_have_a_unit() -> None:
-    given = (2.0, 1.2, 0.999, 4.88e-3, 1e-3, 1.23e-5, 1.1e-6, 3e-9, math.inf)
-    told = ["2 s", "1.2 s", "999 ms", "4.88 ms", "1 ms", "12.3 us", "1.1 us", "3 ns", "-"]
-    assert [page._time(seconds) for seconds in given] == told
+def test_times_are_printed_with_a_unit() -> None:
+    times = (2.0, 1.2, 0.999, 4.88e-3, 1e-3, 1.23e-5, 1.1e-6, 3e-9, math.inf)
+    expected = ["2 s", "1.2 s", "999 ms", "4.88 ms", "1 ms", "12.3 us", "1.1 us", "3 ns", "-"]
+    assert [page._time(seconds) for seconds in times] == expected
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost_of_digits, "METHODS", {n: METHODS[n] for n in ("rk4", "dp8")})
     scene, file = str(SCENES / "mass_spring.toml"), tmp_path / "figures.json"
     words = ["report", scene, "--build", str(tmp_path)]
     with warnings.catch_warnings(action="error"):
-        done = CliRunner().invoke(main, [*words, "--json", str(file)])
-    assert done.exit_code == 0, done.output
-    assert "smallest error" in done.output
-    assert re.search(r"(?m)^wrote .*report\.html$", done.output)
+        result = CliRunner().invoke(main, [*words, "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    assert "smallest error" in result.output
+    assert re.search(r"(?m)^wrote .*report\.html$", result.output)
     best = r"(?m)^for \d+(?: to \d+)? digits up to t = 20 s: ((rk4|dp8) with h|adaptive .*tol) = "
-    assert re.search(best, done.output)
+    assert re.search(best, result.output)
     assert (tmp_path / "mass_spring" / "report.html").read_text().startswith("<!DOCTYPE html>")
     assert json.loads(file.read_text())[0]["scene"] == "mass_spring"
     short = CliRunner().invoke(main, [*words, "--digits", "8"])
@@ -323,11 +333,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_chaos_is_reported(tmp_path: Path) -> None:
-    """The case's own amplification at the end is 1.7e11, by a nudge of its start."""
+    """The case's own amplification at the end is 1.7e11, from a perturbed initial state."""
     system = case_system("double_pendulum_chaotic")
     r = cost_of_digits.measure(system, tmp_path, longest=0.02, methods=("rk4", "dp8"))
     assert r.growth.wild
-    assert 1e10 < r.growth.amplification[-1] < 1e13  # another norm than the case's
+    assert 1e10 < r.growth.amplification[-1] < 1e13  # in another norm than the case
     assert r.growth.horizon > 15
     assert "no run in doubles means anything" in " ".join(page.remarks(r))
     smallest = min(p.along for p in r.points)
@@ -335,9 +345,7 @@ def test_chaos_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_stepper_that_a_scene_can_not_use_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unusable_stepper_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def sources(system: System, *rest: object, **options: object) -> Sources:
         if "rk4" in system.run.methods:
             raise EomcError("rk4 is refused here")
@@ -351,13 +359,13 @@ def test_a_stepper_that_a_scene_can_not_use_is_reported(
         cost_of_digits.build_variant(oscillator(), ("rk4",), tmp_path)
 
 
-def test_progress_begins_before_the_reference_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[int, int]] = []
+def test_progress_starts_before_the_reference_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    reports: list[tuple[int, int]] = []
 
-    def of(*_: Any, **__: Any) -> Any:
-        assert told == [(0, len(METHODS) + 3)]
+    def raise_after_first_report(*_: Any, **__: Any) -> Any:
+        assert reports == [(0, len(METHODS) + 3)]
         raise EomcError("seen")
 
-    monkeypatch.setattr(cost_of_digits.reference_solution, "solve", of)
+    monkeypatch.setattr(cost_of_digits.reference_solution, "solve", raise_after_first_report)
     with pytest.raises(EomcError, match="seen"):
-        cost_of_digits.measure(SCENES / "cartpole.toml", progress=lambda *how: told.append(how))
+        cost_of_digits.measure(SCENES / "cartpole.toml", progress=lambda *how: reports.append(how))

@@ -1,4 +1,4 @@
-"""Equations as they are taught: the right ones, in their order, of at most 100 columns."""
+"""Equations in textbook form: correct, in order, in lines of at most 100 columns."""
 
 import json
 import re
@@ -34,74 +34,84 @@ QUICK = ("cartpole_tutorial", "spring_pendulum", "furuta_pendulum", "kapitza_pen
 
 
 def scenes(files: list[Path]) -> list[Any]:
-    """As parameters, most of them slow."""
+    """Return them as parameters, most of them slow."""
     return [
         pytest.param(f, id=f.stem, marks=() if f.stem in QUICK else pytest.mark.slow) for f in files
     ]
 
 
-def same(found: Eq, left: sympy.Expr, right: sympy.Expr = sympy.S.Zero) -> bool:
-    return bool(sympy.simplify(found.lhs - found.rhs - left + right) == 0)
+def are_equal(equation: Eq, left: sympy.Expr, right: sympy.Expr = sympy.S.Zero) -> bool:
+    return bool(sympy.simplify(equation.lhs - equation.rhs - left + right) == 0)
 
 
-def test_the_tutorials_cart_pole() -> None:
-    found = eomc.equations(SCENES / "cartpole_tutorial.toml")
+def test_cart_pole_of_the_tutorial() -> None:
+    equations = eomc.equations(SCENES / "cartpole_tutorial.toml")
     q2, v2, a1, a2 = symbols("q2 q2_dot q1_ddot q2_ddot")
     mc, mp, r, g = symbols("mc mp l g")
-    first, second = found.scalar
-    assert same(first, (mc + mp) * a1 - mp * r * cos(q2) * a2 / 2 + mp * r * sin(q2) * v2**2 / 2)
-    assert same(second, -mp * r * cos(q2) * a1 / 2 + mp * r**2 * a2 / 3 - mp * g * r * sin(q2))
+    first, second = equations.scalar
+    assert are_equal(
+        first, (mc + mp) * a1 - mp * r * cos(q2) * a2 / 2 + mp * r * sin(q2) * v2**2 / 2
+    )
+    assert are_equal(second, -mp * r * cos(q2) * a1 / 2 + mp * r**2 * a2 / 3 - mp * g * r * sin(q2))
     assert first.rhs == second.rhs == 0
-    assert sympy.expand(found.L - found.kinetic + found.potential) == 0
+    assert sympy.expand(equations.L - equations.kinetic + equations.potential) == 0
 
 
-def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
-    made = eomc.System.make(
+def test_inputs_are_on_the_right_and_friction_on_the_left() -> None:
+    system = eomc.System.make(
         "slider", ["x"], "m*x_dot**2/2", "k*x**2/2", dissipation="c*x_dot**2/2",
         forces={"x": "F - k_3*x**3"}, inputs={"F": 0},
         parameters=dict.fromkeys(("m", "k", "c", "k_3"), 1),
     )  # fmt: skip
-    (found,) = derive(made).scalar
+    (equation,) = derive(system).scalar
     m, k, c, k_3, F = symbols("m k c k_3 F", real=True)
     x, v, a = symbols("x x_dot x_ddot", real=True)
-    assert sympy.expand(found.lhs - (m * a + c * v + k * x)) == 0
-    assert sympy.expand(found.rhs - (F - k_3 * x**3)) == 0
-    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in write_latex(derive(made))
-    text = unicodedata.normalize("NFC", str(derive(made)))
+    assert sympy.expand(equation.lhs - (m * a + c * v + k * x)) == 0
+    assert sympy.expand(equation.rhs - (F - k_3 * x**3)) == 0
+    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in write_latex(derive(system))
+    text = unicodedata.normalize("NFC", str(derive(system)))
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
 
 
-def test_dots_stand_behind_words_not_in_their_middle() -> None:
+def test_dots_follow_words() -> None:
     text = unicodedata.normalize("NFC", str(eomc.equations(SCENES / "furuta_pendulum.toml")))
     assert "⋅arm¨⋅cos(θ)" in text and "⋅arm˙⋅θ̇⋅" in unicodedata.normalize("NFD", text)
     assert not re.search(r"ar[\u0307\u0308]|aṙ|r̈", unicodedata.normalize("NFD", text))
 
 
-def test_decimals_of_a_scene_stay_decimals() -> None:
-    """0.028, not 7/250; a third and an eighth stay fractions."""
+def test_decimals_of_a_scene_are_printed_as_decimals() -> None:
+    """0.028, not 7/250; a third and an eighth are printed as fractions."""
     potential = "0.0125*x**2/2 + 0.007*x*(1 + m) - m*sin(x)/400 + x**3/8"
-    made = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
-    text, latex = (form(derive(made)) for form in (str, write_latex))
+    system = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
+    text, latex = (form(derive(system)) for form in (str, write_latex))
     assert "- 0.0025⋅m⋅cos(x) = 0" in text and "0.007 + 0.007⋅m + 0.0125⋅x" in text
     assert r"- 0.0025 m \cos {x} = 0" in latex and r"\frac{3 x^{2}}{8}" in latex
-    found = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
-    assert found and "- 0.0025 m \\sin {x}" in found[1] and "+ 0.0025 m \\sin {x}" in found[2]
+    match = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
+    assert match and "- 0.0025 m \\sin {x}" in match[1] and "+ 0.0025 m \\sin {x}" in match[2]
     assert "000" not in text + latex
-    assert not derive(made).g.atoms(sympy.Float)  # shown only
+    assert not derive(system).g.atoms(sympy.Float)  # only the printed form has decimals
 
 
 @pytest.mark.parametrize("file", scenes(SMALL))
-def test_terms_are_what_they_are_terms_of(file: Path) -> None:
-    """With their signs: a sum behind a minus would lose all but its first."""
-    found = derive(pipeline.read(file))
-    write = Typesetter(found.system)
+def test_terms_sum_to_their_expression(file: Path) -> None:
+    """The signs matter: a sum after a minus would lose all terms but the first."""
+    equations = derive(pipeline.read(file))
+    write = Typesetter(equations.system)
     rng = np.random.default_rng(3)
-    names = sorted(found.system.names | {"t"})
+    names = sorted(equations.system.names | {"t"})
     at = {
         symbol(n): float(x) for n, x in zip(names, rng.uniform(0.2, 1.0, len(names)), strict=True)
     }
-    at |= dict.fromkeys(found.multipliers, 0.3)
-    values = [found.kinetic, found.potential, found.L, *found.g, *found.D, *found.C, *found.right]
+    at |= dict.fromkeys(equations.multipliers, 0.3)
+    values = [
+        equations.kinetic,
+        equations.potential,
+        equations.L,
+        *equations.g,
+        *equations.D,
+        *equations.C,
+        *equations.right,
+    ]
     for value in values:
         terms = write.terms(value)
         assert len(terms) == 1 or not any(term.is_Add for _, term in terms)
@@ -110,9 +120,9 @@ def test_terms_are_what_they_are_terms_of(file: Path) -> None:
 
 
 @pytest.mark.parametrize("file", scenes(SMALL))
-def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
+def test_scalar_equations_agree_with_reference(file: Path) -> None:
     system = pipeline.read(file)
-    found, reference = derive(system), symbolic.derive(system)
+    equations, reference = derive(system), symbolic.derive(system)
     rng = np.random.default_rng(1)
     values = [p.value for p in system.parameters]
     for _ in range(3):
@@ -124,17 +134,17 @@ def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
             named |= dict(zip(symbols_, x, strict=True))
         named[symbolic.t] = 0.7
         multipliers = rng.uniform(0.2, 1.0, len(system.constraints))
-        named |= dict(zip(found.multipliers, multipliers, strict=True))
-        made = [float((e.lhs - e.rhs).subs(named).evalf()) for e in found.scalar]
+        named |= dict(zip(equations.multipliers, multipliers, strict=True))
+        residuals = [float((e.lhs - e.rhs).subs(named).evalf()) for e in equations.scalar]
         state = {"q": q, "qd": qd, "t": 0.7, "u": u}
         D, bias, tau = (reference.evaluate(name, **state) for name in ("D", "bias", "tau"))
-        wanted = D @ qdd + bias - tau
+        expected = D @ qdd + bias - tau
         if system.constraints:
-            wanted -= multipliers @ reference.evaluate("constraint_jacobian", **state)
-        assert np.allclose(made, wanted, rtol=1e-9, atol=1e-9 * abs(wanted).max())
+            expected -= multipliers @ reference.evaluate("constraint_jacobian", **state)
+        assert np.allclose(residuals, expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
 
 
-def test_terms_stand_as_a_textbook_has_them() -> None:
+def test_terms_are_ordered_as_in_a_textbook() -> None:
     latex = write_latex(derive(pipeline.read(SCENES / "spring_pendulum.toml")))
     assert (
         r"& m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
@@ -146,7 +156,7 @@ def test_terms_stand_as_a_textbook_has_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "dots", "said"),
+    ("name", "dots", "expected"),
     [
         ("theta_1", 0, r"\theta_{1}"),
         ("theta1", 1, r"\dot{\theta}_{1}"),
@@ -160,8 +170,8 @@ def test_terms_stand_as_a_textbook_has_them() -> None:
         ("l_theta2", 0, r"l_{\theta2}"),
     ],
 )
-def test_names(name: str, dots: int, said: str) -> None:
-    assert tex(name, dots) == said
+def test_names_are_typeset(name: str, dots: int, expected: str) -> None:
+    assert tex(name, dots) == expected
 
 
 QUAD = """
@@ -194,11 +204,11 @@ tip = "dot(x4)*y4 + a_ddot"
 """
 
 
-def test_of_four_links_each_entry_stands_by_itself(tmp_path: Path) -> None:
+def test_matrix_entries_of_four_links_are_printed_one_by_one(tmp_path: Path) -> None:
     file = tmp_path / "quad.toml"
     file.write_text(QUAD, encoding="utf-8")
-    found = eomc.equations(file)
-    text, latex = str(found), found._repr_latex_()
+    equations = eomc.equations(file)
+    text, latex = str(equations), equations._repr_latex_()
     assert "D₁₂ = 3⋅mass⋅length ⋅cos(a - b)" in text
     entry = r"D_{34} &= \mathrm{mass} \, \mathrm{length}^{2} \, \cos{\left(c - d \right)}"
     assert entry in latex
@@ -210,63 +220,63 @@ def test_of_four_links_each_entry_stands_by_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", scenes(ALL))
-def test_text_is_mathematics_of_at_most_100_columns(file: Path) -> None:
+def test_text_has_at_most_100_columns(file: Path) -> None:
     text = write_equations(pipeline.read(file))
     assert not re.search(r"\*\*|;$|\bdouble\b|\bw\d+ =|\w\[", text, re.M), text
     assert max(stringPict(line).width() for line in text.splitlines()) <= 100
 
 
-def test_what_is_too_wide_for_a_line_is_broken() -> None:
-    made = eomc.System.make(
+def test_long_lines_are_broken() -> None:
+    system = eomc.System.make(
         "wide", ["x"], "m*x_dot**2/2", f"k*sqrt({' + '.join(f'(x - a_{i})**2' for i in range(9))})",
         parameters={"m": 1, "k": 1, **{f"a_{i}": 1 for i in range(9)}},
     )  # fmt: skip
-    text = str(derive(made))
+    text = str(derive(system))
     assert max(stringPict(line).width() for line in text.splitlines()) <= 100
-    write = Typesetter(made)
+    write = Typesetter(system)
     terms = write.terms(sum(symbols("a:z")))
     assert len(write.rows(terms, 40)) > 2
     assert [t for row in write.rows(terms, 40) for t in row] == terms
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copy(SCENES / "cartpole.toml", tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def show(*words: str) -> str:
-    done = CliRunner().invoke(main, ["show", *words])
-    assert done.exit_code == 0, done.output
-    return done.output
+    result = CliRunner().invoke(main, ["show", *words])
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
-def test_the_repr_of_equations_and_systems_is_a_line() -> None:
+def test_repr_of_equations_and_systems_is_one_line() -> None:
     system = eomc.read(SCENES / "cartpole_driven.toml")
-    said = "2 coordinates, 1 input, 4 parameters"
-    assert repr(system) == f"<System cartpole_driven: {said}>"
+    expected = "2 coordinates, 1 input, 4 parameters"
+    assert repr(system) == f"<System cartpole_driven: {expected}>"
     assert repr(eomc.equations(system)) == (
-        f"<Equations of cartpole_driven: {said}; print() shows them>"
+        f"<Equations of cartpole_driven: {expected}; print() shows them>"
     )
 
 
-def test_what_was_shown_is_kept_until_the_scene_changes(
-    here: Path, monkeypatch: pytest.MonkeyPatch
+def test_printed_equations_are_cached_until_the_scene_changes(
+    scene_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = show("cartpole.toml")
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "read", lambda scene: pytest.fail("derived again"))
         assert show("cartpole.toml") == first
-    text = (here / "cartpole.toml").read_text(encoding="utf-8")
-    (here / "cartpole.toml").write_text(text.replace("m_c", "m_k"), encoding="utf-8")
+    text = (scene_folder / "cartpole.toml").read_text(encoding="utf-8")
+    (scene_folder / "cartpole.toml").write_text(text.replace("m_c", "m_k"), encoding="utf-8")
     assert "m_k" not in first and "mₖ" in show("cartpole.toml")
-    (kept,) = (here / "build" / ".shown").glob("*.json")
-    kept.write_text(json.dumps({"key": 1}), encoding="utf-8")  # damaged
+    (cache_file,) = (scene_folder / "build" / ".shown").glob("*.json")
+    cache_file.write_text(json.dumps({"key": 1}), encoding="utf-8")  # damaged
     assert "mₖ" in show("cartpole.toml")
 
 
-def test_what_is_kept_is_shown_without_sympy(here: Path) -> None:
+def test_cached_equations_are_printed_without_sympy(scene_folder: Path) -> None:
     show("cartpole.toml")
     code = """
 import sys
@@ -274,16 +284,18 @@ from eomc.cli.main import main
 main(["show", "cartpole.toml"], standalone_mode=False)
 assert "sympy" not in sys.modules and "numpy" not in sys.modules
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and "mass matrix" in done.stdout, done.stderr
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0 and "mass matrix" in process.stdout, process.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["suspension", "quad"])
-def test_four_coordinates_take_less_than_three_seconds_and_a_third_of_one_again(
+def test_four_coordinates_are_printed_in_seconds_and_again_faster(
     name: str, tmp_path: Path
 ) -> None:
-    """Of the processor, from an empty folder, SymPy's import with it."""
+    """CPU time from an empty folder, including the import of SymPy."""
     file = SCENES / f"{name}.toml"
     if name == "quad":
         file = tmp_path / "quad.toml"
@@ -298,8 +310,8 @@ def test_four_coordinates_take_less_than_three_seconds_and_a_third_of_one_again(
     assert took[0] < 3.0 and took[1] < 0.3, took
 
 
-def test_nothing_is_kept_where_nothing_can_be_written(here: Path) -> None:
-    (here / "build").write_text("in the way")
+def test_nothing_is_cached_in_an_unwritable_folder(scene_folder: Path) -> None:
+    (scene_folder / "build").write_text("in the way")
     assert "mass matrix" in show("cartpole.toml")
 
 
@@ -322,65 +334,67 @@ def pendulum(tmp_path: Path) -> Path:
     return tmp_path / "pendulum.toml"
 
 
-def test_the_symbols_of_a_scenes_equations_are_plain_ones(pendulum: Path) -> None:
-    found = eomc.equations(pendulum)
+def test_equations_of_a_scene_have_plain_symbols(pendulum: Path) -> None:
+    equations = eomc.equations(pendulum)
     m, r, theta, acceleration = symbols("m l theta theta_ddot")
-    assert found.D.subs({"m": 2, "l": 3})[0, 0] == found.D.subs({m: 2, r: 3})[0, 0] == 18
-    assert sympy.lambdify((m, r), found.D)(2, 3) == 18
+    assert equations.D.subs({"m": 2, "l": 3})[0, 0] == equations.D.subs({m: 2, r: 3})[0, 0] == 18
+    assert sympy.lambdify((m, r), equations.D)(2, 3) == 18
     g = sympy.Rational(981, 100)
-    assert sympy.solve(found.scalar[0], acceleration) == [-g * sin(theta) / r]
-    assert found.symbols["theta_ddot"] == acceleration and found.symbols["m"] == m
-    assert found.set_out.D == found.D and "θ̈" in str(found)
+    assert sympy.solve(equations.scalar[0], acceleration) == [-g * sin(theta) / r]
+    assert equations.symbols["theta_ddot"] == acceleration and equations.symbols["m"] == m
+    assert equations.set_out.D == equations.D and "θ̈" in str(equations)
 
 
 @pytest.mark.parametrize("assumptions", [{}, {"real": True}, {"positive": True}])
-def test_the_symbols_of_a_systems_equations_are_the_users(assumptions: dict[str, bool]) -> None:
+def test_equations_of_a_system_have_the_symbols_of_the_user(assumptions: dict[str, bool]) -> None:
     from sympy.physics.mechanics import dynamicsymbols
 
     m, r = symbols("m l", **assumptions)
     theta = dynamicsymbols("theta")
-    made = eomc.System.make(
+    system = eomc.System.make(
         "pendulum", [theta], m * r**2 * theta.diff() ** 2 / 2, -m * r * cos(theta),
         parameters={m: 1, r: 1},
     )  # fmt: skip
-    found = eomc.equations(made)
-    assert found.D.subs({m: 2, r: 3})[0, 0] == 18
-    assert found.scalar[0].lhs.has(theta.diff(dynamicsymbols._t, 2))
-    assert found.symbols["theta"] == theta and found.symbols["theta_dot"] == theta.diff()
+    equations = eomc.equations(system)
+    assert equations.D.subs({m: 2, r: 3})[0, 0] == 18
+    assert equations.scalar[0].lhs.has(theta.diff(dynamicsymbols._t, 2))
+    assert equations.symbols["theta"] == theta and equations.symbols["theta_dot"] == theta.diff()
     x, v = symbols("x x_dot", **assumptions)
     plain = eomc.System.make("mass", [x], m * v**2 / 2, m * x**2, parameters={m: 1})
     assert eomc.equations(plain).g[0] == 2 * m * x
     assert m * v**2 / 2 - m * x**2 == eomc.equations(plain).L
 
 
-def test_velocities_of_positive_coordinates_have_either_sign() -> None:
+def test_velocities_of_positive_coordinates_may_be_negative() -> None:
     r = sympy.Symbol("r", positive=True)
     for v in (eomc.dot(r), sympy.Symbol("r_dot", real=True)):
-        made = eomc.System.make("mass", [r], v**2 / 2, r**2, forces={r: -v * sympy.Abs(v)})
-        found = eomc.equations(made)
-        assert found.tau.subs({r: 1, found.symbols["r_dot"]: -2})[0] == 4
+        system = eomc.System.make("mass", [r], v**2 / 2, r**2, forces={r: -v * sympy.Abs(v)})
+        equations = eomc.equations(system)
+        assert equations.tau.subs({r: 1, equations.symbols["r_dot"]: -2})[0] == 4
 
 
-def test_names_given_as_text_are_plain_symbols() -> None:
-    made = eomc.System.make("mass", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 1})
-    assert eomc.equations(made).g.subs({"k": 2, "x": 3})[0] == 6
+def test_names_as_text_are_plain_symbols() -> None:
+    system = eomc.System.make(
+        "mass", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 1}
+    )
+    assert eomc.equations(system).g.subs({"k": 2, "x": 3})[0] == 6
 
 
-def test_equations_take_numbers_for_parameters(pendulum: Path) -> None:
-    found = eomc.equations(pendulum)
-    changed = found.with_values({"m": 2}, l=0.1)
+def test_equations_accept_numbers_for_parameters(pendulum: Path) -> None:
+    equations = eomc.equations(pendulum)
+    changed = equations.with_values({"m": 2}, l=0.1)
     assert changed.D[0, 0] == sympy.Rational(1, 50)
     assert "0.02⋅θ̈" in unicodedata.normalize("NFC", str(changed))
-    assert found.with_values({found.symbols["m"]: 3}).D.free_symbols == {sympy.Symbol("l")}
+    assert equations.with_values({equations.symbols["m"]: 3}).D.free_symbols == {sympy.Symbol("l")}
     with pytest.raises(eomc.EomcError, match="ll is not a parameter; did you mean 'l'"):
-        found.with_values(ll=1)
+        equations.with_values(ll=1)
     for wrong in (float("nan"), "x", sympy.Symbol("y"), 1j):
         with pytest.raises(eomc.EomcError, match="m must be a finite real number"):
-            found.with_values(m=wrong)
+            equations.with_values(m=wrong)
 
 
-def test_a_fraction_that_a_double_does_not_tell_from_the_number_is_shown() -> None:
-    made = eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0.3333333333333*x")
-    text = str(derive(made))
+def test_fraction_equal_to_the_double_is_printed() -> None:
+    system = eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0.3333333333333*x")
+    text = str(derive(system))
     assert "2.6666" not in text and "[8/3]" in text
     assert "0.3333333333333" in text  # which is not a third

@@ -1,4 +1,4 @@
-"""Long equations by abbreviations, the short form of large systems, and LaTeX of all in KaTeX."""
+"""Long equations by abbreviations, the short form of large systems, and all LaTeX in KaTeX."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 KATEX = Path(__file__).parents[2] / "build" / "katex" / "node_modules"
 ALL = sorted(SCENES.glob("*.toml"))
 PICTURED = ("arm", "ball_beam", "crane", "slung_load", "satellite")
-# forces of every kind, a gear, a rotor, a slide on a slanted axis, a spring, a row: all at once
+# forces of every kind, a gear, a rotor, a skew prismatic joint, a spring and a row in one scene
 LARGE = """
 eomc = 1
 name = "large"
@@ -99,66 +99,70 @@ row = "c + d - 1/2"
 
 
 @cache
-def large() -> System:
+def large_system() -> System:
     return from_scene(parse(LARGE, "large.toml"))
 
 
 @cache
-def chain() -> Equations:
+def chain_equations() -> Equations:
     return eomc.equations(SCENES / "chain.toml")
 
 
-def test_abbreviations_put_in_give_the_equations_again() -> None:
-    found = chain()
-    short = found.set_out
-    assert short.named and not found.named and short is not found
+def test_substituted_abbreviations_give_the_equations() -> None:
+    equations = chain_equations()
+    short = equations.set_out
+    assert short.named and not equations.named and short is not equations
     assert short.set_out is short
     put = {}
     for name, e in short.named:
         put[name] = e.xreplace(put)
-    put |= {sympy.Symbol(f"D_{i + 1}{j + 1}"): found.D[i, j]
+    put |= {sympy.Symbol(f"D_{i + 1}{j + 1}"): equations.D[i, j]
             for i in range(5) for j in range(5)}  # fmt: skip
     rng = np.random.default_rng(2)
-    symbols = {s for e in (*found.D, *found.C, *found.g, *found.tau) for s in e.free_symbols}
-    accelerations = (found.symbols[x.name] for x in found.system.qdd)
-    symbols |= {*accelerations, *found.kinetic.free_symbols}
-    at = {s: sympy.Float(rng.uniform(0.2, 1)) for s in sorted(symbols, key=str)}
-    pairs = [(found.kinetic, short.kinetic), (found.potential, short.potential)]
+    symbols = {
+        s
+        for e in (*equations.D, *equations.C, *equations.g, *equations.tau)
+        for s in e.free_symbols
+    }
+    accelerations = (equations.symbols[x.name] for x in equations.system.qdd)
+    symbols |= {*accelerations, *equations.kinetic.free_symbols}
+    values = {s: sympy.Float(rng.uniform(0.2, 1)) for s in sorted(symbols, key=str)}
+    pairs = [(equations.kinetic, short.kinetic), (equations.potential, short.potential)]
     for name in ("D", "C", "g", "tau"):
-        pairs += zip(getattr(found, name), getattr(short, name), strict=True)
+        pairs += zip(getattr(equations, name), getattr(short, name), strict=True)
     pairs += [
-        (a.lhs - a.rhs, b.lhs - b.rhs) for a, b in zip(found.scalar, short.scalar, strict=True)
+        (a.lhs - a.rhs, b.lhs - b.rhs) for a, b in zip(equations.scalar, short.scalar, strict=True)
     ]
     for e, abbreviated in pairs:
         whole = abbreviated.xreplace(put)
-        assert not {str(s) for s in whole.free_symbols} - {str(s) for s in at}
-        assert float(e.xreplace(at)) == pytest.approx(
-            float(whole.xreplace(at)), rel=1e-9, abs=1e-12
+        assert not {str(s) for s in whole.free_symbols} - {str(s) for s in values}
+        assert float(e.xreplace(values)) == pytest.approx(
+            float(whole.xreplace(values)), rel=1e-9, abs=1e-12
         )
-    sizes = [sum(e.count_ops() for e in (*x.D, *x.C)) for x in (found, short)]
+    sizes = [sum(e.count_ops() for e in (*x.D, *x.C)) for x in (equations, short)]
     assert 3 * sizes[1] < sizes[0]
 
 
-def test_long_equations_say_where() -> None:
-    text, latex = str(chain()), chain()._repr_latex_()
+def test_long_equations_have_definitions_of_abbreviations() -> None:
+    text, latex = str(chain_equations()), chain_equations()._repr_latex_()
     assert "D₁₁⋅θ̈₁ + D₁₂⋅θ̈₂" in text and "where, here and below:\n    s₁ = " in text
     assert r"& D_{11} \ddot{\theta}_{1} + D_{12} \ddot{\theta}_{2}" in latex
     assert "  s_{1} &= 3 \\sin" in latex and "L &= K - P" in latex
 
 
-def test_abbreviations_keep_clear_of_names_of_the_scene() -> None:
+def test_abbreviations_avoid_names_of_the_scene() -> None:
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bb\b", "s_3", text).replace('"m"', '"D_12"').replace("\nm =", "\nD_12 =")
-    found = derive(from_scene(parse(text.replace('"m*', '"D_12*'), "chain.toml"))).set_out
-    names = {str(s) for s, _ in found.named}
+    abbreviated = derive(from_scene(parse(text.replace('"m*', '"D_12*'), "chain.toml"))).set_out
+    names = {str(s) for s, _ in abbreviated.named}
     assert {"h_1", "h_2"} <= names and not any(name.startswith("s") for name in names)
-    rows = {str(s) for terms in found.left for _, c in terms for s in c.free_symbols}
-    assert "D_13" in rows and not any(x.system.names & names for x in [found])
-    first = {str(rates): c for rates, c in found.left[0]}
+    rows = {str(s) for terms in abbreviated.left for _, c in terms for s in c.free_symbols}
+    assert "D_13" in rows and not any(x.system.names & names for x in [abbreviated])
+    first = {str(rates): c for rates, c in abbreviated.left[0]}
     assert str(first["theta2_ddot"]) != "D_12"
 
 
-def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
+def test_large_system_states_its_recursion_and_cost() -> None:
     system = pipeline.read(SCENES / "bricard.toml")
     text = write_equations(system)
     assert "would fill many pages" in text and "bar2 on bar1: turns about y by q₂" in text
@@ -169,25 +173,25 @@ def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
             refused()
 
 
-def test_the_short_form_has_what_each_joint_is() -> None:
-    latex = equations_text.describe_in_latex(large())
-    for said in (
+def test_short_form_describes_each_joint() -> None:
+    latex = equations_text.describe_in_latex(large_system())
+    for line in (
         r"\text{arm\_1 on the world}, \; k = 1, \; p = 0:", r"s_{3} = 2 \, a - c",
         r"\alpha_{1} = 0.05", r"S_{2} = (0, e_{", r"m_{1} = m, \; c_{1} = \left(", "P' &=",
         r"\tau &= Q - ", "R &=", r"& c + d - \frac{1}{2} = 0",
         r"C_{ij} &= \frac{1}{2} \sum_{k}",
     ):  # fmt: skip
-        assert said in latex, said
+        assert line in latex, line
     left = re.findall(r"^  ([^&]+?) &=", latex, re.MULTILINE)
     assert len(left) == len(set(left)) > 20, "each name stands for one thing"
 
 
-def crossed(v: Any) -> np.ndarray:
+def cross_matrix(v: Any) -> np.ndarray:
     x, y, z = v
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def turned(axis: int, angle: float) -> np.ndarray:
+def rotation_matrix(axis: int, angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
@@ -196,17 +200,17 @@ def turned(axis: int, angle: float) -> np.ndarray:
     return R
 
 
-def as_set_out(
-    system: System, tree: Tree, at: dict[Any, Any], qdd: np.ndarray
+def evaluate_printed_recursion(
+    system: System, tree: Tree, values: dict[Any, Any], qdd: np.ndarray
 ) -> tuple[np.ndarray, float, float]:
-    """D qdd + C qd + g, K and P by the lines of `_latex_recursion`."""
+    """Evaluate D qdd + C qd + g, K and P by the lines of `_latex_recursion`."""
 
     def number(e: Any) -> float:
-        return float(sympy.sympify(e).subs(at))
+        return float(sympy.sympify(e).subs(values))
 
     numbers = np.vectorize(number)
     n, gamma = len(system.q), numbers(tree.gravity)
-    qd = np.array([at[s] for s in system.qd])
+    qd = np.array([values[s] for s in system.qd])
     X, v, a, f, body, S, slopes, places = [], [], [], [], [], [], [], []
     K, P = 0.0, number(tree.other_potential)
     for link in tree.links:
@@ -215,17 +219,17 @@ def as_set_out(
         curved = sum(sympy.diff(rate, x) * v for x, v in zip(system.q, system.qd, strict=True))
         s, R, e = number(link.q), np.reshape(numbers(link.rotation), (3, 3)), np.eye(3)[link.axis]
         r = numbers(link.offset) + (0 if link.turns else R @ e * s)
-        R = R @ turned(link.axis, s) if link.turns else R
+        R = R @ rotation_matrix(link.axis, s) if link.turns else R
         J = np.diag(numbers(link.inertia[:3]))
         for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
             J[i, j] = J[j, i] = number(link.inertia[3 + k])
-        c, m = crossed(numbers(link.moment)), number(link.mass)
-        X.append(np.block([[R.T, np.zeros((3, 3))], [-R.T @ crossed(r), R.T]]))
+        c, m = cross_matrix(numbers(link.moment)), number(link.mass)
+        X.append(np.block([[R.T, np.zeros((3, 3))], [-R.T @ cross_matrix(r), R.T]]))
         body.append(np.block([[J, c], [-c, m * np.eye(3)]]))
         S.append(np.concatenate([e, 0 * e] if link.turns else [0 * e, e]))
         up = np.zeros(6) if link.parent < 0 else v[link.parent]
         v.append(X[-1] @ up + S[-1] * (ds @ qd))
-        w, u = crossed(v[-1][:3]), crossed(v[-1][3:])
+        w, u = cross_matrix(v[-1][:3]), cross_matrix(v[-1][3:])
         cross = np.block([[w, np.zeros((3, 3))], [u, w]])
         up = np.concatenate([np.zeros(3), -gamma]) if link.parent < 0 else a[link.parent]
         sdd = ds @ qdd + number(curved)
@@ -247,20 +251,20 @@ def as_set_out(
 
 
 @pytest.mark.parametrize("name", ["large", "bricard", "chain"])
-def test_the_recursion_as_it_is_set_out_gives_the_equations(name: str) -> None:
-    system = large() if name == "large" else pipeline.read(SCENES / f"{name}.toml")
+def test_printed_recursion_gives_the_equations(name: str) -> None:
+    system = large_system() if name == "large" else pipeline.read(SCENES / f"{name}.toml")
     assert system.tree is not None
     rng = np.random.default_rng(5)
     q, qd, qdd = rng.uniform(0.2, 1, (3, len(system.q)))
-    at = {p.symbol: p.value for p in system.parameters}
-    at |= dict(zip((*system.q, *system.qd), (*q, *qd), strict=True))
-    wanted = symbolic.reference_for(system)
+    values = {p.symbol: p.value for p in system.parameters}
+    values |= dict(zip((*system.q, *system.qd), (*q, *qd), strict=True))
+    reference = symbolic.reference_for(system)
     state = {"q": q, "qd": qd, "u": np.zeros(len(system.u))}
-    expected = wanted.evaluate("D", **state) @ qdd + wanted.evaluate("bias", **state)
-    found, K, P = as_set_out(system, system.tree, at, qdd)
-    assert np.allclose(found, expected, rtol=1e-10, atol=1e-10)
-    assert pytest.approx(float(wanted.evaluate("kinetic", **state)), rel=1e-10) == K
-    assert pytest.approx(float(wanted.evaluate("potential", q, None)), rel=1e-10) == P
+    expected = reference.evaluate("D", **state) @ qdd + reference.evaluate("bias", **state)
+    result, K, P = evaluate_printed_recursion(system, system.tree, values, qdd)
+    assert np.allclose(result, expected, rtol=1e-10, atol=1e-10)
+    assert pytest.approx(float(reference.evaluate("kinetic", **state)), rel=1e-10) == K
+    assert pytest.approx(float(reference.evaluate("potential", q, None)), rel=1e-10) == P
 
 
 @pytest.mark.skipif(
@@ -269,11 +273,11 @@ def test_the_recursion_as_it_is_set_out_gives_the_equations(name: str) -> None:
 )
 @pytest.mark.parametrize("which", ["scenes", "robots"])
 def test_latex_of_every_scene_compiles_in_katex(which: str, tmp_path: Path) -> None:
-    """As `eomc show --latex` prints it, of scenes, robots and mechanisms of other tests too."""
+    """The output of `eomc show --latex` for scenes, robots and mechanisms of other tests."""
     if which == "scenes":
         systems = [pipeline.read(f) for f in ALL]
         systems += [from_scene(pictures.scene(name)) for name in PICTURED]
-        systems += [large(), from_scene(parse(EVERYTHING, "test.toml"))]
+        systems += [large_system(), from_scene(parse(EVERYTHING, "test.toml"))]
     else:
         systems = [from_scene(pictures.scene(name)) for name in pictures.ROBOTS]
     parts = {s.name: write_equations(s, "latex").split(r"\end{align*}")[:-1] for s in systems}
@@ -290,9 +294,9 @@ def test_latex_of_every_scene_compiles_in_katex(which: str, tmp_path: Path) -> N
         }
         console.log(n);
     """
-    done = subprocess.run(
+    process = subprocess.run(
         ["node", "-e", script, str(file)], env=os.environ | {"NODE_PATH": str(KATEX)},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) == sum(map(len, parts.values())) > 2 * len(systems)
+    assert process.returncode == 0, process.stderr
+    assert int(process.stdout) == sum(map(len, parts.values())) > 2 * len(systems)

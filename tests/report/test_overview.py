@@ -1,4 +1,4 @@
-"""The report as the scene's own page: what it is, its equations, its motion; nothing is fetched."""
+"""The report's page about the scene: description, equations and motion, without network access."""
 
 import re
 import sys
@@ -67,13 +67,13 @@ def system() -> System:
 
 
 @cache
-def made() -> str:
+def page_text() -> str:
     needs("gcc")
     report = cost_of_digits.measure(system(), REPORTS, longest=0.005, methods=("rk4", "dp8"))
     return page.write_page(report, overview.describe_scene(system(), report, REPORTS))
 
 
-def test_equations_become_mathml() -> None:
+def test_equations_are_written_as_mathml() -> None:
     first, rest = overview.write_mathml(equations.derive(system()))
     ((more, line),) = first
     assert not more and line.startswith("<math") and 'displaystyle="true"' in line
@@ -86,7 +86,7 @@ def test_equations_become_mathml() -> None:
     assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
 
 
-def test_without_latex2mathml_equations_say_what_to_install(
+def test_equations_without_latex2mathml_name_the_package(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
@@ -97,13 +97,13 @@ def test_without_latex2mathml_equations_say_what_to_install(
 
 
 @pytest.mark.slow
-def test_the_page_says_what_the_scene_is() -> None:
-    text = made()
-    for said in (
+def test_page_describes_the_scene() -> None:
+    text = page_text()
+    for expected in (
         "On a rail, &amp; pushed.", "from the &lt;wall&gt;", "m<sub>c</sub>", "1, 0.5", "N/m",
         "A &lt;b&gt;slider&lt;/b&gt;", "Equations of motion", "Motion", "Speed against error",
     ):  # fmt: skip
-        assert said in text, said
+        assert expected in text, expected
     assert text.count("<math") == text.count("</math>") >= 9
     assert text.count("<svg") == 4 and "<script" not in text
     assert not re.search(r"(src|href)=\"(?!#)", text)
@@ -111,7 +111,7 @@ def test_the_page_says_what_the_scene_is() -> None:
 
 
 @pytest.mark.slow
-def test_a_scene_too_large_to_write_out_says_how_it_is_computed(
+def test_large_scene_states_how_it_is_computed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     needs("gcc")
@@ -124,27 +124,29 @@ def test_a_scene_too_large_to_write_out_says_how_it_is_computed(
     assert '<pre tabindex="0">Chain of links' in page.write_page(report, about)
 
 
-@pytest.mark.parametrize("given", ["page", "latex", "escape", "attribute"])
-def test_free_text_is_escaped(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = PAYLOADS[given]
+@pytest.mark.parametrize("name", ["page", "latex", "escape", "attribute"])
+def test_free_text_is_escaped(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = PAYLOADS[name]
     monkeypatch.setattr(overview, "_motion", lambda *_: ("", ""))
-    whole = system()
-    noted = replace(whole.coordinates[0], unit=text, note=text)
-    about = overview.describe_scene(replace(whole, note=text, coordinates=(noted,)), None, Path())  # type: ignore[arg-type]
+    model = system()
+    with_note = replace(model.coordinates[0], unit=text, note=text)
+    about = overview.describe_scene(
+        replace(model, note=text, coordinates=(with_note,)), None, Path()
+    )  # type: ignore[arg-type]
     assert about.note == texts.html(texts.flat(text))
     assert about.coordinates[0][2:] == (texts.html(texts.flat(text)),) * 2
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(browser.MISSING), reason=browser.MISSING)
-def test_in_a_browser_nothing_is_fetched_and_400_pixels_are_enough(tmp_path: Path) -> None:
+def test_page_in_a_browser_fetches_nothing_and_fits_400_pixels(tmp_path: Path) -> None:
     file = tmp_path / "report.html"
-    file.write_text(made(), encoding="utf-8")
+    file.write_text(page_text(), encoding="utf-8")
     with browser.chromium(tmp_path / "profile") as window:
         dark = {}
         for scheme in ("light", "dark"):
             window.media(prefers_color_scheme=scheme)
-            window.open(file, 500)  # Chromium's least width of a window
+            window.open(file, 500)  # the smallest width of a Chromium window
             window.run("document.body.style.width = '400px'; document.body.style.margin = '0'")
             dark[scheme] = window.run("return getComputedStyle(document.body).backgroundColor")
             wide = window.run("return document.documentElement.scrollWidth")
@@ -153,15 +155,15 @@ def test_in_a_browser_nothing_is_fetched_and_400_pixels_are_enough(tmp_path: Pat
             assert window.run(inside) == 0
             heights = """return [...document.querySelectorAll('math')]
                 .map(m => m.getBoundingClientRect().height)"""
-            assert min(window.run(heights)) > 10  # they are set
+            assert min(window.run(heights)) > 10  # they are rendered
         assert dark["light"] != dark["dark"]
         assert window.logged() == []
-        asked = [url for url in window.requested() if not url.startswith(("data:", "chrome"))]
-        assert {*asked} == {file.as_uri()}
+        requests = [url for url in window.requested() if not url.startswith(("data:", "chrome"))]
+        assert {*requests} == {file.as_uri()}
 
 
 @pytest.mark.slow
-def test_a_motion_that_adaptive_steps_do_best_is_drawn_by_them(tmp_path: Path) -> None:
+def test_motion_is_drawn_by_adaptive_steps_where_they_are_best(tmp_path: Path) -> None:
     text = KEPLER.format(constraints="")
     system = from_scene(parse(text, "kep.toml"))
     report = cost_of_digits.measure(system, tmp_path, methods=("rk4", "adaptive"), longest=0.01)
@@ -173,8 +175,8 @@ def test_a_motion_that_adaptive_steps_do_best_is_drawn_by_them(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_differences_grow_along_the_constraints(tmp_path: Path) -> None:
-    """From where a coordinate can't grow by itself: the end of a rod."""
+def test_perturbations_satisfy_the_constraints(tmp_path: Path) -> None:
+    """From a point where a coordinate cannot grow by itself: the end of a rod."""
     rod = '[constraints]\nrod = "x**2 + y**2 - 0.01"'
     file = tmp_path / "kep.toml"
     file.write_text(KEPLER.format(constraints=rod))

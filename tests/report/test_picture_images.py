@@ -1,4 +1,4 @@
-"""Pictures as they were seen and accepted: python tests/report/test_picture_images.py."""
+"""Compare pictures with accepted ones: python tests/report/test_picture_images.py writes them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,21 +17,24 @@ GOLDEN = Path(__file__).parent / "images"
 NAMES = """acrobot anymal arm ball_beam bead_on_hoop cartpole chain crane furuta_pendulum
 heavy_top slung_load satellite spring_pendulum suspension tumbling_box ur5""".split()
 SIZE, BLOCK = 192, 8  # pixels
-TOLERANCE = 25  # of 255, of the mean of a block: versions of matplotlib smooth lines differently
+TOLERANCE = 25  # of 255, for the mean of a block: versions of matplotlib smooth lines differently
 
 
-def drawn(made):
-    """The last instant and the paths, without axes and texts, whose fonts differ: (SIZE, SIZE)."""
+def render_image(drawing):
+    """Render the last instant and the paths without axes and texts, whose fonts differ:
+
+    (SIZE, SIZE).
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    flat = picture.project_points(made)
+    flat = picture.project_points(drawing)
     figure = Figure(figsize=(2, 2), dpi=SIZE / 2)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
-    for path in made.paths:
+    for path in drawing.paths:
         axes.plot(*flat[:, path.point].T, linewidth=1.0)
-    picture.draw_marks(axes, made, flat[-1])
+    picture.draw_marks(axes, drawing, flat[-1])
     axes.update_datalim(flat.reshape(-1, 2))
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_axis_off()
@@ -39,33 +42,38 @@ def drawn(made):
     return np.asarray(canvas.buffer_rgba())[:, :, :3].mean(axis=2)
 
 
-def made(name):
-    what = scene(name)
-    run = motion(what)
-    return draw_mechanism(system(what), run.t, run.q)
+def drawing_of(name):
+    model = scene(name)
+    run = motion(model)
+    return draw_mechanism(system(model), run.t, run.q)
 
 
-def apart(one, other):
+def block_difference(one, other):
     blocks = (one - other).reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK).mean(axis=(1, 3))
     return float(np.abs(blocks).max())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_is_the_picture_that_was_accepted(name):
-    with Image.open(GOLDEN / f"{name}.png") as was:
-        assert apart(drawn(made(name)), np.asarray(was.convert("L"), dtype=float)) < TOLERANCE
+def test_picture_agrees_with_the_accepted_one(name):
+    with Image.open(GOLDEN / f"{name}.png") as accepted:
+        assert (
+            block_difference(
+                render_image(drawing_of(name)), np.asarray(accepted.convert("L"), dtype=float)
+            )
+            < TOLERANCE
+        )
 
 
-def test_a_mark_that_is_missing_is_seen():
-    whole = made("cartpole")
-    image = drawn(whole)
-    for mark in whole.marks:
-        less = replace(whole, marks=tuple(m for m in whole.marks if m is not mark))
-        assert apart(image, drawn(less)) > TOLERANCE, mark.kind
+def test_comparison_detects_a_missing_mark():
+    drawing = drawing_of("cartpole")
+    image = render_image(drawing)
+    for mark in drawing.marks:
+        reduced = replace(drawing, marks=tuple(m for m in drawing.marks if m is not mark))
+        assert block_difference(image, render_image(reduced)) > TOLERANCE, mark.kind
 
 
 if __name__ == "__main__":
     GOLDEN.mkdir(exist_ok=True)
     for name in NAMES:
-        image = Image.fromarray(drawn(made(name)).astype(np.uint8)).quantize(16)
+        image = Image.fromarray(render_image(drawing_of(name)).astype(np.uint8)).quantize(16)
         image.save(GOLDEN / f"{name}.png", optimize=True)
