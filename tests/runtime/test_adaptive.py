@@ -129,7 +129,9 @@ def test_run_in_one_call_equals_run_with_progress(kepler: ModuleType, options: d
     kepler.simulate(duration=PERIOD)  # stores the number of steps
     fast = kepler.simulate(duration=PERIOD, tol=1e-8, **options)
     assert 0 < fast.steps + 1 <= kepler._model.integrator.room
-    general = kepler.simulate(duration=PERIOD, tol=1e-8, **options, progress=lambda done, of: None)
+    general = kepler.simulate(
+        duration=PERIOD, tol=1e-8, **options, progress=lambda finished, of: None
+    )
     assert fast == general and fast.message == general.message
     assert fast.evaluations == general.evaluations and fast.h == general.h
     assert np.array_equal(fast(options.get("t0", 0.0) + 0.3), general(options.get("t0", 0.0) + 0.3))

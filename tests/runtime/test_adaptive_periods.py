@@ -58,8 +58,8 @@ def test_end_equals_that_of_short_fixed_steps(sampled: ModuleType, u: Any) -> No
     fixed = sampled.simulate(u=u, control_period=0.05, h=0.0025)
     np.testing.assert_allclose(run.x[-1], fixed.x[-1], atol=1e-9)
     assert run.status == "ok" and run.t[-1] == 2.0
-    loose = sampled.simulate(u=u, control_period=0.05, tol=1e-5)
-    assert loose.steps < 60 and loose.rejected < 6  # one step a period, except in the first
+    coarse = sampled.simulate(u=u, control_period=0.05, tol=1e-5)
+    assert coarse.steps < 60 and coarse.rejected < 6  # one step a period, except in the first
 
 
 def test_feedback_law_is_called_at_each_period_start(sampled: ModuleType) -> None:

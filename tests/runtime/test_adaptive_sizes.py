@@ -75,7 +75,7 @@ def reference_end(satellite: ModuleType) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
-def test_small_angles_are_accurate_beside_large_positions(
+def test_small_angles_are_accurate_despite_large_positions(
     satellite: ModuleType, reference_end: np.ndarray, tol: float
 ) -> None:
     run = satellite.simulate(tol=tol, duration=END)

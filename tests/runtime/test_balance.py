@@ -221,9 +221,7 @@ def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
         {"u": law, "control_period": 0.06, "times": np.linspace(0, 0.4, 8)},
     ],
 )
-def test_work_of_inputs_held_constant_is_reported(
-    pushed: ModuleType, options: dict[str, Any]
-) -> None:
+def test_work_of_constant_inputs_is_reported(pushed: ModuleType, options: dict[str, Any]) -> None:
     """Over a step the work of an input is u (x' - x), up to the method's error in x."""
     run = pushed.simulate(**{"steps": 20} if "times" not in options else {"h": 0.02}, **options)
     balance, ends = run.balance(), run(0.02 * np.arange(21))[0][:, 0]
@@ -322,7 +320,9 @@ def falling(modules: Modules) -> ModuleType:
 
 
 @pytest.mark.parametrize("times", [None, np.linspace(0.0, 2.0, 21)])
-def test_energy_lost_in_each_impact_is_exact(falling: ModuleType, times: np.ndarray | None) -> None:
+def test_energy_dissipated_in_each_impact_is_exact(
+    falling: ModuleType, times: np.ndarray | None
+) -> None:
     """An impact takes (1 - e^2) of the kinetic energy, g e^2k before impact k, in any rows."""
     run = falling.simulate() if times is None else falling.simulate(times=times)
     count = len(run.events["impact"])

@@ -287,7 +287,9 @@ def test_progress_reaches_the_end() -> None:
     m = module("cartpole")
     calls: list[tuple[int, int]] = []
     q0, qd0 = starts(m, 64)
-    m.simulate_batch(q0, qd0, steps=STEPS, progress=lambda done, total: calls.append((done, total)))
+    m.simulate_batch(
+        q0, qd0, steps=STEPS, progress=lambda finished, total: calls.append((finished, total))
+    )
     assert calls[-1] == (64 * STEPS, 64 * STEPS)
 
 

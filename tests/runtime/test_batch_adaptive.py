@@ -221,7 +221,7 @@ def test_saved_batch_is_loaded_unchanged(orbits: ModuleType, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_input_tables_are_held_over_control_periods_as_in_single_runs(
+def test_input_tables_are_applied_over_control_periods_as_in_single_runs(
     orbits: ModuleType, shared: bool, tmp_path: Path
 ) -> None:
     """Also over a period that the run cuts short, in one or two threads, and between rows."""

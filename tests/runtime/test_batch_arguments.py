@@ -30,7 +30,7 @@ def test_starts_that_are_not_finite_are_refused_before_any_step(real: str, threa
                     **starts_by_name,
                     steps=STEPS,
                     threads=threads,
-                    progress=lambda done, _: calls.append(done),
+                    progress=lambda finished, _: calls.append(finished),
                 )
     assert not calls
 

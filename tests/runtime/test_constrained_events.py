@@ -199,7 +199,9 @@ def test_sticking_at_a_dead_point_does_not_lock_the_mechanism(yoke: ModuleType) 
 
 @pytest.mark.parametrize("angle", [0.3, 0.8, 1.2, 2.0, 2.9])
 @pytest.mark.parametrize("options", [{"duration": 50.0}, {"h": 0.005, "steps": 800}])
-def test_joint_held_by_another_stays_at_rest(yoke: ModuleType, angle: float, options: dict) -> None:
+def test_joint_balanced_by_another_stays_at_rest(
+    yoke: ModuleType, angle: float, options: dict
+) -> None:
     """Regression: by rounding it stopped and slipped until its jumps seemed to accumulate.
 
     Fixed steps compare velocities with the change that accelerations make.

@@ -389,7 +389,7 @@ DEPENDENT = ["sin(x) + 0.7*y*y", "0.7*y*y - 2*sin(x)"]
 
 
 @pytest.mark.parametrize("one", tiers(DEPENDENT, DEPENDENT[0]))
-def test_constraint_dependent_given_the_fixed_values_is_left_out(one: str, tmp_path: Path) -> None:
+def test_constraint_dependent_on_the_fixed_values_is_redundant(one: str, tmp_path: Path) -> None:
     """With z fixed, the second is a multiple of the first up to rounding: no new direction."""
     modules = list[ModuleType]()
     for name, second in (("one_row", {}), ("two_rows", {"other": f"3.3*({one}) + 7*z"})):

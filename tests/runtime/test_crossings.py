@@ -206,7 +206,7 @@ def test_event_function_of_pure_rounding_costs_little_time() -> None:
     assert time.perf_counter() - start < 1.0
 
 
-def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
+def test_two_jumps_a_rounding_from_each_other_do_not_accumulate(tmp_path: Path) -> None:
     """A wall is hit as a clock strikes: both events jump, one after the other."""
     scene = tmp_path / "walls.toml"
     scene.write_text(

@@ -310,7 +310,7 @@ def test_scenes_that_cannot_be_discretized_are_refused(run: str, signal: str, me
         eomc.sources(from_scene(parse(text, "test.toml")))
 
 
-def test_system_made_in_python_can_be_discretized(modules: Modules) -> None:
+def test_system_from_python_can_be_discretized(modules: Modules) -> None:
     scene_system = eomc.System.make(
         "slider", ["x"], "x_dot**2/2", "x**4", inputs={"F": 0}, forces={"x": "F"}, discretize=True
     )

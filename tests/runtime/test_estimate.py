@@ -351,7 +351,7 @@ def test_failed_convergence_is_reported(modules: Modules) -> None:
     assert module.advice(h=5.0) is None  # no step is too long for stability
 
 
-def test_inputs_are_held_constant_in_shorter_steps_too(driven: ModuleType) -> None:
+def test_inputs_are_constant_over_the_same_intervals_in_shorter_steps(driven: ModuleType) -> None:
     """A table or function defines u between two of the run's own steps."""
     table = np.sin(np.arange(100) * 0.7)[:, None]
     run = driven.simulate(h=0.02, steps=100, u=table, estimate=True)

@@ -133,7 +133,7 @@ def test_multiplier_of_sticking_friction_is_an_output(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_systems_made_in_python_have_force_outputs(modules: Modules) -> None:
+def test_systems_from_python_have_force_outputs(modules: Modules) -> None:
     x, y = (symbol(name) for name in "xy")
     for pull in ("-2*lambda_rod", -2 * sympy.Symbol("lambda_rod")):
         system = System.make(

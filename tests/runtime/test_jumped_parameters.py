@@ -322,7 +322,7 @@ def test_stick_friction_changes_with_a_discrete_coefficient(modules: Modules) ->
 
 
 @pytest.mark.slow
-def test_system_made_in_python_has_discrete_values(tmp_path: Path) -> None:
+def test_system_from_python_has_discrete_values(tmp_path: Path) -> None:
     x, m, k, factor = sympy.symbols("x m k lambda")
     system = System.make(
         "osc", {x: (0, 1.0)}, "m*x_dot**2/2", k * x**2 / 2,

@@ -1,4 +1,4 @@
-"""Limits of inputs: what acts is within them, wherever inputs are used, and runs tell."""
+"""Limits of inputs: saturation wherever inputs are used, and its report in runs."""
 
 from __future__ import annotations
 
@@ -59,40 +59,43 @@ def limited(modules: Modules) -> ModuleType:
     return modules.unoptimised(BATCH)
 
 
-def test_they_are_told_by_name(limited: ModuleType, cartpole: ModuleType) -> None:
-    ends = {"force": (-2.0, 3.0), "push": (0.0, np.inf), "free": (-np.inf, np.inf)}
-    assert limited.limits() == ends and cartpole.limits() == {}
+def test_limits_are_returned_by_name(limited: ModuleType, cartpole: ModuleType) -> None:
+    expected = {"force": (-2.0, 3.0), "push": (0.0, np.inf), "free": (-np.inf, np.inf)}
+    assert limited.limits() == expected and cartpole.limits() == {}
     with pytest.raises(ValueError, match="params: 'mass' is not one of m_c, m_p"):
         cartpole.limits(params={"mass": 1.0})
-    assert limited.limits({"most": 4.0}) == ends | {"force": (-4.0, 6.0)}
+    assert limited.limits({"most": 4.0}) == expected | {"force": (-4.0, 6.0)}
     assert all(type(x) is float for pair in limited.limits().values() for x in pair)
     with pytest.raises(ValueError, match="params: 'least' is not one of most"):
         limited.limits({"least": 1.0})
 
 
-def test_an_equilibrium_that_limits_forbid_is_told_with_them(limited: ModuleType) -> None:
-    """The pole leans against what the force can't give; one that it can is found."""
-    for how in ({"u": [0.0, 4.0, 0.0], "free": "force"}, {"u": [9.0, 0.0, 0.0], "free": "free"}):
+def test_equilibrium_beyond_limits_is_refused_and_names_them(limited: ModuleType) -> None:
+    """The force that balances the pole exceeds its limits; one within them is solved for."""
+    for options in (
+        {"u": [0.0, 4.0, 0.0], "free": "force"},
+        {"u": [9.0, 0.0, 0.0], "free": "free"},
+    ):
         with pytest.raises(limited.MotionError, match=r"left on x, with force beyond its limits;"):
-            limited.equilibrium([0.0, 0.0], **how)
+            limited.equilibrium([0.0, 0.0], **options)
     u = limited.equilibrium([0.0, 0.0], u=[0.0, 1.0, 0.0], free=["theta", "force"]).u
     assert u == pytest.approx([-1.0, 1.0, 0.0], abs=1e-12)
 
 
 @pytest.mark.parametrize("form", tiers(["fast", "plain"], "plain"))
 @pytest.mark.parametrize("text", tiers([BATCH, IMPLICIT], BATCH), ids=lambda t: t[-30:-1])
-def test_what_is_beyond_acts_as_the_limit(text: str, form: str, tmp_path: Path) -> None:
-    """To the last bit, in every method, held or a row a step."""
+def test_input_beyond_its_limit_acts_as_the_limit(text: str, form: str, tmp_path: Path) -> None:
+    """Bit for bit, in every method, for constant inputs and a row per step."""
     module = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form=form)
     q, qd = module.start
     assert not np.array_equal(np.clip(TABLE, LEAST, MOST), TABLE)
     for method in module.methods:
         for u in (TABLE, TABLE[1]):
             run = module.simulate(u=u, method=method)
-            same = module.simulate(u=np.clip(u, LEAST, MOST), method=method)
-            assert run.status == "ok" and np.array_equal(run.x, same.x)
-            assert np.array_equal(run.u, same.u) and not same.saturated.any()
-            assert np.array_equal(run.outputs["pull"], same.outputs["pull"])
+            expected = module.simulate(u=np.clip(u, LEAST, MOST), method=method)
+            assert run.status == "ok" and np.array_equal(run.x, expected.x)
+            assert np.array_equal(run.u, expected.u) and not expected.saturated.any()
+            assert np.array_equal(run.outputs["pull"], expected.outputs["pull"])
     for name in ("acceleration", "tau", "power", "output", "applied"):
         call = getattr(module, name)
         assert np.array_equal(call(q, qd, u=[-7, -1, 9]), call(q, qd, u=[-2, 0, 9]))
@@ -104,9 +107,9 @@ def test_signals_are_limited_at_every_stage(modules: Modules, limited: ModuleTyp
         "force + push", "push"
     )
     by_hand = by_hand.replace(", limits = [0, inf]", "").replace('"push"', '"max(push, 0)"')
-    other = modules.unoptimised(by_hand.replace('x = "both"', 'x = "a + both"'))
-    run, same = limited.simulate(), other.simulate()
-    assert run.x == pytest.approx(same.x, rel=1e-11, abs=1e-11)
+    reference = modules.unoptimised(by_hand.replace('x = "both"', 'x = "a + both"'))
+    run, expected = limited.simulate(), reference.simulate()
+    assert run.x == pytest.approx(expected.x, rel=1e-11, abs=1e-11)
     signals = np.array([20 * run.theta + 3 * run.theta_dot, np.sin(9 * run.t), np.cos(run.t)]).T
     assert run.u == pytest.approx(np.clip(signals, LEAST, MOST), abs=1e-12)
     beyond = (signals < LEAST) | (signals > MOST)
@@ -119,14 +122,14 @@ def test_signals_are_limited_at_every_stage(modules: Modules, limited: ModuleTyp
 
 
 @pytest.mark.parametrize("u", [None, TABLE[:20][None], TABLE[0], TABLE[:60].reshape(3, 20, 3)])
-def test_a_batch_has_the_limits_of_each(limited: ModuleType, u: Any) -> None:
-    most = np.array([0.1, 2.0, 50.0])
+def test_batch_uses_the_limits_of_each_instance(limited: ModuleType, u: Any) -> None:
+    upper_limits = np.array([0.1, 2.0, 50.0])
     runs = limited.simulate_batch(
-        np.tile(limited.start[0], (3, 1)), steps=20, params={"most": most}, u=u
+        np.tile(limited.start[0], (3, 1)), steps=20, params={"most": upper_limits}, u=u
     )
     for k in range(3):
-        held = u if u is None or u.ndim == 1 else u[k % len(u)]
-        run = limited.simulate(steps=20, params={"most": most[k]}, u=held)
+        inputs = u if u is None or u.ndim == 1 else u[k % len(u)]
+        run = limited.simulate(steps=20, params={"most": upper_limits[k]}, u=inputs)
         assert runs.q[k] == pytest.approx(run.q, rel=1e-12, abs=1e-12)
         assert runs.u[k] == pytest.approx(run.u, rel=1e-12, abs=1e-12)
         assert np.array_equal(runs.saturated[k], run.saturated)
@@ -135,34 +138,36 @@ def test_a_batch_has_the_limits_of_each(limited: ModuleType, u: Any) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*Python function")
-def test_runs_keep_what_was_asked_for(limited: ModuleType, tmp_path: Path) -> None:
+def test_saved_runs_store_inputs_and_saturation(limited: ModuleType, tmp_path: Path) -> None:
     run = limited.simulate(u=lambda t, q, qd: [30 * q[1], -1, 0], steps=40, every=7)
     assert run.saturated[:, 1].all() and run.u[:, 0].max() == 3.0
     run.save(tmp_path / "run.npz")
-    for again in (limited.load_run(tmp_path / "run.npz"), pickle.loads(pickle.dumps(run))):
-        assert np.array_equal(again.u, run.u) and np.array_equal(again.saturated, run.saturated)
+    for loaded in (limited.load_run(tmp_path / "run.npz"), pickle.loads(pickle.dumps(run))):
+        assert np.array_equal(loaded.u, run.u) and np.array_equal(loaded.saturated, run.saturated)
 
 
-def test_derivatives_are_zero_beyond(limited: ModuleType) -> None:
+def test_derivatives_are_zero_beyond_limits(limited: ModuleType) -> None:
     q, qd = limited.start
-    within = limited.linearize(q, qd, u=[1, 1, 0])[1]
-    beyond = limited.linearize(q, qd, u=[4, -1, 0])[1]
-    assert np.all(within[2:] != 0) and np.all(beyond[:, :2] == 0)
-    assert np.array_equal(beyond[:, 2], within[:, 2])
+    B_within = limited.linearize(q, qd, u=[1, 1, 0])[1]
+    B_beyond = limited.linearize(q, qd, u=[4, -1, 0])[1]
+    assert np.all(B_within[2:] != 0) and np.all(B_beyond[:, :2] == 0)
+    assert np.array_equal(B_beyond[:, 2], B_within[:, 2])
 
 
-def test_the_command_tells(tmp_path: Path) -> None:
+def test_command_reports_saturation(tmp_path: Path) -> None:
     (tmp_path / "limited.toml").write_text(SCENE, encoding="utf-8")
-    said = (
+    output = (
         CliRunner()
         .invoke(main, ["run", str(tmp_path / "limited.toml"), "--build", str(tmp_path)])
         .output
     )
-    assert "push beyond its limits, and so at them, in 4" in said, said
-    assert "free beyond" not in said
+    assert "push beyond its limits, and so at them, in 4" in output, output
+    assert "free beyond" not in output
 
 
-def test_a_scene_without_has_nothing_of_it(limited: ModuleType, driven: ModuleType) -> None:
+def test_scene_without_limits_has_none_of_their_code(
+    limited: ModuleType, driven: ModuleType
+) -> None:
     assert limited._model.functions.has_limits
     assert not driven._model.functions.has_limits and not driven.simulate(steps=3).saturated.any()
     q, qd = driven.start
@@ -174,30 +179,30 @@ def test_a_scene_without_has_nothing_of_it(limited: ModuleType, driven: ModuleTy
     )
 
 
-def test_systems_made_in_python() -> None:
-    made: dict[str, Any] = {
+def test_systems_from_python_can_have_limits() -> None:
+    options: dict[str, Any] = {
         "parameters": {"m": 1.0}, "inputs": {"F": "sin(t)", "G": 0}, "forces": {"x": "F + G"},
     }  # fmt: skip
 
     def system(limits: Any) -> System:
-        return System.make("cart", ["x"], "m*x_dot**2/2", limits=limits, **made)
+        return System.make("cart", ["x"], "m*x_dot**2/2", limits=limits, **options)
 
     limited = system({"F": ("-m", 2), "G": (None, np.inf)})
     assert str(limited.inputs[0].limited) == "Min(2, Max(F, -m))"
     assert limited.inputs[1].limited == limited.inputs[1].symbol
     assert str(limited.forces[0]) == "F_limited + G"
-    for limits, words in (
+    for limits, message in (
         ({"H": (0, 1)}, "limits of H: inputs are F, G"),
         ({"F": 1}, "give the least and the largest value, here 1"),
         ({"F": (2, "m")}, "2, the least value, is not below m"),
         ({"F": ("x", 1)}, "x can't be used here: limits are made of numbers and parameters"),
     ):
-        with pytest.raises(EomcError, match=words):
+        with pytest.raises(EomcError, match=message):
             system(limits)
 
 
-class Wrong:
-    """The module with inputs of accelerations a little less limited."""
+class PerturbedModule:
+    """Wrap the module; accelerations use slightly larger inputs."""
 
     def __init__(self, module: ModuleType) -> None:
         self._module = module
@@ -205,21 +210,23 @@ class Wrong:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._module, name)
 
-    def acceleration(self, *state: Any, u: Any, **how: Any) -> Any:
-        return self._module.acceleration(*state, u=u, **how) + 1e-15 * np.max(u)
+    def acceleration(self, *state: Any, u: Any, **options: Any) -> Any:
+        return self._module.acceleration(*state, u=u, **options) + 1e-15 * np.max(u)
 
 
-@pytest.mark.parametrize("wrong", [False, True])
-def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: bool) -> None:
-    module: Any = Wrong(limited) if wrong else limited
-    of = Comparison(from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4)
-    checks_inputs_outputs.report_limits(of)
-    (row,) = of.results
-    assert row.name == "limits of inputs" and row.passed is not wrong, row
+@pytest.mark.parametrize("perturbed", [False, True])
+def test_check_detects_violated_limits(limited: ModuleType, perturbed: bool) -> None:
+    module: Any = PerturbedModule(limited) if perturbed else limited
+    comparison = Comparison(
+        from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4
+    )
+    checks_inputs_outputs.report_limits(comparison)
+    (row,) = comparison.results
+    assert row.name == "limits of inputs" and row.passed is not perturbed, row
 
 
-def test_batches_bound_a_register_at_once() -> None:
-    """Not number by number, which took three to six times as long as the whole step."""
+def test_batches_limit_a_whole_register_at_once() -> None:
+    """Number by number took three to six times as long as the whole step."""
     files = eomc.sources(from_scene(parse(BATCH, "test.toml"))).files
     assert "limited_fmax_wide(" in files["fast/limited.c"]
     assert "fmax(x[i]" not in files["fast/limited.c"]

@@ -1,4 +1,4 @@
-"""Functions of many states with inputs, times and parameters of their own: one call of C."""
+"""Functions of many states with inputs, times and parameters per state: one call of C."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def crank(request: pytest.FixtureRequest, modules: Modules) -> ModuleType:
 
 
 class CountedCalls:
-    """The C functions of a module, with the number of calls of each."""
+    """The C functions of a module, which count the calls of each."""
 
     def __init__(self, lib: Any) -> None:
         self._lib, self.counts = lib, Counter[str]()
@@ -97,9 +97,9 @@ class CountedCalls:
     def __getattr__(self, name: str) -> Any:
         return partial(self._called, name, getattr(self._lib, name))
 
-    def _called(self, name: str, function: Any, *given: Any) -> Any:
+    def _called(self, name: str, function: Any, *arguments: Any) -> Any:
         self.counts[name] += 1
-        return function(*given)
+        return function(*arguments)
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def calls(crank: ModuleType, monkeypatch: pytest.MonkeyPatch) -> CountedCalls:
 
 
 def arguments(m: ModuleType, function: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a function takes of COUNT states: once for all, and one for each of them."""
+    """Return arguments of a function for COUNT states: shared ones, and those per state."""
     random = np.random.default_rng(3)
     q, qd = (x + 0.05 * random.standard_normal((COUNT, 3)) for x in m.start)
     q, qd = m.project(q, qd, params={"a": 0.41})
@@ -122,33 +122,33 @@ def arguments(m: ModuleType, function: str) -> tuple[dict[str, Any], dict[str, A
         "params": {"m": 0.5 + random.random(COUNT), "most": 0.1 + random.random(COUNT)},
     }  # fmt: skip
     shared = {"wrenches": np.ones((3, 3))}
-    takes = inspect.signature(getattr(m, function)).parameters
+    accepted = inspect.signature(getattr(m, function)).parameters
     return (
-        {name: x for name, x in shared.items() if name in takes},
-        {name: x for name, x in each.items() if name in takes},
+        {name: x for name, x in shared.items() if name in accepted},
+        {name: x for name, x in each.items() if name in accepted},
     )
 
 
-def arrays(found: Any) -> list[Any]:
-    if isinstance(found, dict):
-        return list(found.values())
-    return list(found) if isinstance(found, tuple) else [found]
+def as_list(result: Any) -> list[Any]:
+    if isinstance(result, dict):
+        return list(result.values())
+    return list(result) if isinstance(result, tuple) else [result]
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_each_state_has_the_values_of_a_single_call(crank: ModuleType, function: str) -> None:
     call, (shared, each) = getattr(crank, function), arguments(crank, function)
-    for left_out in ((), ("u",), ("t", "params")):
-        given = {name: x for name, x in each.items() if name not in left_out}
-        many = arrays(call(**shared, **given))
+    for omitted in ((), ("u",), ("t", "params")):
+        arguments_used = {name: x for name, x in each.items() if name not in omitted}
+        values = as_list(call(**shared, **arguments_used))
         for k in range(COUNT):
-            one = {
+            single = {
                 name: {n: v[k] for n, v in x.items()} if name == "params" else x[k]
-                for name, x in given.items()
+                for name, x in arguments_used.items()
             }
             # linear algebra may round differently for several matrices at once
             tolerance = 1e3 * np.finfo(crank.dtype).eps * (function in ("drive_forces", "tangent"))
-            for a, b in zip(many, arrays(call(**shared, **one)), strict=True):
+            for a, b in zip(values, as_list(call(**shared, **single)), strict=True):
                 np.testing.assert_allclose(a[k], b, rtol=tolerance, atol=tolerance)
 
 
@@ -170,8 +170,8 @@ def test_ten_steps_of_a_control_period_are_one_call(crank: ModuleType, calls: Co
     q, qd = each["q"], each["qd"]
     expected = np.broadcast_to(np.eye(6), (COUNT, 6, 6)), np.zeros((COUNT, 6, 1))
     for step in range(10):
-        held = each | {"q": q, "qd": qd, "t": each["t"] + 1e-3 * step}
-        A, B = crank.discretize(**held, h=1e-3)
+        arguments_of_step = each | {"q": q, "qd": qd, "t": each["t"] + 1e-3 * step}
+        A, B = crank.discretize(**arguments_of_step, h=1e-3)
         expected = A @ expected[0], A @ expected[1] + B
         crank.step_batch(q, qd, 1e-3, params=each["params"], u=each["u"])
     eps = float(np.finfo(crank.dtype).eps)
@@ -179,21 +179,21 @@ def test_ten_steps_of_a_control_period_are_one_call(crank: ModuleType, calls: Co
     np.testing.assert_allclose(Gamma, expected[1], rtol=0, atol=1e3 * eps)
 
 
-def test_columns_of_a_batch_are_those_of_its_runs(crank: ModuleType, calls: CountedCalls) -> None:
+def test_columns_of_a_batch_equal_those_of_its_runs(crank: ModuleType, calls: CountedCalls) -> None:
     q, qd = (np.tile(x, (3, 1)) for x in crank.start)
     u = 2 * np.random.default_rng(7).standard_normal((3, 8, 1))
     p = {"m": np.array([0.5, 0.6, 0.7]), "most": np.array([0.3, 0.6, 0.9])}
-    for held in (u, None):
-        batch = crank.simulate_batch(q, qd, steps=8, u=held, params=p)
+    for inputs in (u, None):
+        batch = crank.simulate_batch(q, qd, steps=8, u=inputs, params=p)
         names = ("energy", "u", "saturated", "outputs", "constraints", "multipliers", "reactions")
         for name in names:
             calls.counts.clear()
             column = getattr(batch, name)
             assert max(calls.counts.values(), default=0) <= 2, name
             for k in range(3):
-                own = {n: float(v[k]) for n, v in p.items()}
-                run = crank.simulate(steps=8, u=None if held is None else u[k], params=own)
-                pairs = zip(arrays(column), arrays(getattr(run, name)), strict=True)
+                params = {n: float(v[k]) for n, v in p.items()}
+                run = crank.simulate(steps=8, u=None if inputs is None else u[k], params=params)
+                pairs = zip(as_list(column), as_list(getattr(run, name)), strict=True)
                 for a, b in pairs:
                     scale = np.max(np.abs(b), initial=1.0)
                     tolerance = 1e4 * float(np.finfo(crank.dtype).eps) * scale
@@ -208,22 +208,22 @@ def test_rows_of_a_run_are_evaluated_in_one_call(crank: ModuleType, calls: Count
         assert max(calls.counts.values()) <= 2, name  # `applied` at both limits
 
 
-def test_a_bad_row_is_named(crank: ModuleType) -> None:
+def test_invalid_row_is_named(crank: ModuleType) -> None:
     q, qd = (np.tile(x, (3, 1)) for x in crank.start)
-    bad = np.array([1.0, 2.0, np.nan])
+    invalid = np.array([1.0, 2.0, np.nan])
     with pytest.raises(ValueError, match=r"t: nan is not a finite number, at \[2\]"):
-        crank.energy(q, qd, t=bad)
+        crank.energy(q, qd, t=invalid)
     with pytest.raises(ValueError, match=r"params: m is not finite everywhere: nan, at \[2\]"):
-        crank.D(q, params={"m": bad})
+        crank.D(q, params={"m": invalid})
     with pytest.raises(ValueError, match=r"u\[2, 0\]: nan in float"):
-        crank.tau(q, qd, u=bad[:, None])
+        crank.tau(q, qd, u=invalid[:, None])
     with pytest.raises(ValueError, match=r"params: m: shape \(2,\), expected \(3,\) for 3 states"):
-        crank.D(q, params={"m": bad[:2]})
+        crank.D(q, params={"m": invalid[:2]})
     with pytest.raises(ValueError, match=r"t: shape \(2,\), expected one number or \(3,\)"):
-        crank.project(q, qd, bad[:2])
+        crank.project(q, qd, invalid[:2])
 
 
-def test_no_states_have_no_values(crank: ModuleType) -> None:
-    none = np.empty((0, 3))
-    assert crank.D(none, t=np.empty(0), params={"m": np.empty(0)}).shape == (0, 3, 3)
-    assert crank.acceleration(none, none, np.empty(0), np.empty((0, 1))).shape == (0, 3)
+def test_zero_states_have_zero_values(crank: ModuleType) -> None:
+    empty = np.empty((0, 3))
+    assert crank.D(empty, t=np.empty(0), params={"m": np.empty(0)}).shape == (0, 3, 3)
+    assert crank.acceleration(empty, empty, np.empty(0), np.empty((0, 1))).shape == (0, 3)

@@ -1,4 +1,4 @@
-"""Jumps that follow soon behind a jump: tables that move, walls with corners."""
+"""Jumps in quick succession: moving tables, walls with corners."""
 
 from __future__ import annotations
 
@@ -57,49 +57,49 @@ batch = true
 
 
 @pytest.mark.parametrize("e", [0.3, 0.5, 0.9])
-def test_a_ball_does_not_fall_through_a_table_that_moves(tmp_path: Path, e: float) -> None:
-    """It comes to rest on it, or is thrown up again for ever."""
+def test_ball_does_not_fall_through_a_moving_table(tmp_path: Path, e: float) -> None:
+    """It comes to rest on the table, or is thrown up again for ever."""
     file = tmp_path / "table.toml"
     file.write_text(TABLE, encoding="utf-8")
     A = np.linspace(0.002, 0.05, 100)
     runs = eomc.load(file, BUILDS).simulate_batch(params={"A": A, "e": e})
-    assert not (runs.q[:, :, 0] < -1.001 * A[:, None]).any()  # NaN behind an end
+    assert not (runs.q[:, :, 0] < -1.001 * A[:, None]).any()  # rows after the end are NaN
     assert set(runs.status) <= {"ok", "accumulated"}
     flights = runs.events["impact"].for_instance(90)
     assert len(flights) > 10
     # free flight from the first impact to the second, in closed form
     t, v = flights.t[:2], -e * flights.qd[0, 0] + (1 + e) * A[90] * 30 * np.cos(30 * flights.t[0])
-    there = A[90] * np.sin(30 * t[0]) + v * (t[1] - t[0]) - 9.81 * (t[1] - t[0]) ** 2 / 2
-    assert abs(there - A[90] * np.sin(30 * t[1])) < 1e-10
+    height = A[90] * np.sin(30 * t[0]) + v * (t[1] - t[0]) - 9.81 * (t[1] - t[0]) ** 2 / 2
+    assert abs(height - A[90] * np.sin(30 * t[1])) < 1e-10
 
 
-def test_a_ball_stays_inside_of_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
-    """Where straight and round meet, a chord may be as short as rounding allows."""
+def test_ball_stays_inside_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
+    """Where the straight and the round part meet, a chord may be as short as rounding."""
     file = tmp_path / "stadium.toml"
     file.write_text(STADIUM, encoding="utf-8")
     y = np.linspace(-0.9, 0.9, 100)
     runs = eomc.load(file, BUILDS).simulate_batch(np.column_stack([0.1 + 0 * y, y]))
     x, y = np.moveaxis(runs.q, 2, 0)
-    off = x - np.clip(x, -1, 1)
-    assert not (off**2 + y**2 > 1 + 1e-9).any()  # NaN behind an end
+    distance_x = x - np.clip(x, -1, 1)
+    assert not (distance_x**2 + y**2 > 1 + 1e-9).any()  # rows after the end are NaN
     assert set(runs.status) <= {"ok", "accumulated"}
-    ended = np.array(runs.status) == "ok"
-    speed = np.hypot(*runs.qd[ended, -1].T)
+    completed = np.array(runs.status) == "ok"
+    speed = np.hypot(*runs.qd[completed, -1].T)
     np.testing.assert_allclose(speed, np.hypot(0.7, 0.4), rtol=1e-9)
-    assert ended.mean() > 0.9
+    assert completed.mean() > 0.9
 
 
-def test_an_estimate_tells_what_jumps_make_of_rounding(tmp_path: Path) -> None:
-    """Flights are exact by any tolerance, so finer steps alone show no error at all."""
+def test_error_estimate_includes_the_amplification_of_rounding_by_jumps(tmp_path: Path) -> None:
+    """Flights are exact at any tolerance: finer steps alone show no error."""
     file = tmp_path / "stadium.toml"
     file.write_text(STADIUM, encoding="utf-8")
     stadium = eomc.load(file, BUILDS)
-    for how in ({}, {"times": [50.0]}):
-        run = stadium.simulate(**how or {"duration": 50.0}, estimate=True)
-        near = stadium.simulate([0.1 + 1e-15, 0.2], duration=50.0)  # some 7 digits are left
-        moved = np.abs(near.q[-1] - run.q[-1])
-        assert run.error.resolved and (run.error.q[-1] > 0.1 * moved).all()
-        assert (run.error.q[-1] < 10 * moved).all() and max(run.error.digits.values()) < 10
+    for options in ({}, {"times": [50.0]}):
+        run = stadium.simulate(**options or {"duration": 50.0}, estimate=True)
+        perturbed = stadium.simulate([0.1 + 1e-15, 0.2], duration=50.0)  # about 7 digits are left
+        difference = np.abs(perturbed.q[-1] - run.q[-1])
+        assert run.error.resolved and (run.error.q[-1] > 0.1 * difference).all()
+        assert (run.error.q[-1] < 10 * difference).all() and max(run.error.digits.values()) < 10
     with pytest.warns(RuntimeWarning, match="chaotic: a difference at the start grows"):
         chaotic = stadium.simulate(estimate=True)
     assert chaotic.error.amplification > 1e14 and max(chaotic.error.digits.values()) < 3

@@ -1,4 +1,4 @@
-"""The compiled module as a package: what it says of itself, and beside other modules."""
+"""The compiled module as a package: its metadata, and its independence of other modules."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ import eomc
 from eomc.model.system import System, symbol, t
 
 
-def test_says_what_it_is(cartpole: ModuleType, driven: ModuleType) -> None:
+def test_module_describes_its_scene(cartpole: ModuleType, driven: ModuleType) -> None:
     assert cartpole.coordinates == ("x", "theta")
     assert cartpole.parameters == ("m_c", "m_p", "l", "g")
     assert cartpole.inputs == ()
@@ -37,7 +37,7 @@ def test_says_what_it_is(cartpole: ModuleType, driven: ModuleType) -> None:
     assert set(cartpole.__all__) >= {"D", "C", "g", "bias", "acceleration", "step", "simulate"}
 
 
-def test_start_is_the_scenes_whatever_is_done_to_it(cartpole: ModuleType) -> None:
+def test_start_is_that_of_the_scene_after_any_assignment(cartpole: ModuleType) -> None:
     q, qd = cartpole.start
     assert q.tolist() == [0, math.pi / 2]
     assert qd.tolist() == [0, 0]
@@ -51,7 +51,7 @@ def test_start_is_the_scenes_whatever_is_done_to_it(cartpole: ModuleType) -> Non
             q[0] = 0
 
 
-def test_params_know_their_names(cartpole: ModuleType) -> None:
+def test_params_have_the_names_of_the_scene(cartpole: ModuleType) -> None:
     p = cartpole.Params(m_c=3.0)
     assert p.m_c == 3.0
     assert p.m_p == 2.0
@@ -64,17 +64,19 @@ def test_params_know_their_names(cartpole: ModuleType) -> None:
         p.m_c = math.nan
 
 
-def test_a_parameter_may_have_any_name_that_a_scene_may_use(everything: ModuleType) -> None:
-    """`values`, `h`, `I`: what they mean is what the scene says, in Params too."""
+def test_parameter_can_have_any_name_that_a_scene_allows(everything: ModuleType) -> None:
+    """`values`, `h`, `I`: in Params too they mean the scene's parameters."""
     p = everything.Params()
     assert {n: getattr(p, n) for n in everything.parameters} == everything.defaults
     for name in everything.parameters:
-        given = everything.Params(**{name: 2.5})
-        assert getattr(given, name) == 2.5, name
+        params = everything.Params(**{name: 2.5})
+        assert getattr(params, name) == 2.5, name
 
 
-def test_modules_side_by_side(cartpole: ModuleType, driven: ModuleType, modules: Modules) -> None:
-    """Each keeps its own names, sizes and numbers, and loading again gives the same one."""
+def test_modules_are_independent_of_each_other(
+    cartpole: ModuleType, driven: ModuleType, modules: Modules
+) -> None:
+    """Each has its own names, sizes and numbers; loading a scene again returns the same module."""
     spring = modules("mass_spring")
     assert [m.D(np.zeros(len(m.coordinates))).shape for m in (cartpole, spring)] == [(2, 2), (1, 1)]
     assert spring.simulate(h=0.01, duration=1).q[-1] == pytest.approx(math.cos(1), abs=1e-9)
@@ -83,8 +85,8 @@ def test_modules_side_by_side(cartpole: ModuleType, driven: ModuleType, modules:
 
 
 @pytest.mark.usefixtures("quickly_compiled", "found")
-def test_a_changed_scene_is_a_new_module_in_the_same_process(scene: Path, root: Path) -> None:
-    """And the old one, still held, still works."""
+def test_changed_scene_is_a_new_module_in_the_same_process(scene: Path, root: Path) -> None:
+    """The old module still works."""
     old = eomc.load(scene, root)
     scene.write_text(CHANGED, encoding="utf-8")
     new = eomc.load(scene, root)
@@ -94,8 +96,8 @@ def test_a_changed_scene_is_a_new_module_in_the_same_process(scene: Path, root: 
     assert eomc.load(scene, root).g([1.0]) == old.g([1.0])
 
 
-def test_the_folder_is_a_package_that_needs_numpy_and_cffi_alone(tmp_path: Path) -> None:
-    """PYTHONPATH=build, `import cartpole`; neither the generator nor SymPy is there."""
+def test_package_depends_only_on_numpy_and_cffi(tmp_path: Path) -> None:
+    """PYTHONPATH=build, `import cartpole`; neither the generator nor SymPy is importable."""
     folder = eomc.build(SCENES / "cartpole.toml", MODULES).folder
     code = """
 import importlib.abc, sys
@@ -111,17 +113,17 @@ strange = {m.split(".")[0] for m in sys.modules} & {"eomc", "sympy", "scipy"}
 assert not strange, strange
 print(cartpole.__file__)
 """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True, text=True, cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(folder.parent)},
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert Path(done.stdout.strip()).parent == folder
+    assert process.returncode == 0, process.stderr
+    assert Path(process.stdout.strip()).parent == folder
 
 
 @pytest.fixture(scope="module")
-def made(modules: Modules) -> ModuleType:
+def minimal_module(modules: Modules) -> ModuleType:
     """A module of a System without any option."""
     return modules.unoptimised(System.make("made", {"x": 1}, "x_dot**2/2", "x**2/2"))
 
@@ -142,32 +144,32 @@ def made(modules: Modules) -> ModuleType:
         (lambda m: m.pose([0], "tip"), "which System.make has not"),
     ],
 )
-def test_what_a_system_was_built_without_is_an_argument_of_make(
-    made: ModuleType, call: Callable[[ModuleType], Any], argument: str
+def test_missing_option_of_a_system_is_named_as_argument_of_make(
+    minimal_module: ModuleType, call: Callable[[ModuleType], Any], argument: str
 ) -> None:
-    with pytest.raises((ValueError, AttributeError)) as fault:
-        call(made)
-    assert argument in str(fault.value)
-    assert "System.make" in str(fault.value)
+    with pytest.raises((ValueError, AttributeError)) as error:
+        call(minimal_module)
+    assert argument in str(error.value)
+    assert "System.make" in str(error.value)
 
 
-def test_what_a_scene_was_built_without_is_a_key_of_run(cartpole: ModuleType) -> None:
+def test_missing_option_of_a_scene_is_named_as_key_of_run(cartpole: ModuleType) -> None:
     for call in (cartpole.linearize, cartpole.discretize):
-        with pytest.raises(ValueError, match=r"\[run\] (linearize|discretize) = true") as fault:
+        with pytest.raises(ValueError, match=r"\[run\] (linearize|discretize) = true") as error:
             call([0, 0], [0, 0])
-        assert "System.make" not in str(fault.value)
+        assert "System.make" not in str(error.value)
 
 
-def test_a_system_has_inverse_dynamics_where_it_is_asked_for(modules: Modules) -> None:
+def test_system_can_be_built_with_inverse_dynamics(modules: Modules) -> None:
     system = System.make(
         "inverse", {"x": 1}, "m*x_dot**2/2", "x**2/2", parameters={"m": 2}, inverse_dynamics=True
     )
-    found = modules.unoptimised(system).inverse_dynamics([0.5], [0.0], [3.0])
-    assert found == pytest.approx([6.5])
+    tau = modules.unoptimised(system).inverse_dynamics([0.5], [0.0], [3.0])
+    assert tau == pytest.approx([6.5])
 
 
-def test_a_module_from_sympy_expressions() -> None:
-    """The same compiled face; time in K and an input beside it."""
+def test_module_from_sympy_expressions() -> None:
+    """The same compiled interface; K depends on time, and there is an input."""
     x, v, m, u = symbol("x"), symbol("x_dot"), symbol("m"), symbol("u")
     system = System.make(
         "rocket", {x: (0.0, 1.0)}, m * (2 - t) * v**2 / 2, parameters={m: 3}, inputs={u: t},

@@ -1,4 +1,4 @@
-"""A pickled value belongs to the build that pickled it, whatever is built under its name since."""
+"""A pickled value belongs to the build that pickled it, whatever was built under its name later."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ HEAVIER = TEXT.replace("m = 0.1", "m = 0.3")
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 
 
-def forget(name: str) -> None:
-    """Leave this process as one that has not loaded the builds of a scene."""
+def unload_builds(name: str) -> None:
+    """Remove the loaded builds of a scene from this process."""
     for module in [m for m in sys.modules if m.startswith(f"_eomc_{name}_")]:
         del sys.modules[module]
 
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
-    """What each version of a scene pickles, by the name of the version; all were built in turn."""
+    """Pickled values of each version of a scene, by version; the versions were built in turn."""
     root = tmp_path_factory.mktemp("versions")
     scene, pickled = root / "carriage.toml", {}
     with pytest.MonkeyPatch.context() as patch:
@@ -65,62 +65,62 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, by
                 "params": m.Params(m=0.7), "rest": m.equilibrium(free=["theta"]),
                 "error": m.simulate().estimate(), "fault": m.MotionError("words", "singular"),
             }  # fmt: skip
-            pickled[name] = {what: pickle.dumps(value) for what, value in values.items()}
+            pickled[name] = {kind: pickle.dumps(value) for kind, value in values.items()}
     pickled["root"] = {"root": str(root / "build").encode()}
     return pickled
 
 
 @pytest.fixture
 def folder(versions: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder of their builds, as a process finds it that has loaded none of them."""
-    place = Path(versions["root"]["root"].decode()) / "carriage"
-    stored = place.with_name("stored")
-    shutil.copytree(place, stored)
-    forget("carriage")
-    yield place
-    forget("carriage")
-    shutil.rmtree(place)
-    stored.rename(place)
+    """The folder of the builds, in a process that has loaded none of them."""
+    path = Path(versions["root"]["root"].decode()) / "carriage"
+    stored = path.with_name("stored")
+    shutil.copytree(path, stored)
+    unload_builds("carriage")
+    yield path
+    unload_builds("carriage")
+    shutil.rmtree(path)
+    stored.rename(path)
 
 
-def test_each_version_is_read_as_it_was_pickled(
+def test_each_version_is_unpickled_as_it_was(
     versions: dict[str, Any], folder: Path, no_warnings: None
 ) -> None:
-    """And a process that has read one reads another, newer or older."""
+    """A process that has loaded one version can load others, newer or older."""
     for name, m, order in (
         ("first", 0.1, ("x", "theta")),
         ("heavier", 0.3, ("x", "theta")),
         ("reordered", 0.1, ("theta", "x")),
         ("first", 0.1, ("x", "theta")),
     ):
-        read = {what: pickle.loads(text) for what, text in versions[name].items()}
-        module, run = read["module"], read["run"]
+        loaded = {kind: pickle.loads(text) for kind, text in versions[name].items()}
+        module, run = loaded["module"], loaded["run"]
         assert module.defaults == {"m": m} and module.coordinates == order
         assert [run["x"][0], run["theta"][0]] == [0.5, 0.1]
-        assert run.to_dict()["x"][0] == 0.5 and run.model is model_of(module) is read["model"]
-        assert read["function"](*module.start) == module.energy(*module.start)
+        assert run.to_dict()["x"][0] == 0.5 and run.model is model_of(module) is loaded["model"]
+        assert loaded["function"](*module.start) == module.energy(*module.start)
         assert run.energy[0] == module.energy(*module.start)
-        assert type(read["rest"]).__name__ == "Equilibrium" and read["rest"].q.shape == (2,)
-        assert read["error"].digits.keys() == set(order) | {f"{c}_dot" for c in order}
+        assert type(loaded["rest"]).__name__ == "Equilibrium" and loaded["rest"].q.shape == (2,)
+        assert loaded["error"].digits.keys() == set(order) | {f"{c}_dot" for c in order}
 
 
-def test_a_module_whose_build_is_gone_is_refused_when_it_is_used(
+def test_module_of_a_deleted_build_is_refused_on_use(
     versions: dict[str, Any], folder: Path
 ) -> None:
-    """A pool would wait for ever for a task whose reading raises an error."""
+    """Not on unpickling: a pool would wait for ever for a task that fails to unpickle."""
     shutil.rmtree(folder / ".builds")
     module, function = (pickle.loads(versions["first"][x]) for x in ("module", "function"))
-    words = r"carriage: this was pickled by the build _carriage_\w{12}, which is gone"
+    message = r"carriage: this was pickled by the build _carriage_\w{12}, which is gone"
     for use in UNREADABLE_USES:
-        with pytest.raises(eomc.EomcError, match=words):
+        with pytest.raises(eomc.EomcError, match=message):
             use(module)
-    with pytest.raises(eomc.EomcError, match=words):
+    with pytest.raises(eomc.EomcError, match=message):
         function([0.0, 0.0], [0.0, 0.0])
     assert repr(module).startswith("<unreadable: ") and not hasattr(module, "__len_hint__")
-    # another process that has the build reads what this one could not
-    passed_on = pickle.dumps((module, function))
+    # another process that has the build can unpickle what this one could not
+    repickled = pickle.dumps((module, function))
     (folder.with_name("stored") / ".builds").rename(folder / ".builds")
-    module, function = pickle.loads(passed_on)
+    module, function = pickle.loads(repickled)
     assert module.defaults == {"m": 0.1} and function([0.5, 0.1], [0.0, 0.0]) > 0
     shutil.copytree(folder / ".builds", folder.with_name("stored") / ".builds")
 
@@ -133,50 +133,51 @@ UNREADABLE_USES: list[Callable[[Any], object]] = [
 ]  # fmt: skip
 
 
-def test_data_of_a_build_that_is_gone_are_read_by_their_names(
+def test_data_of_a_deleted_build_are_unpickled_by_column_names(
     versions: dict[str, Any], folder: Path
 ) -> None:
-    """With a warning where the columns are those of the present version, else refused by name."""
+    """With a warning if the columns equal those of the present version, else refused by name."""
     shutil.rmtree(folder / ".builds")
-    for what in ("run", "params", "rest", "error"):
+    for kind in ("run", "params", "rest", "error"):
         with pytest.warns(RuntimeWarning, match="pickled by another build of the scene, which is"):
-            pickle.loads(versions["first"][what])
+            pickle.loads(versions["first"][kind])
         with pytest.raises(eomc.EomcError, match=r"whose coordinates were theta, x; here they are"):
-            len(pickle.loads(versions["reordered"][what]).q)
+            len(pickle.loads(versions["reordered"][kind]).q)
     with pytest.warns(RuntimeWarning):
         run = pickle.loads(versions["first"]["run"])
     assert run["x"][0] == 0.5 and run.params == {"m": 0.1} and run.model.info.defaults == {"m": 0.3}
 
 
-def test_where_no_build_is_left_all_but_errors_is_refused(
+def test_all_but_errors_are_refused_if_no_build_is_left(
     versions: dict[str, Any], folder: Path
 ) -> None:
     shutil.rmtree(folder)
-    for what in ("module", "function", "run", "params", "error"):
+    for kind in ("module", "function", "run", "params", "error"):
         with pytest.raises(eomc.EomcError, match=r"the build of carriage that pickled this is go"):
-            len(pickle.loads(versions["first"][what]))
+            len(pickle.loads(versions["first"][kind]))
     assert pickle.loads(versions["first"]["fault"]).status == "singular"
     folder.mkdir()
 
 
-def test_a_damaged_build_is_not_read(versions: dict[str, Any], folder: Path) -> None:
+def test_damaged_build_is_not_loaded(versions: dict[str, Any], folder: Path) -> None:
     for file in folder.glob(".builds/*/_runtime/status.py"):
         file.write_text(file.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     with pytest.raises(eomc.EomcError, match="which is gone"):
         pickle.loads(versions["first"]["module"]).simulate()
 
 
-# --- all that can be pickled ----------------------------------------------------------------------
+# --- all kinds of pickled values
+# -------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def values(unoptimised_file: None) -> dict[str, Any]:
-    """One of each kind."""
-    ball, many = built(BALL), batches.module("mass_spring")
+    """One value of each kind."""
+    ball, batch = built(BALL), batches.module("mass_spring")
     run, runs = ball.simulate(duration=1.0), ball.simulate_batch([[0, 1], [0, 2]], duration=0.5)
     return {
-        "batch": many.simulate_batch([[0.1], [0.2]], steps=10),
-        "batch at times": many.simulate_batch([[0.1], [0.2]], times=[0.0, 0.05]),
+        "batch": batch.simulate_batch([[0.1], [0.2]], steps=10),
+        "batch at times": batch.simulate_batch([[0.1], [0.2]], times=[0.0, 0.05]),
         "adaptive batch": runs,
         "adaptive run": run,
         "stepped run": ball.simulate(h=0.01, duration=1.0),
@@ -193,45 +194,45 @@ KINDS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("what", KINDS)
-def test_a_value_is_read_where_its_module_was_not_loaded(
-    values: dict[str, Any], what: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("kind", KINDS)
+def test_value_is_unpickled_without_a_loaded_module(
+    values: dict[str, Any], kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    value, pickled = values[what], pickle.dumps(values[what])
+    value, pickled = values[kind], pickle.dumps(values[kind])
     for name in [m for m in sys.modules if m.startswith("_eomc_")]:
         monkeypatch.delitem(sys.modules, name)
-    other = pickle.loads(pickled)
-    assert type(other) is not type(value) and type(other).__name__ == type(value).__name__
-    assert repr(other) == repr(value)
+    loaded = pickle.loads(pickled)
+    assert type(loaded) is not type(value) and type(loaded).__name__ == type(value).__name__
+    assert repr(loaded) == repr(value)
     if hasattr(value, "to_dict"):
-        mine, read = value.to_dict(), other.to_dict()
-        assert mine.keys() == read.keys()
-        assert all(np.array_equal(mine[k], read[k], equal_nan=True) for k in mine)
+        expected, actual = value.to_dict(), loaded.to_dict()
+        assert expected.keys() == actual.keys()
+        assert all(np.array_equal(expected[k], actual[k], equal_nan=True) for k in expected)
 
 
-@pytest.mark.parametrize("what", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("field", ["coordinates", "parameters", "inputs", "events"])
-def test_no_value_is_read_under_other_names(values: dict[str, Any], what: str, field: str) -> None:
-    """Events too: what a run stores of them is numbered."""
-    if what == "interrupted":  # its words are its own; the run inside is a value by itself
+def test_value_with_other_names_is_refused(values: dict[str, Any], kind: str, field: str) -> None:
+    """Names of events too: a run stores their numbers."""
+    if kind == "interrupted":  # it has only a message; the run inside is a value by itself
         return
-    function, (place, pickled, *rest) = values[what].__reduce__()
-    same = Identity(*pickled)._replace(extension="_another_0")
+    function, (path, pickled, *rest) = values[kind].__reduce__()
+    identity = Identity(*pickled)._replace(extension="_another_0")
     with pytest.warns(RuntimeWarning, match="another build of the scene"):
-        function(place, tuple(same), *rest)
-    other = same._replace(**{field: (*getattr(same, field)[::-1], "more")})
+        function(path, tuple(identity), *rest)
+    changed = identity._replace(**{field: (*getattr(identity, field)[::-1], "more")})
     with pytest.raises(eomc.EomcError, match=f"whose {field} were .*more; here they are"):
-        len(function(place, tuple(other), *rest))
+        len(function(path, tuple(changed), *rest))
 
 
 def test_numbers_of_another_precision_are_refused(values: dict[str, Any]) -> None:
-    function, (place, pickled, *rest) = values["batch"].__reduce__()
-    other = Identity(*pickled)._replace(extension="_another_0", dtype="float32")
+    function, (path, pickled, *rest) = values["batch"].__reduce__()
+    changed = Identity(*pickled)._replace(extension="_another_0", dtype="float32")
     with pytest.raises(eomc.EomcError, match="pickled in float32; the build here has float64"):
-        len(function(place, tuple(other), *rest))
+        len(function(path, tuple(changed), *rest))
 
 
-def test_a_saved_run_with_other_events_is_refused(values: dict[str, Any], tmp_path: Path) -> None:
+def test_saved_run_with_other_events_is_refused(values: dict[str, Any], tmp_path: Path) -> None:
     file, ball = tmp_path / "run.npz", built(BALL)
     values["adaptive run"].save(file)
     stored = dict(np.load(file))
@@ -239,15 +240,15 @@ def test_a_saved_run_with_other_events_is_refused(values: dict[str, Any], tmp_pa
     np.savez(file, **stored)
     with pytest.raises(ValueError, match=r"whose events were .*more; here they are"):
         ball.load_run(file)
-    del stored["events"]  # as files of an older version
+    del stored["events"]  # as in files of older versions
     np.savez(file, **stored)
     assert ball.load_run(file) == values["adaptive run"]
 
 
-def test_a_module_imported_by_its_own_name_is_refused_where_another_build_stands(
+def test_module_imported_by_its_own_name_is_refused_if_another_build_has_the_name(
     cartpole: ModuleType,
 ) -> None:
-    """It is found by that name alone: another build has the name now."""
+    """It is found by that name alone, which another build now has."""
     code = """
 import pickle, sys
 import cartpole as m
@@ -260,13 +261,13 @@ try:
 except RuntimeError as fault:
     print(fault)
 """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
         env={"PYTHONPATH": str(MODULES)},
     )
-    assert "pickled by the build _cartpole_0, which is gone" in done.stdout, done.stderr
+    assert "pickled by the build _cartpole_0, which is gone" in process.stdout, process.stderr
 
 
 # --- pools ----------------------------------------------------------------------------------------
@@ -301,13 +302,13 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["spawn", "forkserver"])
-def test_a_pool_reads_each_version_and_never_waits(how: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_pool_loads_each_version_and_never_waits(method: str, tmp_path: Path) -> None:
     file, script = tmp_path / "cartpole.toml", tmp_path / "pool.py"
     shutil.copy(SCENES / "cartpole.toml", file)
     script.write_text(POOL, encoding="utf-8")
-    words = [sys.executable, str(script), str(file), str(tmp_path / "build"), how]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.splitlines() == [
+    command = [sys.executable, str(script), str(file), str(tmp_path / "build"), method]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert process.stdout.splitlines() == [
         "2.0 4.0", "3.0 4.0", "4.0 4.0", "['refused', 'refused', 4.0] refused",
-    ], done.stderr  # fmt: skip
+    ], process.stderr  # fmt: skip

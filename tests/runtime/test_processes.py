@@ -1,4 +1,4 @@
-"""What a module makes goes to other processes and comes back, and can be copied and compared."""
+"""Values of a module can be pickled across processes, copied and compared."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ COPIES: dict[str, Callable[[Any], Any]] = {
 
 
 @pytest.fixture(params=COPIES.values(), ids=list(COPIES))
-def copied(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
-    """A way to copy a value."""
-    way: Callable[[Any], Any] = request.param
-    return way
+def copy_value(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
+    """A function that copies a value."""
+    function: Callable[[Any], Any] = request.param
+    return function
 
 
 @pytest.fixture(scope="session")
 def batch() -> ModuleType:
-    """Many cart-poles."""
+    """Cart-poles."""
     return batches.module("cartpole")
 
 
@@ -49,81 +49,87 @@ def batch() -> ModuleType:
 
 
 def test_params_are_copied_and_compared(
-    cartpole: ModuleType, copied: Callable[[Any], Any], modules: Modules
+    cartpole: ModuleType, copy_value: Callable[[Any], Any], modules: Modules
 ) -> None:
     p = cartpole.Params(m_c=3.25)
-    other = copied(p)
-    assert type(other) is type(p) and other == p and other.m_c == 3.25
-    other.l = 7.0
-    assert other != p and p.l == 2.0
+    copied_params = copy_value(p)
+    assert type(copied_params) is type(p) and copied_params == p and copied_params.m_c == 3.25
+    copied_params.l = 7.0
+    assert copied_params != p and p.l == 2.0
     assert p == cartpole.Params(m_c=3.25) and p != cartpole.Params() and p != 3
     assert p != modules("simple_pendulum").Params()
     with pytest.raises(TypeError, match="unhashable"):
         hash(p)
 
 
-def test_a_run_is_copied_and_compared(driven: ModuleType, copied: Callable[[Any], Any]) -> None:
-    how: dict[str, Any] = {"steps": 40, "every": 7, "params": {"m_c": 3.0}, "t0": 0.3}
-    run = driven.simulate(u=np.full((40, 1), 0.25), **how)
+def test_run_is_copied_and_compared(driven: ModuleType, copy_value: Callable[[Any], Any]) -> None:
+    options: dict[str, Any] = {"steps": 40, "every": 7, "params": {"m_c": 3.0}, "t0": 0.3}
+    run = driven.simulate(u=np.full((40, 1), 0.25), **options)
     run.estimate()
-    other = copied(run)
-    assert other == run and type(other) is type(run) and other is not run
-    assert (repr(other), other.message) == (repr(run), run.message)
+    copied_run = copy_value(run)
+    assert copied_run == run and type(copied_run) is type(run) and copied_run is not run
+    assert (repr(copied_run), copied_run.message) == (repr(run), run.message)
     for name in ("t", "q", "qd", "energy", "jacobi", "x"):
-        assert np.array_equal(getattr(other, name), getattr(run, name)), name
-    assert other.error.end == run.error.end and np.array_equal(other.error.q, run.error.q)
-    again = other.estimate()
-    assert np.array_equal(again.q, run.error.q)
-    assert run != driven.simulate(**how) and run != 3
-    if copied is not copy.copy:
-        other.q[0] = 9.0
-        assert run.q[0, 0] != 9.0 and other != run
+        assert np.array_equal(getattr(copied_run, name), getattr(run, name)), name
+    assert copied_run.error.end == run.error.end and np.array_equal(copied_run.error.q, run.error.q)
+    repeated = copied_run.estimate()
+    assert np.array_equal(repeated.q, run.error.q)
+    assert run != driven.simulate(**options) and run != 3
+    if copy_value is not copy.copy:
+        copied_run.q[0] = 9.0
+        assert run.q[0, 0] != 9.0 and copied_run != run
 
 
-def test_a_run_under_a_function_keeps_all_but_the_function(driven: ModuleType) -> None:
+def test_run_under_a_function_is_copied_without_the_function(driven: ModuleType) -> None:
     with (
         pytest.warns(RuntimeWarning)
         if "u" not in driven._model.integrator.warned
         else memoryview(b"")
     ):
         run = driven.simulate(steps=10, u=lambda t, q, qd: [-qd[0]])
-    other = pickle.loads(pickle.dumps(run))
-    assert other == run and np.array_equal(other.energy, run.energy)
+    copied_run = pickle.loads(pickle.dumps(run))
+    assert copied_run == run and np.array_equal(copied_run.energy, run.energy)
     with pytest.raises(ValueError, match=r"^estimate: u was a function.*simulate again"):
-        other.estimate()
-    found = copy.deepcopy(run).estimate()
-    assert found.order == 4
-    # it hangs at rest, where rounding alone moves it: that is not chaos
-    assert not found.verdict and found.amplification < 10 and min(found.digits.values()) > 12
+        copied_run.estimate()
+    estimate = copy.deepcopy(run).estimate()
+    assert estimate.order == 4
+    # it hangs at rest, where only rounding moves it: that is not chaos
+    assert (
+        not estimate.verdict and estimate.amplification < 10 and min(estimate.digits.values()) > 12
+    )
 
 
-def test_a_run_that_stopped_is_copied(cartpole: ModuleType, copied: Callable[[Any], Any]) -> None:
+def test_stopped_run_is_copied(cartpole: ModuleType, copy_value: Callable[[Any], Any]) -> None:
     with pytest.warns(RuntimeWarning):
         run = cartpole.simulate(h=3.0, duration=300.0)
-    assert copied(run) == run and copied(run).status == "not finite"
-    stop = copied(cartpole.Interrupted(run))
-    assert type(stop) is cartpole.Interrupted and stop.run == run and str(stop) == run.message
+    assert copy_value(run) == run and copy_value(run).status == "not finite"
+    interruption = copy_value(cartpole.Interrupted(run))
+    assert (
+        type(interruption) is cartpole.Interrupted
+        and interruption.run == run
+        and str(interruption) == run.message
+    )
 
 
-def test_a_batch_is_copied_and_compared(batch: ModuleType, copied: Callable[[Any], Any]) -> None:
+def test_batch_is_copied_and_compared(batch: ModuleType, copy_value: Callable[[Any], Any]) -> None:
     q0 = np.array([[0.0, 0.1], [0.0, 1e300], [0.0, 0.4]])
     run = batch.simulate_batch(q0, h=0.01, steps=30, every=4, params={"m_c": [1.0, 2, 3]})
-    other = copied(run)
-    assert other == run and repr(other) == repr(run) and other is not run
-    assert other.status.tolist() == run.status.tolist()
-    assert np.array_equal(other.t, run.t) and np.array_equal(other.steps, run.steps)
+    copied_run = copy_value(run)
+    assert copied_run == run and repr(copied_run) == repr(run) and copied_run is not run
+    assert copied_run.status.tolist() == run.status.tolist()
+    assert np.array_equal(copied_run.t, run.t) and np.array_equal(copied_run.steps, run.steps)
     assert run != batch.simulate_batch(q0, h=0.01, steps=30, every=5)
 
 
-def test_a_motion_error_is_copied(cartpole: ModuleType, copied: Callable[[Any], Any]) -> None:
-    with pytest.raises(cartpole.MotionError) as fault:
+def test_motion_error_is_copied(cartpole: ModuleType, copy_value: Callable[[Any], Any]) -> None:
+    with pytest.raises(cartpole.MotionError) as error:
         cartpole.step([0, 0.4], [0, 1e200], h=1.0)
-    other = copied(fault.value)
-    assert type(other) is cartpole.MotionError
-    assert (str(other), other.status) == (str(fault.value), "not finite")
+    copied_error = copy_value(error.value)
+    assert type(copied_error) is cartpole.MotionError
+    assert (str(copied_error), copied_error.status) == (str(error.value), "not finite")
 
 
-def test_modules_and_their_functions_are_pickled_as_themselves(cartpole: ModuleType) -> None:
+def test_modules_and_their_functions_are_pickled_by_reference(cartpole: ModuleType) -> None:
     classes = (cartpole.Params, cartpole.Run, cartpole.MotionError)
     for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate, *classes):
         assert pickle.loads(pickle.dumps(value)) == value
@@ -131,11 +137,11 @@ def test_modules_and_their_functions_are_pickled_as_themselves(cartpole: ModuleT
     assert pickle.loads(pickle.dumps(cartpole)) is cartpole
 
 
-def test_faults_of_a_scene_are_pickled() -> None:
-    fault = eomc.SceneError([Problem("is wrong", "a", "x.toml", 2), Problem("too", "b")])
-    other = pickle.loads(pickle.dumps(fault))
-    assert type(other) is eomc.SceneError
-    assert other.problems == fault.problems and str(other) == str(fault)
+def test_errors_of_a_scene_are_pickled() -> None:
+    error = eomc.SceneError([Problem("is wrong", "a", "x.toml", 2), Problem("too", "b")])
+    loaded = pickle.loads(pickle.dumps(error))
+    assert type(loaded) is eomc.SceneError
+    assert loaded.problems == error.problems and str(loaded) == str(error)
 
 
 # --- processes ------------------------------------------------------------------------------------
@@ -176,22 +182,22 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.parametrize("loaded", ["loaded", "not loaded"])
-def test_a_pool_of_processes(how: str, loaded: str, tmp_path: Path, cartpole: ModuleType) -> None:
-    """It would wait for ever for an exception that can't be read."""
+def test_pool_of_processes(method: str, loaded: str, tmp_path: Path, cartpole: ModuleType) -> None:
+    """An exception that cannot be unpickled would make it wait for ever."""
     script = tmp_path / "pool.py"
     script.write_text(POOL, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, str(script), str(SCENES / "cartpole.toml"), str(MODULES), how, loaded],
+    process = subprocess.run(
+        [sys.executable, str(script), str(SCENES / "cartpole.toml"), str(MODULES), method, loaded],
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
-    assert done.stdout.splitlines() == [
+    assert process.stdout.splitlines() == [
         "MotionError not finite",
         "SceneError ",
         "<Run of cartpole: 5 steps of 0.005 s> 5.0 4 True",
         "7.0 6",
-    ], done.stderr
+    ], process.stderr
 
 
 JOBS = """
@@ -219,49 +225,51 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 def test_jobs_of_joblib(tmp_path: Path, cartpole: ModuleType, batch: ModuleType) -> None:
-    """Functions of the script go by value, what they use of a module by where it lies."""
+    """Functions of the script are sent by value, modules that they use by their path."""
     pytest.importorskip("joblib")
     script = tmp_path / "jobs.py"
     script.write_text(JOBS, encoding="utf-8")
     scenes = [str(SCENES / "cartpole.toml"), str(MODULES), "build/tests/many_cartpole.toml"]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, str(script), *scenes, "build/tests/modules"],
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
-    assert done.stdout.splitlines() == [
+    assert process.stdout.splitlines() == [
         "2.0 True",
         "3.0 True",
         "[<Run of cartpole: 1 steps of 0.005 s>, <Run of cartpole: 2 steps of 0.005 s>]",
-    ], done.stderr
+    ], process.stderr
 
 
-def test_a_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -> None:
-    """What one process pickles another reads, by NumPy and cffi alone."""
-    write = (
+def test_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -> None:
+    """Another process unpickles the values with NumPy and cffi alone."""
+    write_code = (
         "import cartpole as m, pickle, sys\n"
         "try:\n    m.step([0, 0.4], [0, 1e200], h=1.0)\n"
         "except m.MotionError as error:\n    fault = error\n"
         "sys.stdout.buffer.write(pickle.dumps((m.simulate(steps=5), m.Params(m_c=3), fault, m.D)))"
     )
-    read = (
+    read_code = (
         "import pickle, sys\n"
         "run, p, fault, D = pickle.loads(sys.stdin.buffer.read())\n"
         "assert 'eomc' not in sys.modules and fault.status == 'not finite'\n"
         "print(run, p, type(fault).__module__, D([0, 0.5])[0, 0], run.energy.shape)"
     )
     env = {**os.environ, "PYTHONPATH": str(MODULES)}
-    made = subprocess.run([sys.executable, "-c", write], capture_output=True, env=env, check=True)
-    done = subprocess.run(
-        [sys.executable, "-c", read], input=made.stdout, capture_output=True, env=env
+    writer = subprocess.run(
+        [sys.executable, "-c", write_code], capture_output=True, env=env, check=True
     )
-    assert done.returncode == 0, done.stderr.decode()
-    assert done.stdout.decode().split(">")[0] == "<Run of cartpole: 5 steps of 0.005 s"
-    assert "cartpole._runtime.status 4.0 (6,)" in done.stdout.decode()
+    reader = subprocess.run(
+        [sys.executable, "-c", read_code], input=writer.stdout, capture_output=True, env=env
+    )
+    assert reader.returncode == 0, reader.stderr.decode()
+    assert reader.stdout.decode().split(">")[0] == "<Run of cartpole: 5 steps of 0.005 s"
+    assert "cartpole._runtime.status 4.0 (6,)" in reader.stdout.decode()
 
 
 @pytest.mark.slow
-def test_a_fork_has_threads_of_its_own(batch: ModuleType) -> None:
-    """Those of the parent are not there, and a batch given to them would wait for ever."""
+def test_forked_process_has_its_own_threads(batch: ModuleType) -> None:
+    """The parent's threads do not exist there; a batch assigned to them would wait for ever."""
     q0 = np.tile(batch.start[0], (3000, 1))
     expected = batch.simulate_batch(q0, steps=100, every=100, threads=2)
     context = multiprocessing.get_context("fork")
@@ -286,7 +294,7 @@ def test_a_fork_has_threads_of_its_own(batch: ModuleType) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("name", "value", "message"),
     [
         ("m_c", 50, r'cartpole_driven.simulate\(params={"m_c": 50}\), or eomc run --set m_c=50'),
         ("g", 3.7, r'params={"g": 3.7}'),
@@ -302,27 +310,31 @@ def test_a_fork_has_threads_of_its_own(batch: ModuleType) -> None:
         ("defaults", {}, "belongs to the module"),
     ],
 )
-def test_a_module_is_not_assigned_to(driven: ModuleType, name: str, value: Any, words: str) -> None:
-    before = dict(vars(driven))
-    with pytest.raises(AttributeError, match=f"^{name}: .*{words}"):
+def test_assignment_to_a_module_is_refused_with_advice(
+    driven: ModuleType, name: str, value: Any, message: str
+) -> None:
+    initial = dict(vars(driven))
+    with pytest.raises(AttributeError, match=f"^{name}: .*{message}"):
         setattr(driven, name, value)
-    assert vars(driven) == before
+    assert vars(driven) == initial
 
 
-def test_a_test_may_replace_a_function(driven: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is meant goes into the dictionary, or to the model."""
+def test_function_can_be_replaced_for_a_test(
+    driven: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A deliberate replacement goes into the dictionary, or to the model."""
     monkeypatch.setitem(vars(driven), "simulate", lambda: "another")
     assert driven.simulate() == "another"
     monkeypatch.undo()
     assert driven.simulate(steps=1).steps == 1
 
 
-def test_an_input_is_not_assigned_to(driven: ModuleType) -> None:
+def test_assignment_to_an_input_is_refused_with_advice(driven: ModuleType) -> None:
     with pytest.raises(AttributeError, match=r'an input .*simulate\(u={"force": 1.0}\)'):
         setattr(driven, driven.inputs[0], 1.0)
 
 
-def test_a_parameter_called_like_a_function(cartpole: ModuleType) -> None:
+def test_assignment_to_a_parameter_named_like_a_function(cartpole: ModuleType) -> None:
     """g is both: the function stays, and the message names the parameter."""
     with pytest.raises(AttributeError, match="params="):
         cartpole.g = 3.7
@@ -332,10 +344,10 @@ def test_a_parameter_called_like_a_function(cartpole: ModuleType) -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_what_is_no_name_of_the_scene_may_be_assigned(tmp_path: Path) -> None:
+def test_name_unknown_to_the_scene_can_be_assigned(tmp_path: Path) -> None:
     x = sympy_symbol("x")
-    made = System.make("free", {x: 1.0}, sympy_symbol("x_dot") ** 2 / 2, x**2 / 2)
-    module = eomc.load(made, MODULES)
+    system = System.make("free", {x: 1.0}, sympy_symbol("x_dot") ** 2 / 2, x**2 / 2)
+    module = eomc.load(system, MODULES)
     module._mine = module.mine = 3  # type: ignore[attr-defined]
     assert module.mine == 3
     del module.mine, module._mine  # type: ignore[attr-defined]
@@ -348,14 +360,14 @@ def sympy_symbol(name: str) -> Any:
 
 
 def test_defaults_are_read_only(cartpole: ModuleType) -> None:
-    before = json.dumps(cartpole.defaults)
+    initial = json.dumps(cartpole.defaults)
     for change in (
         lambda d: d.__setitem__("m_c", 50), lambda d: d.update(m_c=50), lambda d: d.clear(),
         lambda d: d.pop("m_c"), lambda d: d.setdefault("m", 1),
     ):  # fmt: skip
         with pytest.raises(TypeError, match=r"params={...}"):
             change(cartpole.defaults)
-    assert json.dumps(cartpole.defaults) == before
-    mine = cartpole.defaults | {"m_c": 50}
-    assert mine["m_c"] == 50 and copy.deepcopy(cartpole.defaults) == cartpole.defaults
+    assert json.dumps(cartpole.defaults) == initial
+    changed = cartpole.defaults | {"m_c": 50}
+    assert changed["m_c"] == 50 and copy.deepcopy(cartpole.defaults) == cartpole.defaults
     assert pickle.loads(pickle.dumps(cartpole.defaults)) == cartpole.defaults

@@ -1,4 +1,4 @@
-"""Multipliers, reactions and outputs over them where D is negative along the rows: none."""
+"""Multipliers, reactions and their outputs are undefined where D is negative along constraints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eomc.model.symbols import Reaction
 from eomc.scene.read import parse
 from eomc.toolchain.files import write_files
 
-MADE = from_scene(
+SYSTEM = from_scene(
     parse("""eomc = 1
 name = "lighter"
 [coordinates]
@@ -36,9 +36,11 @@ h = 0.01
 duration = 0.1
 """)
 )
-(ROW,) = MADE.constraints
-PULL = Reaction("pull", (ROW.multiplier, 0 * ROW.multiplier, 0 * ROW.multiplier))
-LIGHTER = replace(MADE, reactions=(PULL,), plane=True)
+(CONSTRAINT,) = SYSTEM.constraints
+REACTION = Reaction(
+    "pull", (CONSTRAINT.multiplier, 0 * CONSTRAINT.multiplier, 0 * CONSTRAINT.multiplier)
+)
+LIGHTER = replace(SYSTEM, reactions=(REACTION,), plane=True)
 PROGRAM = """#include <lighter.h>
 #include <stdio.h>
 int main(void)
@@ -61,30 +63,40 @@ def lighter(unoptimised_file: None, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize("name", ["acceleration", "multipliers", "reactions"])
-def test_they_refuse_in_the_same_words(lighter: ModuleType, name: str) -> None:
+def test_functions_refuse_with_the_same_message(lighter: ModuleType, name: str) -> None:
     q, qd = lighter.start
-    with pytest.raises(lighter.MotionError, match=r"at q = \[ 0.6 .*D is not positive") as said:
+    with pytest.raises(lighter.MotionError, match=r"at q = \[ 0.6 .*D is not positive") as error:
         getattr(lighter, name)(q, qd, params={"m": 0.1})
-    assert said.value.status == "singular"
+    assert error.value.status == "singular"
     with pytest.raises(lighter.MotionError, match=r"at q = \[ 0.6 "):
         getattr(lighter, name)([[-0.6, -0.8], q], [qd, qd], params={"m": 0.1})
 
 
-def test_outputs_over_them_are_nan(lighter: ModuleType) -> None:
+def test_outputs_of_multipliers_are_nan(lighter: ModuleType) -> None:
     q, qd = lighter.start
-    found = lighter.output([q, [-0.6, -0.8]], [qd, qd], params={"m": 0.1})
-    assert np.isnan(found[0, 0]) and np.isfinite(found[1, 0])
+    outputs = lighter.output([q, [-0.6, -0.8]], [qd, qd], params={"m": 0.1})
+    assert np.isnan(outputs[0, 0]) and np.isfinite(outputs[1, 0])
 
 
-def test_the_c_of_both_forms_says_so_and_writes_nothing(tmp_path: Path) -> None:
-    made = eomc.sources(LIGHTER).files
+def test_c_of_both_forms_reports_it_and_writes_nothing(tmp_path: Path) -> None:
+    sources = eomc.sources(LIGHTER).files
     (tmp_path / "fast").mkdir()
     write_files(
-        {file: text for file, text in made.items() if file.endswith((".c", ".h"))}, tmp_path
+        {file: text for file, text in sources.items() if file.endswith((".c", ".h"))}, tmp_path
     )
     (tmp_path / "asked.c").write_text(PROGRAM)
-    for at in (".", "fast"):
-        built = ["cc", "-std=gnu99", "-O0", f"-I{at}", "asked.c", f"{at}/lighter.c", "-lm"]
-        subprocess.run(built, cwd=tmp_path, check=True)
-        done = subprocess.run(["./a.out"], cwd=tmp_path, check=True, capture_output=True, text=True)
-        assert done.stdout == "1 1 1 -7 -7\n"
+    for folder in (".", "fast"):
+        command = [
+            "cc",
+            "-std=gnu99",
+            "-O0",
+            f"-I{folder}",
+            "asked.c",
+            f"{folder}/lighter.c",
+            "-lm",
+        ]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        process = subprocess.run(
+            ["./a.out"], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        assert process.stdout == "1 1 1 -7 -7\n"

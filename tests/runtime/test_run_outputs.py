@@ -1,4 +1,4 @@
-"""Outputs of runs and states: by name, whatever inputs were, to the last row."""
+"""Outputs of runs and states: by name, under any inputs, including the last row."""
 
 from __future__ import annotations
 
@@ -58,17 +58,17 @@ def crane(modules: Modules) -> ModuleType:
     return modules.unoptimised(SCENE)
 
 
-def expected(crane: ModuleType, run: Any) -> dict[str, Any]:
-    """The formulas, by hand."""
+def evaluate_by_hand(crane: ModuleType, run: Any) -> dict[str, Any]:
+    """Return the outputs from hand-written formulas."""
     rows = zip(run.q, run.qd, run.t.tolist(), run.u, strict=True)
     qdd = np.array([crane.acceleration(*row) for row in rows])
     m, length, g = (crane.defaults[name] for name in "mlg")
     (x, theta), (v, w), (a, alpha) = run.q.T, run.qd.T, qdd.T
-    far, low = length * np.sin(theta), length * np.cos(theta)
-    ax, ay = a + low * alpha - far * w**2, far * alpha + low * w**2
+    dx, dy = length * np.sin(theta), length * np.cos(theta)
+    ax, ay = a + dy * alpha - dx * w**2, dx * alpha + dy * w**2
     return {
-        "tip_x": x + far,
-        "speed": np.hypot(v + low * w, far * w),
+        "tip_x": x + dx,
+        "speed": np.hypot(v + dy * w, dx * w),
         "pull": m * (np.cos(theta) * (ay + g) - np.sin(theta) * ax),
         "E": run.energy,
         "push": run.u[:, 0] * (1 + run.t),
@@ -77,27 +77,27 @@ def expected(crane: ModuleType, run: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("every", tiers([1, 7], 7))
-@pytest.mark.parametrize("given", INPUTS)
+@pytest.mark.parametrize("inputs", INPUTS)
 @pytest.mark.filterwarnings("ignore:.*Python function")
-def test_a_run_has_them_by_name(crane: ModuleType, given: str, every: int) -> None:
-    run = crane.simulate(u=INPUTS[given], every=every)
+def test_run_has_outputs_by_name(crane: ModuleType, inputs: str, every: int) -> None:
+    run = crane.simulate(u=INPUTS[inputs], every=every)
     assert list(run.outputs) == list(crane.outputs)
-    for name, values in expected(crane, run).items():
+    for name, values in evaluate_by_hand(crane, run).items():
         assert run.outputs[name].shape == run.t.shape
         assert run.outputs[name] == pytest.approx(values, rel=1e-12, abs=1e-12), name
 
 
 @pytest.mark.filterwarnings("ignore:.*Python function")
-def test_inputs_can_be_read_as_they_were_applied(crane: ModuleType) -> None:
-    at = np.minimum(7 * np.arange(16), 99)
+def test_inputs_of_a_run_are_those_applied(crane: ModuleType) -> None:
+    rows = np.minimum(7 * np.arange(16), 99)
     run = crane.simulate(u=TABLE, every=7)
-    assert np.array_equal(run.u, TABLE[at])
+    assert np.array_equal(run.u, TABLE[rows])
     run = crane.simulate(u=INPUTS["a function"], every=7)
     assert run.u[:-1, 0] == pytest.approx(np.cos(run.t[:-1]), abs=1e-15)
-    assert run.u[-1, 0] == pytest.approx(np.cos(0.99))  # over the last step
-    again = pickle.loads(pickle.dumps(run))
-    assert np.array_equal(again.u, run.u) and np.array_equal(
-        again.outputs["pull"], run.outputs["pull"]
+    assert run.u[-1, 0] == pytest.approx(np.cos(0.99))  # during the last step
+    loaded = pickle.loads(pickle.dumps(run))
+    assert np.array_equal(loaded.u, run.u) and np.array_equal(
+        loaded.outputs["pull"], run.outputs["pull"]
     )
     run = crane.simulate()
     signals = np.sin(3 * run.t) - run.qd[:, 0] / 5
@@ -106,8 +106,8 @@ def test_inputs_can_be_read_as_they_were_applied(crane: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("u", [None, [0.3], np.linspace(-1, 1, 60).reshape(3, 20, 1)])
-def test_batches_have_them_too(crane: ModuleType, u: Any) -> None:
-    length = np.array([0.7, 0.8, 0.0])  # the last has no acceleration
+def test_batch_has_outputs(crane: ModuleType, u: Any) -> None:
+    length = np.array([0.7, 0.8, 0.0])  # the last instance has no acceleration
     q0, qd0 = (np.tile(x, (3, 1)) for x in crane.start)
     runs = crane.simulate_batch(q0, qd0, steps=20, every=3, params={"l": length}, u=u)
     for k in range(2):
@@ -118,83 +118,93 @@ def test_batches_have_them_too(crane: ModuleType, u: Any) -> None:
     assert np.isnan(runs.outputs["pull"][2]).all() and np.isnan(runs["tip_x"][2, 1:]).all()
 
 
-def test_they_are_columns(crane: ModuleType, tmp_path: Path) -> None:
+def test_outputs_are_columns_of_a_run(crane: ModuleType, tmp_path: Path) -> None:
     run = crane.simulate(steps=10)
     assert np.array_equal(run["pull"], run.outputs["pull"]) and run.E is run.outputs["E"]
     assert list(run.to_dict())[-7:] == [*crane.outputs, "energy"]
     run.save(tmp_path / "run.csv")
     header, first, *_ = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()
-    found = dict(zip(header.split(","), map(float, first.split(",")), strict=True))
-    assert found["cart"] == run.outputs["cart"][0]
+    columns = dict(zip(header.split(","), map(float, first.split(",")), strict=True))
+    assert columns["cart"] == run.outputs["cart"][0]
     run.save(tmp_path / "run.npz")
-    again = crane.load_run(tmp_path / "run.npz")
-    assert np.array_equal(again.outputs["pull"], run.outputs["pull"])
+    loaded = crane.load_run(tmp_path / "run.npz")
+    assert np.array_equal(loaded.outputs["pull"], run.outputs["pull"])
 
 
-def test_a_state_and_many(crane: ModuleType) -> None:
+def test_outputs_of_one_state_and_of_many(crane: ModuleType) -> None:
     q, qd = crane.start
-    one = crane.output(q, qd, 0.3, [0.2], {"l": 0.9})
-    many = crane.output(np.array([q, 2 * q]), np.array([qd, qd]), 0.3, [0.2], {"l": 0.9})
-    assert np.array_equal(many[0], one) and not np.array_equal(many[1], one)
-    assert one[0] == pytest.approx(0.1 + 0.9 * np.sin(0.5)) and one[4] == pytest.approx(0.26)
+    single = crane.output(q, qd, 0.3, [0.2], {"l": 0.9})
+    several = crane.output(np.array([q, 2 * q]), np.array([qd, qd]), 0.3, [0.2], {"l": 0.9})
+    assert np.array_equal(several[0], single) and not np.array_equal(several[1], single)
+    assert single[0] == pytest.approx(0.1 + 0.9 * np.sin(0.5)) and single[4] == pytest.approx(0.26)
     assert crane.units["tip_x"] == "m" and crane.units["pull"] == "N"
 
 
-def test_they_are_nan_where_there_is_no_acceleration(crane: ModuleType) -> None:
-    found = dict(zip(crane.outputs, crane.output(*crane.start, 0, [0.0], {"l": 0.0}), strict=True))
-    assert np.isnan(found["pull"]) and np.isnan(found["cart"])
-    assert found["tip_x"] == pytest.approx(0.1) and found["push"] == 0
+def test_outputs_are_nan_without_acceleration(crane: ModuleType) -> None:
+    outputs = dict(
+        zip(crane.outputs, crane.output(*crane.start, 0, [0.0], {"l": 0.0}), strict=True)
+    )
+    assert np.isnan(outputs["pull"]) and np.isnan(outputs["cart"])
+    assert outputs["tip_x"] == pytest.approx(0.1) and outputs["push"] == 0
 
 
-def test_their_linearization_is_that_of_the_motion(crane: ModuleType) -> None:
+def test_linearized_outputs_equal_difference_quotients(crane: ModuleType) -> None:
     q, qd = (np.array(x) for x in crane.start)
     A, B, C, D = crane.linearize(q, qd, u=[0.4], outputs=True)
     assert C.shape == (6, 4) and D.shape == (6, 1)
     x, e = np.hstack([q, qd]), 1e-6
 
-    def slope(to: Any) -> Any:
-        return (to(e) - to(-e)) / (2 * e)
+    def difference_quotient(function: Any) -> Any:
+        return (function(e) - function(-e)) / (2 * e)
 
     for k in range(4):
-        found = slope(lambda d, k=k: crane.output(*np.split(x + d * np.eye(4)[k], 2), u=[0.4]))
-        assert C[:, k] == pytest.approx(found, abs=1e-7)
-    assert D[:, 0] == pytest.approx(slope(lambda d: crane.output(q, qd, u=[0.4 + d])), abs=1e-7)
+        expected = difference_quotient(
+            lambda d, k=k: crane.output(*np.split(x + d * np.eye(4)[k], 2), u=[0.4])
+        )
+        assert C[:, k] == pytest.approx(expected, abs=1e-7)
+    assert D[:, 0] == pytest.approx(
+        difference_quotient(lambda d: crane.output(q, qd, u=[0.4 + d])), abs=1e-7
+    )
     assert all(
         np.array_equal(a, b) for a, b in zip((A, B), crane.linearize(q, qd, u=[0.4]), strict=True)
     )
 
 
-@pytest.mark.parametrize("how", [{"outputs": "tip_x"}, {"outputs": ["E"]}, {"closed": "no"}])
-def test_a_name_is_not_taken_for_true(crane: ModuleType, how: Any) -> None:
+@pytest.mark.parametrize("options", [{"outputs": "tip_x"}, {"outputs": ["E"]}, {"closed": "no"}])
+def test_name_is_not_accepted_as_true(crane: ModuleType, options: Any) -> None:
     with pytest.raises(ValueError, match=r"(outputs|closed): .* is not True or False"):
-        crane.linearize(*crane.start, **how)
+        crane.linearize(*crane.start, **options)
 
 
-def test_a_scene_without_has_nothing_of_it(cartpole: ModuleType, crane: ModuleType) -> None:
+def test_scene_without_outputs_has_none_of_their_code(
+    cartpole: ModuleType, crane: ModuleType
+) -> None:
     assert cartpole.outputs == () and cartpole.simulate(steps=3).outputs == {}
     assert not hasattr(cartpole._model.c.lib, "outputs") and hasattr(crane._model.c.lib, "outputs")
     with pytest.raises(ValueError, match=r"name them in \[outputs\]"):
         cartpole.output(*cartpole.start)
 
 
-def test_along_a_run_each_state_has_its_own_time_inputs_and_parameters(crane: ModuleType) -> None:
+def test_states_of_a_run_have_their_own_times_inputs_and_parameters(crane: ModuleType) -> None:
     run = crane.simulate(u=TABLE)
-    at = (run.q, run.qd, run.t, run.u)
-    values = crane.output(*at)
+    states = (run.q, run.qd, run.t, run.u)
+    values = crane.output(*states)
     assert np.array_equal(values, np.column_stack([*run.outputs.values()]))
-    assert np.array_equal(crane.acceleration(*at)[:, 0], run["cart"])
-    assert np.array_equal(crane.tau(*at)[:, 0], run["F"])
-    assert np.array_equal(crane.power(*at), run["F"] * run["x_dot"])
-    assert np.array_equal(crane.applied(*at), run.u)
+    assert np.array_equal(crane.acceleration(*states)[:, 0], run["cart"])
+    assert np.array_equal(crane.tau(*states)[:, 0], run["F"])
+    assert np.array_equal(crane.power(*states), run["F"] * run["x_dot"])
+    assert np.array_equal(crane.applied(*states), run.u)
     lengths = np.linspace(0.5, 1.0, len(run))
-    each = crane.output(run.q, run.qd, run.t, {"F": run["F"]}, params={"l": lengths})
-    last = crane.output(*(x[-1] for x in at), params={"l": lengths[-1]})
-    assert np.array_equal(each[-1], last) and not np.array_equal(each[0], values[0])
+    values_by_length = crane.output(run.q, run.qd, run.t, {"F": run["F"]}, params={"l": lengths})
+    single = crane.output(*(x[-1] for x in states), params={"l": lengths[-1]})
+    assert np.array_equal(values_by_length[-1], single) and not np.array_equal(
+        values_by_length[0], values[0]
+    )
     np.testing.assert_allclose(
         crane.potential_energy(run.q, params={"l": lengths}),
         -9.81 * lengths * np.cos(run["theta"]),
         rtol=1e-15,
     )
-    assert crane.output(*(x[:0] for x in at)).shape == (0, 6)
+    assert crane.output(*(x[:0] for x in states)).shape == (0, 6)
     with pytest.raises(ValueError, match=r"u: shape \(100, 1\), expected \(101, 1\) for 101 st"):
         crane.power(run.q, run.qd, run.t, TABLE)

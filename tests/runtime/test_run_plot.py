@@ -1,4 +1,4 @@
-"""Curves of runs: which panels there are, what is in them, whose axes they are drawn in."""
+"""Plots of runs: panels, their curves, and the axes that they use."""
 
 import base64
 import dataclasses
@@ -26,7 +26,7 @@ if importlib.util.find_spec("matplotlib") is None:
 
 @pytest.fixture(autouse=True)
 def pyplot() -> Iterator[Any]:
-    """Imported by who runs these tests, not by all who collect them."""
+    """Import pyplot only when these tests run, not when they are collected."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -46,7 +46,7 @@ def labels(axes) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"),
+    ("name", "expected"),
     [
         ("shoulder_pan_joint", r"$\mathrm{shoulder\ pan\ joint}$"),
         ("wrist_1_joint", r"$\mathrm{wrist\ 1\ joint}$"),
@@ -56,29 +56,29 @@ def labels(axes) -> list[str]:
         ("rod_prime", r"$\mathrm{rod}'$"),
     ],
 )
-def test_names_of_words_are_words(name: str, shown: str) -> None:
-    assert mathtext(name) == shown
+def test_names_of_words_are_words_in_mathtext(name: str, expected: str) -> None:
+    assert mathtext(name) == expected
 
 
-def test_a_picture_is_written(run, tmp_path: Path, pyplot: Any) -> None:
-    for k, how in enumerate(({}, {"phase": "theta"}, {"phase": ("x", "theta")})):
-        run.plot("theta", file=tmp_path / f"{k}.png", **how)
+def test_picture_is_written(run, tmp_path: Path, pyplot: Any) -> None:
+    for k, options in enumerate(({}, {"phase": "theta"}, {"phase": ("x", "theta")})):
+        run.plot("theta", file=tmp_path / f"{k}.png", **options)
         assert pyplot.imread(tmp_path / f"{k}.png").shape[1] >= 600
     with pytest.raises(ValueError, match=r"'p\.png' is no column: give file='p\.png'"):
         run.plot("p.png")
 
 
-def test_inputs_that_are_held_are_drawn_as_stairs(run, driven: ModuleType) -> None:
-    (held,), (followed,) = (
+def test_constant_inputs_are_drawn_as_steps(run, driven: ModuleType) -> None:
+    (constant,), (signal,) = (
         r.plot("force").get_lines() for r in (run, driven.simulate(duration=2.0))
     )
-    assert held.get_drawstyle() == "steps-post" and followed.get_drawstyle() == "default"
+    assert constant.get_drawstyle() == "steps-post" and signal.get_drawstyle() == "default"
 
 
-def test_without_names_coordinates_inputs_and_energy_have_panels(run) -> None:
+def test_default_panels_are_coordinates_inputs_and_energy(run) -> None:
     axes = run.plot()
-    wanted = ["$x$ (m)", r"$\theta$ (rad)", r"$\mathrm{force}$ (N)", "energy (J)"]
-    assert labels(axes) == wanted and axes[-1].get_xlabel() == "$t$ (s)"
+    expected = ["$x$ (m)", r"$\theta$ (rad)", r"$\mathrm{force}$ (N)", "energy (J)"]
+    assert labels(axes) == expected and axes[-1].get_xlabel() == "$t$ (s)"
     assert [a.get_xlabel() for a in axes[:-1]] == [""] * 3
     for a, name in zip(axes, ("x", "theta", "force", "energy"), strict=True):
         (line,) = a.get_lines()
@@ -86,7 +86,7 @@ def test_without_names_coordinates_inputs_and_energy_have_panels(run) -> None:
         assert np.array_equal(line.get_ydata(), run[name])
 
 
-def test_outputs_and_rates_by_name(everything: ModuleType) -> None:
+def test_outputs_and_velocities_are_plotted_by_name(everything: ModuleType) -> None:
     run = everything.simulate(duration=0.2)
     axes = run.plot("tip", "theta_dot", "pull")
     assert labels(axes) == [r"$\mathrm{tip}$ (m)", r"$\dot{\theta}$ (rad/s)", r"$\mathrm{pull}$"]
@@ -95,45 +95,45 @@ def test_outputs_and_rates_by_name(everything: ModuleType) -> None:
         run.plot("tipp")
 
 
-def test_phase_portraits_stand_beside_the_curves(run) -> None:
+def test_phase_portraits_follow_the_curves(run) -> None:
     axes = run.plot("theta", phase=["theta", ("x", "theta")])
     assert len(axes) == 3
     assert np.array_equal(axes[1].get_lines()[0].get_xydata().T, [run.theta, run.theta_dot])
     assert (axes[2].get_xlabel(), axes[2].get_ylabel()) == ("$x$ (m)", r"$\theta$ (rad)")
-    alone = run.plot(phase="theta")
-    assert np.array_equal(alone.get_lines()[0].get_ydata(), run.theta_dot)
+    single = run.plot(phase="theta")
+    assert np.array_equal(single.get_lines()[0].get_ydata(), run.theta_dot)
     with pytest.raises(ValueError, match="'force' is no coordinate"):
         run.plot(phase="force")
 
 
-def test_axes_can_be_given_and_are_returned(run, pyplot: Any) -> None:
-    _, mine = pyplot.subplots(2)
-    assert all(a is b for a, b in zip(run.plot("x", "theta", axes=mine), mine, strict=True))
-    assert run.plot("x", "theta", ax=mine[0], color="red", linewidth=3) is mine[0]
-    assert [a.get_color() for a in mine[0].get_lines()[1:]] == ["red", "red"]
-    before = len(pyplot.get_fignums())
+def test_axes_can_be_passed_and_are_returned(run, pyplot: Any) -> None:
+    _, own_axes = pyplot.subplots(2)
+    assert all(a is b for a, b in zip(run.plot("x", "theta", axes=own_axes), own_axes, strict=True))
+    assert run.plot("x", "theta", ax=own_axes[0], color="red", linewidth=3) is own_axes[0]
+    assert [a.get_color() for a in own_axes[0].get_lines()[1:]] == ["red", "red"]
+    initial_count = len(pyplot.get_fignums())
     with pytest.raises(ValueError, match="axes: 2 for 4 panels"):
-        run.plot(axes=mine)
+        run.plot(axes=own_axes)
     with pytest.raises(ValueError, match="give one of them"):
-        run.plot("x", ax=mine[0], axes=mine)
-    assert len(pyplot.get_fignums()) == before
+        run.plot("x", ax=own_axes[0], axes=own_axes)
+    assert len(pyplot.get_fignums()) == initial_count
 
 
-def test_the_style_is_the_users(run, pyplot: Any) -> None:
+def test_style_is_that_of_the_user(run, pyplot: Any) -> None:
     with pyplot.rc_context({"lines.linewidth": 4.5, "axes.prop_cycle": pyplot.cycler(color=["k"])}):
         (line,) = run.plot("x").get_lines()
     assert line.get_linewidth() == 4.5 and line.get_color() == "k"
 
 
-def test_runs_are_compared_in_colours_of_their_names(driven: ModuleType, run) -> None:
+def test_compared_runs_share_the_colours_of_their_columns(driven: ModuleType, run) -> None:
     other = driven.simulate(duration=1.0, u=lambda t, q, qd: [-q[0]], control_period=0.05)
     axes = run.plot("x", "force", other=other, labels=["held", "law_1"])
     for a, name in zip(axes, ("x", "force"), strict=True):
         first, second = a.get_lines()
         assert np.array_equal(second.get_ydata(), other[name])
         assert first.get_color() == second.get_color() and second.get_linestyle() == "--"
-        said = [text.get_text() for text in a.get_legend().get_texts()]
-        assert said == [f"{mathtext(name)}, held", f"{mathtext(name)}, law_1"]
+        texts = [text.get_text() for text in a.get_legend().get_texts()]
+        assert texts == [f"{mathtext(name)}, held", f"{mathtext(name)}, law_1"]
     with pytest.raises(ValueError, match="labels: give 2"):
         run.plot("x", other=[other], labels=["one"])
 
@@ -142,17 +142,17 @@ def test_wrapped_angles_have_breaks_and_no_jumps(modules: Modules) -> None:
     run = modules("simple_pendulum").simulate(qd0=[9.0], duration=5.0)
     assert run.theta[-1] > 8
     (line,) = run.plot("theta", wrap=True).get_lines()
-    drawn = line.get_ydata()
-    assert np.nanmax(np.abs(drawn)) <= np.pi
-    assert np.isnan(drawn).sum() == np.sum(np.diff(np.floor((run.theta + np.pi) / (2 * np.pi))))
-    assert np.nanmax(np.abs(np.diff(drawn))) < 0.1
+    plotted = line.get_ydata()
+    assert np.nanmax(np.abs(plotted)) <= np.pi
+    assert np.isnan(plotted).sum() == np.sum(np.diff(np.floor((run.theta + np.pi) / (2 * np.pi))))
+    assert np.nanmax(np.abs(np.diff(plotted))) < 0.1
     portrait = run.plot(phase="theta", wrap="theta").get_lines()[0].get_xdata()
-    assert np.isnan(portrait).sum() == np.isnan(drawn).sum()
+    assert np.isnan(portrait).sum() == np.isnan(plotted).sum()
     with pytest.raises(KeyError, match="'thetta'"):
         run.plot("theta", wrap=["thetta"])
 
 
-WRONG: list[tuple[dict[str, Any], str]] = [
+INVALID_OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"period": 0}, "period: 0 is not a period: give a number greater than 0"),
     ({"period": -1.0}, "period: -1 is not a period"),
     ({"period": np.nan}, "period: nan is not a finite number"),
@@ -163,28 +163,28 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_sections_are_exact_to_the_fourth_power_of_the_rows(modules: Modules) -> None:
-    """x = cos(t/2) falls through 1/2 at 2 pi/3, and 4 pi later."""
+def test_sections_are_accurate_to_fourth_order_in_the_row_interval(modules: Modules) -> None:
+    """x = cos(t/2) falls through 1/2 at 2 pi/3 and 4 pi later."""
     spring = modules("mass_spring")
     params = {"m": 4.0, "k": 1.0}
     for every in (1, 50, 100, 200):
         run = spring.simulate([1.0], [0.0], h=0.002, duration=20.0, every=every, params=params)
-        found = run.section("x", 0.5, rising=False)
-        assert np.allclose(found["x"], 0.5, atol=1e-12)
+        section = run.section("x", 0.5, rising=False)
+        assert np.allclose(section["x"], 0.5, atol=1e-12)
         speed = np.sqrt(0.75) / 2
-        # of the cubic between its middle nodes, the fourth derivative of x below 0.6/16
+        # error of the cubic between its middle nodes; the fourth derivative of x is below 0.6/16
         bound = 0.5625 / 24 * 0.6 / 16 * (every * 0.002) ** 4
-        error = abs(found["t"] - (2 * np.pi / 3 + 4 * np.pi * np.arange(2)))
+        error = abs(section["t"] - (2 * np.pi / 3 + 4 * np.pi * np.arange(2)))
         assert (error < bound / speed + 1e-11).all()
-        assert np.allclose(found["x_dot"], -speed, atol=bound + 1e-11)
+        assert np.allclose(section["x_dot"], -speed, atol=bound + 1e-11)
     assert len(run.section("x")["t"]) == 3 and len(run.section("x", rising=True)["t"]) == 1
     assert np.allclose(run.section("t", 1.0, period=4.0)["t"], [1, 5, 9, 13, 17])
     assert np.allclose(run.section("x", 0.5)["x"], 0.5) and not len(run.section("x", 2.0)["t"])
     with pytest.raises(ValueError, match="3 rows, where a cubic needs 4"):
         spring.simulate(steps=2).section("x")
-    for given, words in WRONG:
-        with pytest.raises(ValueError, match=words):
-            run.section("x", **given)
+    for options, message in INVALID_OPTIONS:
+        with pytest.raises(ValueError, match=message):
+            run.section("x", **options)
     points = run.plot(phase="x", section=run.section("t", period=4.0)).get_lines()[0]
     assert points.get_linestyle() == "None" and len(points.get_xdata()) == 5
 
@@ -215,7 +215,9 @@ def test_rates_of_words_and_of_units() -> None:
     assert [rate_unit(u, True) for u in ("m", "", "N m")] == ["m/s", "", "(N m)/s"]
 
 
-def test_batches_are_fans_lines_or_ends(modules: Modules, tmp_path: Path, pyplot: Any) -> None:
+def test_batches_are_drawn_as_fans_lines_or_ends(
+    modules: Modules, tmp_path: Path, pyplot: Any
+) -> None:
     module = modules.unoptimised(BATCH)
     masses = np.linspace(1, 2, 21)
     runs = module.simulate_batch(np.full((21, 1), 1.0), params={"m": masses}, steps=40)
@@ -240,11 +242,11 @@ def test_batches_are_fans_lines_or_ends(modules: Modules, tmp_path: Path, pyplot
     assert pyplot.imread(tmp_path / "many.png").shape[1] >= 600
     with pytest.raises(ValueError, match=r"'p\.pdf' is no column: give file='p\.pdf'"):
         runs.plot("p.pdf")
-    way = r" is of one run: many\.simulate\(runs\.q\[k, 0\], runs\.qd\[k, 0\], params=\.\.\.\)\."
-    with pytest.raises(TypeError, match=rf"plot: phase={way}plot\(phase=\.\.\.\)"):
+    advice = r" is of one run: many\.simulate\(runs\.q\[k, 0\], runs\.qd\[k, 0\], params=\.\.\.\)\."
+    with pytest.raises(TypeError, match=rf"plot: phase={advice}plot\(phase=\.\.\.\)"):
         runs.plot(phase="x")
     for name in ("estimate", "balance", "section", "error"):
-        with pytest.raises(AttributeError, match=f"{name}{way}[bes]"):
+        with pytest.raises(AttributeError, match=f"{name}{advice}[bes]"):
             getattr(runs, name)
 
 
@@ -265,7 +267,7 @@ batch = true
 """
 
 
-def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Modules) -> None:
+def test_end_values_of_stopped_instances_are_their_last_valid_rows(modules: Modules) -> None:
     runs = modules.unoptimised(BATCH).simulate_batch(np.ones((2, 1)), steps=10)
     runs.q[1, 4:] = np.nan
     y = runs.plot("x", over="instance").get_lines()[0].get_ydata()
@@ -273,9 +275,7 @@ def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Module
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_the_end_the_verdict_and_a_picture(
-    driven: ModuleType, pyplot: Any
-) -> None:
+def test_notebook_shows_end_verdict_and_picture(driven: ModuleType, pyplot: Any) -> None:
     run = driven.simulate(duration=0.5)
     page = run._repr_html_()
     assert "status: ok" in page and f"{run.q[-1, 1]:.9g} rad" in page
@@ -296,25 +296,28 @@ def image(page: str) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_the_mechanism_where_there_is_one(modules: Modules, monkeypatch) -> None:
+def test_notebook_shows_the_mechanism_if_there_is_one(modules: Modules, monkeypatch) -> None:
     run = modules("cartpole").simulate(duration=0.5)
     page = run._repr_html_()
     assert 'alt="over time: x, theta; and the mechanism"' in page
-    with_it = image(page)
-    right = with_it[:, with_it.shape[1] // 2 :, :3]
-    grey = np.abs(right - 0.3).max(axis=2) < 0.05  # the cart and the pole
+    complete = image(page)
+    mechanism = complete[:, complete.shape[1] // 2 :, :3]
+    grey = np.abs(mechanism - 0.3).max(axis=2) < 0.05  # the cart and the pole
     assert grey.sum() > 100
     monkeypatch.setattr(run.model, "source", None)
-    alone = run._repr_html_()
-    assert 'alt="over time: x, theta"' in alone and image(alone).shape[1] < with_it.shape[1]
+    curves_only = run._repr_html_()
+    assert (
+        'alt="over time: x, theta"' in curves_only
+        and image(curves_only).shape[1] < complete.shape[1]
+    )
 
 
-def test_a_notebook_shows_curves_alone_of_what_says_nothing_of_its_shape(modules: Modules) -> None:
+def test_notebook_shows_only_curves_of_scenes_without_a_picture(modules: Modules) -> None:
     page = modules.unoptimised(BATCH).simulate(duration=0.5)._repr_html_()
     assert 'alt="over time: x"' in page
 
 
-def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> None:
+def test_notebook_escapes_free_text(modules: Modules, monkeypatch) -> None:
     run = modules("mass_spring").simulate(steps=5)
     model = run.model
     info = replace(model.info, title="<script>$x$\x1b", units={"x": '"><b>'})
@@ -324,8 +327,8 @@ def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> No
     assert "&quot;&gt;&lt;b&gt;" in page
 
 
-def test_without_matplotlib_an_error_names_the_remedy(modules: Modules) -> None:
-    """In a process of its own: matplotlib can't be forgotten."""
+def test_missing_matplotlib_is_reported_with_advice(modules: Modules) -> None:
+    """Run in a separate process: matplotlib cannot be unloaded."""
     folder = modules("mass_spring").__path__[0]
     code = """
 import importlib.abc, sys
@@ -342,6 +345,8 @@ try:
 except ModuleNotFoundError as fault:
     print(fault)
 """
-    at = Path(folder).parent
-    done = subprocess.run([sys.executable, "-c", code], cwd=at, capture_output=True, text=True)
-    assert "plot: matplotlib is not installed: pip install matplotlib" in done.stdout, done.stderr
+    path = Path(folder).parent
+    process = subprocess.run([sys.executable, "-c", code], cwd=path, capture_output=True, text=True)
+    assert "plot: matplotlib is not installed: pip install matplotlib" in process.stdout, (
+        process.stderr
+    )

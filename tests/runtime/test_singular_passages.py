@@ -1,7 +1,7 @@
-"""IFToMM's four-bar A02 lies flat twice a turn; adaptive steps and gauss16 go through.
+"""Passage through singular positions: IFToMM's four-bar A02 lies flat twice a turn.
 
-There rows depend on one another: what errors of velocities make of accelerations grows without end
-towards it, and sweeps find no stages but where these are moved onto the constraints.
+There the constraints are dependent: towards it, velocity errors grow without bound in the
+accelerations, and fixed-point iteration converges only if stages are projected onto constraints.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from eomc.scene.read import parse
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 N1, N2 = "iftomm_A02_four_bar_N1", "iftomm_A02_four_bar_N2"
 
-# Sarrus' linkage: two chains of hinges, across one another, that lift a plate; it folds flat
+# Sarrus' linkage: two crossed chains of hinges that lift a plate; it folds flat
 SARRUS = """
 eomc = 1
 name = "sarrus"
@@ -58,27 +58,25 @@ BARS = (  # name, coordinate, parent, offset, axis, centre of mass
 def case(
     request: pytest.FixtureRequest, modules: Modules, unoptimised_file: None
 ) -> tuple[str, ModuleType]:
-    """Its name, and the module of a form."""
+    """Return the case's name and its module in one form of C."""
     name, form = request.param.split()
-    made = system(name)
-    made = replace(made, run=replace(made.run, methods=("rk4", "gauss16"), tolerance=1e-9))
+    linkage = system(name)
+    linkage = replace(linkage, run=replace(linkage.run, methods=("rk4", "gauss16"), tolerance=1e-9))
     if form == "fast":
-        return name, modules.unoptimised(made)
-    return name, eomc.load(made, MODULES.parent / "passages", form="plain")
+        return name, modules.unoptimised(linkage)
+    return name, eomc.load(linkage, MODULES.parent / "passages", form="plain")
 
 
 @pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9, 1e-11, 1e-12])
-def test_steps_that_fit_a_tolerance_end_where_the_reference_does(
-    case: tuple[str, ModuleType], tol: float
-) -> None:
+def test_adaptive_steps_end_at_the_reference(case: tuple[str, ModuleType], tol: float) -> None:
     name, module = case
     run = module.simulate(tol=tol)
     assert run.status == "ok" and run.steps < 120
     assert error_of(name, run.q[-1]) < 10 * tol
 
 
-def test_they_get_through_from_anywhere(case: tuple[str, ModuleType]) -> None:
-    """However near to a stage or a step's end the flat position is met."""
+def test_passage_succeeds_from_any_speed(case: tuple[str, ModuleType]) -> None:
+    """However close the flat position is to a stage or to the end of a step."""
     _, module = case
     q, qd = module.start
     for part in np.random.default_rng(0).uniform(0.7, 1.3, 60):
@@ -86,23 +84,23 @@ def test_they_get_through_from_anywhere(case: tuple[str, ModuleType]) -> None:
         assert run.status == "ok" and np.ptp(run.energy) < 3e-8
 
 
-def test_states_between_are_as_exact(case: tuple[str, ModuleType]) -> None:
+def test_interpolated_states_are_as_accurate(case: tuple[str, ModuleType]) -> None:
     _, module = case
-    run, other = module.simulate(tol=1e-8), module.simulate(tol=1e-11)
+    run, fine = module.simulate(tol=1e-8), module.simulate(tol=1e-11)
     times = np.linspace(0, run.t[-1], 400)
-    for a, b in zip(run(times), other(times), strict=True):
+    for a, b in zip(run(times), fine(times), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
-def test_fifty_steps_of_gauss16_do(case: tuple[str, ModuleType]) -> None:
+def test_fifty_steps_of_gauss16_pass(case: tuple[str, ModuleType]) -> None:
     name, module = case
     run = module.simulate(method="gauss16", h=0.2, duration=10.0)
     assert run.status == "ok"
     assert error_of(name, run.q[-1]) < 1e-7
 
 
-def test_their_error_is_found(case: tuple[str, ModuleType]) -> None:
-    """The run beside it takes shorter steps, and where these find nothing its own."""
+def test_error_is_estimated_across_singular_positions(case: tuple[str, ModuleType]) -> None:
+    """The comparison run takes shorter steps; where these fail, it takes the run's own steps."""
     name, module = case
     run = module.simulate(tol=1e-8)
     error = run.estimate()
@@ -111,7 +109,7 @@ def test_their_error_is_found(case: tuple[str, ModuleType]) -> None:
 
 @pytest.mark.slow
 def test_sarrus_linkage_folds(modules: Modules) -> None:
-    """Its end by RK4, which meets the flat position nowhere; its energy."""
+    """Compare its end with RK4, whose steps miss the flat position, and check the energy."""
     text = SARRUS
     for name, coordinate, parent, *places in BARS:
         text += f'[[body]]\nname = "{name}"\njoint = "revolute"\ncoordinates = "{coordinate}"\n'
@@ -120,10 +118,13 @@ def test_sarrus_linkage_folds(modules: Modules) -> None:
             text += f"{key} = {list(place)}\n"
         text += "mass = 1.0\ninertia = [0.05, 0.05, 0.08]\n"
     module = modules.unoptimised(from_scene(parse(text)))
-    right = module.simulate(method="rk4", h=2.5e-4, duration=1.0)
-    assert right.status == "ok" and np.sin(right["a"]).max() > 0.1 > -0.1 > np.sin(right["a"]).min()
+    expected = module.simulate(method="rk4", h=2.5e-4, duration=1.0)
+    assert (
+        expected.status == "ok"
+        and np.sin(expected["a"]).max() > 0.1 > -0.1 > np.sin(expected["a"]).min()
+    )
     for tol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
         run = module.simulate(tol=tol)
         assert run.status == "ok" and run.steps < 60
-        np.testing.assert_allclose(run.q[-1], right.q[-1], rtol=0, atol=1e-7 + 10 * tol)
+        np.testing.assert_allclose(run.q[-1], expected.q[-1], rtol=0, atol=1e-7 + 10 * tol)
         assert np.ptp(run.energy) < 1e-9 + 10 * tol * run.energy[0]

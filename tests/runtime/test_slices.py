@@ -1,4 +1,4 @@
-"""Ctrl-C is answered soon wherever C works long, and arrays are read wherever they lie."""
+"""Ctrl-C is handled soon in long calls of C; arrays of any alignment are read."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 
-MANY = 10_000_000  # rows
+N_ROWS = 10_000_000  # rows
 STIFF = 'method = "gauss8"\n'
 
 
-def loaded(name: str, run: str = "", repeat: int = 0) -> ModuleType:
-    """A scene with more under [run], in so many links."""
+def load_scene(name: str, run: str = "", repeat: int = 0) -> ModuleType:
+    """Load a scene with more under [run] and `repeat` links."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8").replace("[run]\n", "[run]\n" + run)
     if repeat:
         text = text.replace("n = { value = 5,", f"n = {{ value = {repeat},")
@@ -35,67 +35,67 @@ def loaded(name: str, run: str = "", repeat: int = 0) -> ModuleType:
 
 @pytest.fixture(scope="session")
 def batch() -> ModuleType:
-    return loaded("cartpole", "batch = true\n")
+    return load_scene("cartpole", "batch = true\n")
 
 
-def soon(work: Callable[[], Any], *, before: float = 0.4, after: float = 0.3) -> BaseException:
-    """What Ctrl-C raises in work that takes longer; it has to come soon after."""
-    with pytest.raises(KeyboardInterrupt) as stop, ctrl_c_after(before):
-        begun = time.perf_counter()
+def interrupt(work: Callable[[], Any], *, delay: float = 0.4, limit: float = 0.3) -> BaseException:
+    """Return the exception that Ctrl-C raises in `work`; it must come within `limit` seconds."""
+    with pytest.raises(KeyboardInterrupt) as interruption, ctrl_c_after(delay):
+        start = time.perf_counter()
         work()
-    late = time.perf_counter() - begun - before
-    assert late < after, f"{late:.2f} s"
-    return stop.value
+    latency = time.perf_counter() - start - delay
+    assert latency < limit, f"{latency:.2f} s"
+    return interruption.value
 
 
 # --- Ctrl-C ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_a_batch_of_one_after_a_quick_one(batch: ModuleType) -> None:
-    """A large batch takes some ns a step of an instance; one alone as long as eight."""
+def test_ctrl_c_in_a_batch_of_one_after_a_fast_one(batch: ModuleType) -> None:
+    """An instance of a large batch takes some ns per step; a single one as long as eight."""
     q0 = np.tile(batch.start[0], (4096, 1))
     batch.simulate_batch(q0, steps=2000, every=2000)
-    stop: Any = soon(
-        lambda: batch.simulate_batch(q0[:1], steps=10**9, every=10**8), before=0.1, after=0.25
+    interruption: Any = interrupt(
+        lambda: batch.simulate_batch(q0[:1], steps=10**9, every=10**8), delay=0.1, limit=0.25
     )
-    run = stop.run
+    run = interruption.run
     assert run.status[0] == "interrupted" and 0 < run.steps[0] < 10**9
     steps = int(run.steps[0])
-    # rows whose steps were not all done are nan, the others are those of the whole run
-    done = steps // 10**8
-    assert np.isnan(run.q[0, done + 1 :]).all()
-    again = batch.simulate_batch(q0[:1], steps=1 + done * 10**8, every=10**8)
-    assert np.array_equal(run.q[0, : done + 1], again.q[0, : done + 1])
+    # rows whose steps were not completed are NaN, the others equal those of the full run
+    n_rows = steps // 10**8
+    assert np.isnan(run.q[0, n_rows + 1 :]).all()
+    expected = batch.simulate_batch(q0[:1], steps=1 + n_rows * 10**8, every=10**8)
+    assert np.array_equal(run.q[0, : n_rows + 1], expected.q[0, : n_rows + 1])
 
 
 @pytest.mark.slow
 def test_ctrl_c_in_a_batch_whose_angles_become_wide(batch: ModuleType) -> None:
-    """An instance that vectors can't serve is many times slower."""
+    """Angles too wide for vector code make an instance many times slower."""
     q0 = np.tile(batch.start[0], (512, 1))
     batch.simulate_batch(q0, steps=5000, every=5000)
     q0[:, 1] = 1e9
-    soon(lambda: batch.simulate_batch(q0, steps=10**8, every=10**8, threads=1))
+    interrupt(lambda: batch.simulate_batch(q0, steps=10**8, every=10**8, threads=1))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["D", "energy", "acceleration", "bias", "C"])
 def test_ctrl_c_in_a_function_of_many_rows(name: str, batch: ModuleType) -> None:
-    q = np.zeros((MANY, 2))
-    out = np.empty((MANY, *np.shape(getattr(batch, name)(*(q[0],) * (1 if name == "D" else 2)))))
-    place = (q,) if name == "D" else (q, q)
+    q = np.zeros((N_ROWS, 2))
+    out = np.empty((N_ROWS, *np.shape(getattr(batch, name)(*(q[0],) * (1 if name == "D" else 2)))))
+    state = (q,) if name == "D" else (q, q)
 
     def work() -> None:
         for _ in range(50):
-            getattr(batch, name)(*place, out=out)
+            getattr(batch, name)(*state, out=out)
 
-    soon(work)
+    interrupt(work)
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_one_call_for_long_rows() -> None:
-    """Rows of a chain of twenty, tens of microseconds each."""
-    m = loaded("chain", repeat=20)
+def test_ctrl_c_in_one_call_for_expensive_rows() -> None:
+    """Rows of a chain of twenty links, tens of microseconds each."""
+    m = load_scene("chain", repeat=20)
     rows = np.tile(m.start[0], (80_000, 1))
     out = np.empty((80_000, 20, 20))
 
@@ -103,47 +103,49 @@ def test_ctrl_c_in_one_call_for_long_rows() -> None:
         for _ in range(50):
             m.C(rows, rows, out=out)
 
-    soon(work, before=0.1)
+    interrupt(work, delay=0.1)
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_an_implicit_method_and_in_its_estimate() -> None:
-    """A step of gauss8 of a chain of twenty may take milliseconds."""
-    m = loaded("chain", STIFF, repeat=20)
-    stop: Any = soon(
+def test_ctrl_c_in_an_implicit_method_and_in_its_error_estimate() -> None:
+    """A step of gauss8 of a chain of twenty links may take milliseconds."""
+    m = load_scene("chain", STIFF, repeat=20)
+    interruption: Any = interrupt(
         lambda: m.simulate(h=0.01, steps=10**7, every=10**5, params={"b": 5.0}),
-        before=0.05, after=0.2,
+        delay=0.05, limit=0.2,
     )  # fmt: skip
-    assert stop.run.steps > 0
+    assert interruption.run.steps > 0
     run = m.simulate(h=0.005, steps=800, params={"b": 5.0})
-    soon(lambda: run.estimate(), before=0.05)
+    interrupt(lambda: run.estimate(), delay=0.05)
 
 
 # --- slices change nothing ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["D", "C", "g", "bias", "energy", "potential_energy", "tau"])
-def test_rows_in_slices_are_rows(
+def test_slices_give_the_values_of_single_rows(
     name: str, driven: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(3)
     q, qd = rng.standard_normal((2, 5003, 2))
-    place = (q,) if name in ("D", "g", "potential_energy") else (q, qd)
-    how = {"u": [0.3]} if name == "tau" else {}
-    whole = getattr(driven, name)(*place, t=0.2, **how)
-    rows = [getattr(driven, name)(*(x[k] for x in place), t=0.2, **how) for k in range(0, 5003, 7)]
-    assert np.array_equal(whole[::7], rows)
+    state = (q,) if name in ("D", "g", "potential_energy") else (q, qd)
+    options = {"u": [0.3]} if name == "tau" else {}
+    all_rows = getattr(driven, name)(*state, t=0.2, **options)
+    rows = [
+        getattr(driven, name)(*(x[k] for x in state), t=0.2, **options) for k in range(0, 5003, 7)
+    ]
+    assert np.array_equal(all_rows[::7], rows)
     monkeypatch.setattr(sys.modules[f"{driven.__name__}._runtime.functions"], "_ROWS", 100)
-    assert np.array_equal(getattr(driven, name)(*place, t=0.2, **how), whole)
+    assert np.array_equal(getattr(driven, name)(*state, t=0.2, **options), all_rows)
 
 
-def test_accelerations_in_slices_are_rows_and_name_the_bad_one(
+def test_accelerations_in_slices_equal_single_ones_and_name_the_invalid_row(
     cartpole: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     q, qd = np.random.default_rng(3).standard_normal((2, 5003, 2))
-    whole = cartpole.acceleration(q, qd)
+    all_rows = cartpole.acceleration(q, qd)
     monkeypatch.setattr(sys.modules[f"{cartpole.__name__}._runtime.functions"], "_ROWS", 100)
-    assert np.array_equal(cartpole.acceleration(q, qd), whole)
+    assert np.array_equal(cartpole.acceleration(q, qd), all_rows)
     qd[3777] = [0, 1.25e200]
     with pytest.raises(cartpole.MotionError, match=r"1\.25e\+200"):
         cartpole.acceleration(q, qd)
@@ -152,14 +154,14 @@ def test_accelerations_in_slices_are_rows_and_name_the_bad_one(
 # --- arrays that are not aligned ------------------------------------------------------------------
 
 
-def crooked(array: Any) -> Any:
-    """The same numbers at an odd address, C-contiguous."""
+def unaligned(array: Any) -> Any:
+    """Return the same numbers at an odd address, C-contiguous."""
     array = np.asarray(array, float)
     memory = bytearray(array.nbytes + 1)
-    other = np.frombuffer(memory, offset=1, dtype=float, count=array.size).reshape(array.shape)
-    other[...] = array
-    assert other.flags.c_contiguous and not other.flags.aligned
-    return other
+    copy = np.frombuffer(memory, offset=1, dtype=float, count=array.size).reshape(array.shape)
+    copy[...] = array
+    assert copy.flags.c_contiguous and not copy.flags.aligned
+    return copy
 
 
 ENTRIES = """
@@ -167,7 +169,7 @@ import sys
 import numpy as np
 import eomc
 sys.path[:0] = {tests!r}
-from test_slices import crooked
+from test_slices import unaligned
 m = eomc.load({scene!r}, {root!r})
 
 rng = np.random.default_rng(1)
@@ -205,19 +207,19 @@ def calls(f, g, G):
             m.step_batch(G, f(QD), params=table, u=f(u), out=to)
             yield to
 
-for name, bad in (("crooked", (crooked, crooked(q), crooked(Q))),
-                  ("record", (crooked, record[0]["q"], record[0]["Q"]))):
+for name, bad in (("unaligned", (unaligned, unaligned(q), unaligned(Q))),
+                  ("record", (unaligned, record[0]["q"], record[0]["Q"]))):
     for good, other in zip(calls(np.array, q, Q), calls(*bad), strict=True):
         for a, b in zip(good, other, strict=True):
             assert np.array_equal(a, b), name
 
 wrong = [
-    ("out: .*aligned", lambda: m.D(q, out=crooked(np.zeros((n, n))))),
-    ("out.0.: .*aligned", lambda: m.step(q, qd, out=(crooked(q), crooked(q)))),
-    ("out.0.: .*aligned", lambda: m.simulate(q, qd, steps=0, out=(crooked([q]), crooked([q])))),
+    ("out: .*aligned", lambda: m.D(q, out=unaligned(np.zeros((n, n))))),
+    ("out.0.: .*aligned", lambda: m.step(q, qd, out=(unaligned(q), unaligned(q)))),
+    ("out.0.: .*aligned", lambda: m.simulate(q, qd, steps=0, out=(unaligned([q]), unaligned([q])))),
 ]
 if hasattr(m, "simulate_batch"):
-    wrong.append(("q: .*not aligned", lambda: m.step_batch(crooked(Q), QD)))
+    wrong.append(("q: .*not aligned", lambda: m.step_batch(unaligned(Q), QD)))
 import re
 for words, call in wrong:
     try:
@@ -230,10 +232,10 @@ for words, call in wrong:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["cartpole_driven", "chain of 40"])
-def test_arrays_that_are_not_aligned(what: str, tmp_path: Path) -> None:
-    """In C that stops where a number is read from an odd address."""
-    name = what.split()[0]
+@pytest.mark.parametrize("case", ["cartpole_driven", "chain of 40"])
+def test_unaligned_arrays_are_read(case: str, tmp_path: Path) -> None:
+    """The C code is compiled to trap when a number is read from an odd address."""
+    name = case.split()[0]
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     if name == "chain":
         text = text.replace("n = { value = 5,", "n = { value = 40,")
@@ -244,9 +246,9 @@ def test_arrays_that_are_not_aligned(what: str, tmp_path: Path) -> None:
         tests=[str(p) for p in Path(__file__).parents[:2]], root=str(tmp_path),
         scene=str(tmp_path / "scene.toml"), nq=2 if name != "chain" else 40,
     )  # fmt: skip
-    checked = "-fsanitize=alignment -fsanitize-undefined-trap-on-error"
-    done = subprocess.run(
+    sanitizer = "-fsanitize=alignment -fsanitize-undefined-trap-on-error"
+    process = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True,
-        env={**os.environ, "CC": f"gcc {checked}", "EOMC_CFLAGS": "-O1"},
+        env={**os.environ, "CC": f"gcc {sanitizer}", "EOMC_CFLAGS": "-O1"},
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr or f"ended by signal {-done.returncode}"
+    assert process.returncode == 0, process.stderr or f"ended by signal {-process.returncode}"

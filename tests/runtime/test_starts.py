@@ -1,4 +1,4 @@
-"""Where runs start: by formulas of the parameters that they are given, and by name."""
+"""Initial states: formulas of the parameters passed to a run, and values by name."""
 
 from __future__ import annotations
 
@@ -60,79 +60,87 @@ def scene() -> Scene:
     return parse(TEXT, "hangs.toml")
 
 
-@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
-def test_a_run_starts_where_its_parameters_say(hangs: ModuleType, scene: Scene, how: dict) -> None:
+@pytest.mark.parametrize("options", [{}, {"h": 0.01}])
+def test_run_starts_at_the_values_of_its_parameters(
+    hangs: ModuleType, scene: Scene, options: dict
+) -> None:
     for params in ({"k": 60.0}, {"v": -3.0, "l0": 2.0}, {"m": 2.0, "load": 3.0}, {}):
-        given = {k: x for k, x in params.items() if k != "load"}  # which a jump sets: it is in q0
+        constants = {k: x for k, x in params.items() if k != "load"}  # a jump sets it: it is in q0
         q, qd = scene.start(params)
-        for values in (given, hangs.Params(**given)):
-            run = hangs.simulate(params=values, **how)
+        for values in (constants, hangs.Params(**constants)):
+            run = hangs.simulate(params=values, **options)
             np.testing.assert_allclose(run.q[0, :3], q, rtol=1e-15)
             np.testing.assert_allclose(run.qd[0, :3], qd, rtol=1e-15)
     start = [0.1, 0.2, 0.3, 2]
-    run = hangs.simulate(start, params={"k": 60.0, "v": 1.0}, **how)
+    run = hangs.simulate(start, params={"k": 60.0, "v": 1.0}, **options)
     assert run.q[0].tolist() == start and run.qd[0, 0] == scene.start({"v": 1.0})[1][0]
 
 
-@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
-def test_each_of_a_batch_starts_where_its_own_say(
-    hangs: ModuleType, scene: Scene, how: dict
+@pytest.mark.parametrize("options", [{}, {"h": 0.01}])
+def test_each_instance_starts_at_the_values_of_its_parameters(
+    hangs: ModuleType, scene: Scene, options: dict
 ) -> None:
-    runs = hangs.simulate_batch(params=MANY, **how)
+    runs = hangs.simulate_batch(params=MANY, **options)
     for k in range(3):
         q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
         np.testing.assert_allclose(runs.q[k, 0, :3], q, rtol=1e-15)
         np.testing.assert_allclose(runs.qd[k, 0, :3], qd, rtol=1e-15)
-    assert (runs.q[0, 0] == hangs.start[0]).all()  # its parameters are the scene's: to the last bit
+    # its parameters are those of the scene: equal bit for bit
+    assert (runs.q[0, 0] == hangs.start[0]).all()
 
 
 # --- by name --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("how", [{}, {"h": 0.01}, {"h": 0.01, "times": [0.0, 0.05]}])
-def test_values_by_name_leave_the_others_as_the_scene_has_them(
-    hangs: ModuleType, scene: Scene, how: dict
+@pytest.mark.parametrize("options", [{}, {"h": 0.01}, {"h": 0.01, "times": [0.0, 0.05]}])
+def test_values_by_name_leave_the_others_at_those_of_the_scene(
+    hangs: ModuleType, scene: Scene, options: dict
 ) -> None:
     params = {"k": 60.0, "v": 1.5}
     q, qd = scene.start(params)
-    run = hangs.simulate({"x": 0.5}, {"theta": 0.7, "r_dot": 0.1}, params=params, **how)
-    assert run.q[0] == pytest.approx([*q[:2], 0.5, 2.0], rel=1e-15)  # a jump sets the last
+    run = hangs.simulate({"x": 0.5}, {"theta": 0.7, "r_dot": 0.1}, params=params, **options)
+    assert run.q[0] == pytest.approx([*q[:2], 0.5, 2.0], rel=1e-15)  # a jump sets the last one
     assert run.qd[0] == pytest.approx([0.1, 0.7, *qd[2:], 0.0], rel=1e-15)
-    run = hangs.simulate({sympy.Symbol("load"): 3.0, "r": 2}, **how)
+    run = hangs.simulate({sympy.Symbol("load"): 3.0, "r": 2}, **options)
     assert run.q[0].tolist() == [2.0, *hangs.start[0][1:3], 3.0]
     assert run.qd[0].tolist() == hangs.start[1].tolist()
 
 
-@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
-def test_values_by_name_of_each_in_a_batch(hangs: ModuleType, scene: Scene, how: dict) -> None:
-    runs = hangs.simulate_batch({"x": [1.0, 2.0, 3.0]}, {"x": 0.5}, params=MANY, **how)
+@pytest.mark.parametrize("options", [{}, {"h": 0.01}])
+def test_values_by_name_for_each_instance(hangs: ModuleType, scene: Scene, options: dict) -> None:
+    runs = hangs.simulate_batch({"x": [1.0, 2.0, 3.0]}, {"x": 0.5}, params=MANY, **options)
     for k in range(3):
         q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
         assert runs.q[k, 0] == pytest.approx([*q[:2], k + 1.0, 2.0], rel=1e-15)
         assert runs.qd[k, 0] == pytest.approx([*qd[:2], 0.5, 0.0], rel=1e-15)
-    runs = hangs.simulate_batch({"x": 4.0}, {"theta": np.array([0.1, 0.2])}, **how)
+    runs = hangs.simulate_batch({"x": 4.0}, {"theta": np.array([0.1, 0.2])}, **options)
     assert runs.q[:, 0, 2].tolist() == [4.0, 4.0] and runs.qd[:, 0, 1].tolist() == [0.1, 0.2]
-    assert len(hangs.simulate_batch({"x": 4.0}, **how)) == 1
+    assert len(hangs.simulate_batch({"x": 4.0}, **options)) == 1
 
 
-def test_a_formula_of_what_is_given_by_name_is_not_asked_for(hangs: ModuleType) -> None:
+def test_formula_is_not_evaluated_for_a_value_passed_by_name(hangs: ModuleType) -> None:
     with pytest.raises(ValueError, match=r"params: the start of r, .* is not finite"):
         hangs.simulate({"x": 1.0}, params={"k": 0.0}, steps=1, h=0.01)
     assert hangs.simulate({"r": 1.0}, params={"k": 0.0}, steps=1, h=0.01).q[0, 0] == 1.0
 
 
-def test_other_starts_by_name(hangs: ModuleType) -> None:
+def test_other_functions_accept_starts_by_name(hangs: ModuleType) -> None:
     q, qd = hangs.start
     q[2], qd[1] = 0.5, 0.7
     assert hangs.advice({"x": 0.5}, {"theta": 0.7}, h=10.0) == hangs.advice(q, qd, h=10.0)
-    found = hangs.equilibrium({"x": 0.0, "theta": 0.0}, {"theta": 0.7}, free=["r"])
-    assert found.q[1:].tolist() == [0.0, 0.0, 2.0] and found.qd.tolist() == [0.0, 0.7, 0.0, 0.0]
+    equilibrium = hangs.equilibrium({"x": 0.0, "theta": 0.0}, {"theta": 0.7}, free=["r"])
+    assert equilibrium.q[1:].tolist() == [0.0, 0.0, 2.0] and equilibrium.qd.tolist() == [
+        0.0,
+        0.7,
+        0.0,
+        0.0,
+    ]
     # k (r - l0) - m g - (m + load) r theta_dot^2 = 0
-    assert found.q[0] == pytest.approx((30 + 9.81) / (30 - 3 * 0.49), rel=1e-12)
+    assert equilibrium.q[0] == pytest.approx((30 + 9.81) / (30 - 3 * 0.49), rel=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("q0", "qd0", "words"),
+    ("q0", "qd0", "message"),
     [
         ({"z": 1.0}, None, r"^q0: 'z' is not one of r, theta, x, load"),
         ({"Theta": 1.0}, None, r"^q0: .*did you mean 'theta'"),
@@ -144,15 +152,15 @@ def test_other_starts_by_name(hangs: ModuleType) -> None:
         ({"x": [1.0, 2.0]}, None, r"^q0: x: \[1.0, 2.0\] is not a number"),
     ],
 )
-def test_wrong_names_and_values_are_refused(
-    hangs: ModuleType, q0: dict, qd0: dict, words: str
+def test_invalid_names_and_values_are_refused(
+    hangs: ModuleType, q0: dict, qd0: dict, message: str
 ) -> None:
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=message):
         hangs.simulate(q0, qd0, steps=1)
 
 
 @pytest.mark.parametrize(
-    ("q0", "qd0", "params", "words"),
+    ("q0", "qd0", "params", "message"),
     [
         ({"x": [1.0, 2.0]}, {"x": [1.0, 2.0, 3.0]}, None, "qd0: x: 3 .* where q0: x has 2"),
         ({"x": [1.0, 2.0]}, None, MANY, "q0: x: 2 instances where params has 3"),
@@ -161,24 +169,24 @@ def test_wrong_names_and_values_are_refused(
         ({"x": [1.0, 2.0]}, np.zeros((3, 4)), None, "qd0: 3 instances where q0 has 2"),
     ],
 )
-def test_values_of_other_batches_are_refused(
-    hangs: ModuleType, q0: dict, qd0: object, params: object, words: str
+def test_values_of_other_batch_sizes_are_refused(
+    hangs: ModuleType, q0: dict, qd0: object, params: object, message: str
 ) -> None:
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=message):
         hangs.simulate_batch(q0, qd0, params=params, steps=1, h=0.01)
 
 
-def test_a_start_by_name_is_assembled(modules: Modules) -> None:
+def test_start_by_name_is_assembled(modules: Modules) -> None:
     rod = modules("pendulum_xy")
     by_name, array = rod.simulate({"x": 0.6}, steps=1), rod.start[0]
     array[0] = 0.6
     assert by_name == rod.simulate(array, rod.start[1], steps=1)
 
 
-# --- what has no value ----------------------------------------------------------------------------
+# --- formulas without a value ---------------------------------------------------------------------
 
 
-def test_a_start_without_a_value_is_refused(hangs: ModuleType, scene: Scene) -> None:
+def test_start_that_is_not_finite_is_refused(hangs: ModuleType, scene: Scene) -> None:
     with pytest.raises(EomcError):
         scene.start({"k": 0.0})
     for simulate in (hangs.simulate, hangs.simulate_batch):
@@ -187,14 +195,14 @@ def test_a_start_without_a_value_is_refused(hangs: ModuleType, scene: Scene) -> 
         assert simulate([1.0, 0.0, 0.0], params={"k": 0.0}).qd.flat[0] == 1.0
 
 
-def test_one_under_constraints_is_assembled(modules: Modules) -> None:
+def test_start_under_constraints_is_assembled(modules: Modules) -> None:
     bob = modules("pendulum_xy")
     run = bob.simulate(params={"l": 1.5}, steps=2)
     assert run["y"][0] == -1.5 and bob.simulate(steps=2)["y"][0] == -0.8
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_those_of_a_system_made_in_python(tmp_path: Path) -> None:
+def test_starts_of_a_system_from_python(tmp_path: Path) -> None:
     r, lam, k = sympy.Symbol("r"), sympy.Symbol("lambda"), sympy.Symbol("k")
     system = eomc.System.make(
         "made_hangs",
@@ -212,6 +220,6 @@ def test_those_of_a_system_made_in_python(tmp_path: Path) -> None:
     assert run.qd[0].tolist() == [-8, 0, 0, 0]
 
 
-def test_starts_know_every_function_of_formulas() -> None:
-    """A built module imports nothing of eomc, so it has a table of its own."""
+def test_starts_support_all_functions_of_formulas() -> None:
+    """A built module imports nothing of eomc, so it has its own table of functions."""
     assert {*starts._FUNCTIONS} == {*formulas.FUNCTIONS} - {"dot"}

@@ -1,4 +1,4 @@
-"""Events in fixed steps: found by shorter steps of the same method, and what is kept of them."""
+"""Events in fixed steps, located by shorter steps of the same method; their runs when saved."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METHODS = '["rk4", "dp8"]'
 
 @pytest.fixture(scope="module")
 def ball(modules: Modules) -> ModuleType:
-    """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
+    """A ball that falls from 1 m, moves along at 1 m/s, and bounces off floor and wall."""
     text = BALL.replace("bouncing", "stepped_ball")
     return modules.unoptimised(text.replace("[run]", f"[run]\nmethod = {METHODS}\nh = 0.01"))
 
@@ -61,14 +61,14 @@ duration = 4.0
 
 @pytest.fixture(scope="module")
 def swing(modules: Modules) -> ModuleType:
-    """A driven pendulum beside a wall."""
+    """A driven pendulum next to a wall."""
     return modules.unoptimised(SWING)
 
 
 @pytest.mark.parametrize("h", [0.01, 0.25, 2.0])
 @pytest.mark.parametrize("method", ["rk4", "dp8"])
-def test_a_ball_bounces_at_the_right_times(ball: ModuleType, h: float, method: str) -> None:
-    """Both are exact for parabolas, however long a step is."""
+def test_ball_bounces_at_the_right_times(ball: ModuleType, h: float, method: str) -> None:
+    """Both methods are exact for parabolas, whatever the step size."""
     run = ball.simulate(h=h, method=method, duration=2.0)
     assert run.events["impact"].t == pytest.approx(impacts(0.8, 3), rel=1e-13)
     tops = run.events["top"]
@@ -79,8 +79,8 @@ def test_a_ball_bounces_at_the_right_times(ball: ModuleType, h: float, method: s
 
 
 @pytest.mark.parametrize("h", [0.001, 0.5])
-def test_it_comes_to_rest(ball: ModuleType, h: float) -> None:
-    """Its last flights are a millionth of a step."""
+def test_ball_comes_to_rest(ball: ModuleType, h: float) -> None:
+    """Its last flights last a millionth of a step."""
     with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
         run = ball.simulate(h=h, duration=20.0)
     times = impacts(0.8, len(run.events["impact"]))
@@ -94,12 +94,12 @@ def test_rows_are_multiples_of_h_and_both_sides_of_each_jump(ball: ModuleType) -
     (jump,) = run.events["impact"].t
     grid = 0.7 + 0.1 * np.arange(11)
     assert run.t.tolist() == np.sort([*grid, jump, jump]).tolist()
-    at = run.t.tolist().index(jump)
-    assert run.qd[at, 1] < 0 < run.qd[at + 1, 1] == pytest.approx(-0.8 * run.qd[at, 1])
-    assert run.steps == 11 and run.q[at].tolist() == run.events["impact"].q[0].tolist()
+    row = run.t.tolist().index(jump)
+    assert run.qd[row, 1] < 0 < run.qd[row + 1, 1] == pytest.approx(-0.8 * run.qd[row, 1])
+    assert run.steps == 11 and run.q[row].tolist() == run.events["impact"].q[0].tolist()
 
 
-def test_what_ends_a_run_ends_it(ball: ModuleType) -> None:
+def test_stop_event_ends_the_run(ball: ModuleType) -> None:
     run = ball.simulate(h=0.1, params={"far": 0.44}, duration=5.0)
     assert run.status == "ok" and run.stopped == "away"
     assert run.t[-1] == pytest.approx(0.44, abs=1e-15) == run.events["away"].t[0]
@@ -107,7 +107,7 @@ def test_what_ends_a_run_ends_it(ball: ModuleType) -> None:
     assert at_multiple.t[-1] == pytest.approx(0.4, abs=1e-15) and len(at_multiple) in (5, 6)
 
 
-def test_between_events_they_are_the_steps_of_the_method(swing: ModuleType) -> None:
+def test_steps_between_events_are_those_of_the_method(swing: ModuleType) -> None:
     for method in swing.methods:
         run = swing.simulate(method=method, duration=3.9)
         for k in range(len(run) - 1):
@@ -120,48 +120,50 @@ def test_between_events_they_are_the_steps_of_the_method(swing: ModuleType) -> N
 @pytest.mark.parametrize(
     ("method", "order", "h"), [("rk4", 4, 0.05), ("dp8", 8, 0.2), ("euler", 1, 0.01)]
 )
-def test_times_err_as_the_method_does(swing: ModuleType, method: str, order: int, h: float) -> None:
-    exact = swing.simulate(tol=1e-14, duration=4.0).events["wall"]
+def test_event_times_have_the_order_of_the_method(
+    swing: ModuleType, method: str, order: int, h: float
+) -> None:
+    reference = swing.simulate(tol=1e-14, duration=4.0).events["wall"]
     errors = []
     for parts in (1, 2):
-        found = swing.simulate(h=h / parts, method=method, duration=4.0).events["wall"]
-        assert len(found) == len(exact) > 1
-        errors.append(np.max(np.abs(found.t - exact.t)))
+        events = swing.simulate(h=h / parts, method=method, duration=4.0).events["wall"]
+        assert len(events) == len(reference) > 1
+        errors.append(np.max(np.abs(events.t - reference.t)))
     assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.9)
     assert errors[1] < (0.1 if order == 1 else 1e-6)
 
 
-def test_events_that_never_happen_change_nothing(
+def test_undetected_events_change_nothing(
     swing: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = swing.simulate(q0=[0.5], h=0.01, duration=0.3)
     assert not any(map(len, run.events.values()))
     monkeypatch.setattr(swing._model.integrator, "ignores_events", True)
-    plain = swing.simulate(q0=[0.5], h=0.01, duration=0.3)
-    np.testing.assert_allclose(run.x, plain.x, rtol=1e-14, atol=1e-15)
-    assert run.t.tolist() == plain.t.tolist()
+    without_events = swing.simulate(q0=[0.5], h=0.01, duration=0.3)
+    np.testing.assert_allclose(run.x, without_events.x, rtol=1e-14, atol=1e-15)
+    assert run.t.tolist() == without_events.t.tolist()
 
 
 def law(t: float, q: Any, qd: Any) -> list[float]:
     return [-2 * q[0] - math.sin(3 * t) * (qd[0] > 0)]
 
 
-def test_laws_are_asked_at_each_step_or_period(swing: ModuleType) -> None:
-    """Not behind a jump: inputs are held to the next multiple of h."""
-    asked: list[float] = []
+def test_feedback_law_is_called_at_each_step_or_period(swing: ModuleType) -> None:
+    """It is not called after a jump: inputs are held constant until the next multiple of h."""
+    call_times: list[float] = []
 
-    def kept(t: float, q: Any, qd: Any) -> list[float]:
-        asked.append(t)
+    def recording_law(t: float, q: Any, qd: Any) -> list[float]:
+        call_times.append(t)
         return law(t, q, qd)
 
     with pytest.warns(RuntimeWarning, match="called before each step"):
-        run = swing.simulate(h=0.01, u=kept, duration=2.0)
+        run = swing.simulate(h=0.01, u=recording_law, duration=2.0)
     assert len(run.events["wall"]) == 1
-    assert asked == pytest.approx(0.01 * np.arange(200), abs=1e-12)
+    assert call_times == pytest.approx(0.01 * np.arange(200), abs=1e-12)
     for period in (0.01, 0.05):
         run = swing.simulate(u=law, method="dp8", control_period=period, duration=2.0)
-        same = swing.simulate(u=law, tol=1e-12, control_period=period, duration=2.0)
-        np.testing.assert_allclose(run.x[-1], same.x[-1], atol=1e-10)
+        adaptive = swing.simulate(u=law, tol=1e-12, control_period=period, duration=2.0)
+        np.testing.assert_allclose(run.x[-1], adaptive.x[-1], atol=1e-10)
         table = run.u[np.searchsorted(run.t, period * np.arange(round(2 / period)) - 1e-9)]
         rows = swing.simulate(u=table, method="dp8", control_period=period, duration=2.0)
         assert np.array_equal(rows.x, run.x) and np.array_equal(rows.u, run.u)
@@ -169,7 +171,7 @@ def test_laws_are_asked_at_each_step_or_period(swing: ModuleType) -> None:
         swing.simulate(h=0.01, u=np.zeros((3, 1)), duration=2.0)
 
 
-def test_rows_where_they_are_asked_for(swing: ModuleType) -> None:
+def test_rows_at_output_times_equal_interpolated_states(swing: ModuleType) -> None:
     run = swing.simulate(h=0.01, duration=2.0)
     times = np.array([0.0, 0.015, 0.83, 1.9999])
     rows = swing.simulate(h=0.01, times=times)
@@ -177,17 +179,17 @@ def test_rows_where_they_are_asked_for(swing: ModuleType) -> None:
     q, qd = run(times)
     np.testing.assert_allclose(rows.q, q, atol=1e-15)
     np.testing.assert_allclose(rows.qd, qd, atol=1e-15)
-    some = swing.simulate(h=0.01, duration=2.0, every=30)
-    assert some.t == pytest.approx([*0.3 * np.arange(7), 2.0])
-    np.testing.assert_allclose(some.q, run(some.t)[0], atol=1e-15)
-    for wrong in ({"every": 2}, {"steps": 3}):
+    sparse = swing.simulate(h=0.01, duration=2.0, every=30)
+    assert sparse.t == pytest.approx([*0.3 * np.arange(7), 2.0])
+    np.testing.assert_allclose(sparse.q, run(sparse.t)[0], atol=1e-15)
+    for conflicting in ({"every": 2}, {"steps": 3}):
         with pytest.raises(ValueError, match="times say where rows are"):
-            swing.simulate(times=times, h=0.01, **wrong)
+            swing.simulate(times=times, h=0.01, **conflicting)
     with pytest.raises(ValueError, match="out: events add rows"):
         swing.simulate(h=0.01, steps=3, out=(np.empty((4, 1)), np.empty((4, 1))))
 
 
-def test_where_it_stops_there_is_a_row(ball: ModuleType) -> None:
+def test_run_ends_with_a_row_at_its_stop_event(ball: ModuleType) -> None:
     run = ball.simulate(h=0.1, every=100, params={"far": 0.317}, duration=20.0)
     assert run.stopped == "away" and run.t == pytest.approx([0, 0.317])
     assert run.q[-1] == pytest.approx([0.317, 1 - G / 2 * 0.317**2])
@@ -196,92 +198,98 @@ def test_where_it_stops_there_is_a_row(ball: ModuleType) -> None:
     assert run.t[-1] == pytest.approx(9 * math.sqrt(2 / G)) and run.q[-1, 1] == pytest.approx(0)
 
 
-def test_each_of_a_batch_is_its_run_alone(swing: ModuleType) -> None:
+def test_instance_of_a_batch_equals_its_single_run(swing: ModuleType) -> None:
     starts = np.linspace(0.2, 1.4, 7)[:, None]
     runs = swing.simulate_batch(starts, duration=2.0, method="dp8")
-    again = swing.simulate_batch(starts, duration=2.0, method="dp8", threads=1)
-    assert runs == again and runs.q.shape == (7, 201, 1) and runs.method == "dp8"
+    one_thread = swing.simulate_batch(starts, duration=2.0, method="dp8", threads=1)
+    assert runs == one_thread and runs.q.shape == (7, 201, 1) and runs.method == "dp8"
     assert "of 0.01 s" in runs.message
     for k, start in enumerate(starts):
-        alone = swing.simulate(start, duration=2.0, method="dp8")
+        single = swing.simulate(start, duration=2.0, method="dp8")
         for name in ("below", "wall"):
-            one, own = alone.events[name], runs.events[name].for_instance(k)
-            assert own.t.tolist() == one.t.tolist() and own.q.tolist() == one.q.tolist()
-        assert runs.q[k, -1].tolist() == alone.q[-1].tolist()
-        assert runs.evaluations[k] >= alone.evaluations > 14 * alone.steps
+            expected, actual = single.events[name], runs.events[name].for_instance(k)
+            assert (
+                actual.t.tolist() == expected.t.tolist()
+                and actual.q.tolist() == expected.q.tolist()
+            )
+        assert runs.q[k, -1].tolist() == single.q[-1].tolist()
+        assert runs.evaluations[k] >= single.evaluations > 14 * single.steps
     q, _ = runs([0.305])
     assert q[3, 0] == pytest.approx(swing.simulate(starts[3], method="dp8")(0.305)[0], abs=1e-15)
     table = np.full((1, 200, 1), 0.2)
-    tabled = swing.simulate_batch(starts, h=0.01, duration=2.0, u=table)
-    held = swing.simulate_batch(starts, h=0.01, duration=2.0, u=[0.2])
-    np.testing.assert_allclose(tabled.q, held.q, atol=1e-14)
+    by_table = swing.simulate_batch(starts, h=0.01, duration=2.0, u=table)
+    constant = swing.simulate_batch(starts, h=0.01, duration=2.0, u=[0.2])
+    np.testing.assert_allclose(by_table.q, constant.q, atol=1e-14)
 
 
-def test_its_error_is_estimated(swing: ModuleType) -> None:
-    exact = swing.simulate(tol=1e-14)
+def test_error_is_estimated_among_events(swing: ModuleType) -> None:
+    reference = swing.simulate(tol=1e-14)
     for h in (0.01, 0.02):
         run = swing.simulate(h=h)
-        found = run.estimate()
-        error = abs(run.q[-1, 0] - exact.q[-1, 0])
-        assert found.order == 4 and found.end["theta"] == pytest.approx(error, rel=0.2)
-        assert found.resolved
+        estimate = run.estimate()
+        error = abs(run.q[-1, 0] - reference.q[-1, 0])
+        assert estimate.order == 4 and estimate.end["theta"] == pytest.approx(error, rel=0.2)
+        assert estimate.resolved
 
 
-def test_what_is_kept_is_the_run(swing: ModuleType, tmp_path: Path) -> None:
+def test_saved_or_pickled_run_is_unchanged(swing: ModuleType, tmp_path: Path) -> None:
     run = swing.simulate(h=0.01, duration=1.0)
     run.save(tmp_path / "one.npz")
-    for same in (swing.load_run(tmp_path / "one.npz"), pickle.loads(pickle.dumps(run))):
-        assert same == run and same.events["wall"].t.tolist() == run.events["wall"].t.tolist()
-        assert same(0.777)[0] == run(0.777)[0] and "steps of 0.01 s" in repr(same)
-        assert same.estimate().end == run.estimate().end
+    for loaded in (swing.load_run(tmp_path / "one.npz"), pickle.loads(pickle.dumps(run))):
+        assert loaded == run and loaded.events["wall"].t.tolist() == run.events["wall"].t.tolist()
+        assert loaded(0.777)[0] == run(0.777)[0] and "steps of 0.01 s" in repr(loaded)
+        assert loaded.estimate().end == run.estimate().end
     runs = swing.simulate_batch([[0.5], [1.2]], h=0.01, duration=1.0)
     runs.save(tmp_path / "many.npz")
-    same = swing.load_run(tmp_path / "many.npz")
-    assert same == runs and np.array_equal(same([0.31])[0], runs([0.31])[0])
+    loaded = swing.load_run(tmp_path / "many.npz")
+    assert loaded == runs and np.array_equal(loaded([0.31])[0], runs([0.31])[0])
 
 
 @pytest.mark.parametrize(("t0", "h"), [(1e6, 1e-9), (1.7e9, 2e-5), (1e3, 1e-4)])
-def test_steps_that_time_hardly_resolves_are_made_all_the_same(
+def test_steps_near_the_resolution_of_time_have_full_length(
     ball: ModuleType, t0: float, h: float
 ) -> None:
-    """They went by h, and time by 2h."""
+    """Regression: the state advanced by h per step, the time by 2h."""
     run = ball.simulate(t0=t0, h=h, steps=500)
     np.testing.assert_allclose(run.q[-1], [500 * h, 1 - G / 2 * (500 * h) ** 2], rtol=1e-12)
     assert run.steps == 500 and run.status == "ok" and run.t[-1] == t0 + 500 * h
 
 
-def test_an_h_below_what_time_resolves_is_refused(ball: ModuleType) -> None:
+def test_step_size_below_the_resolution_of_time_is_refused(ball: ModuleType) -> None:
     for simulate in (ball.simulate, ball.simulate_batch):
         with pytest.raises(ValueError, match=r"h: 1e-09 s .* at 1.7e\+09 s, .* smaller t0"):
             simulate(t0=1.7e9, h=1e-9, steps=1000)
 
 
 @pytest.mark.parametrize("h", [0.1, 0.05, 0.01])
-@pytest.mark.parametrize("how", [{}, {"u": "table"}, {"tol": 1e-9, "control_period": 0.1}])
-def test_jumps_at_multiples_of_h_happen_once(
-    clock: ModuleType, h: float, how: dict[str, Any]
+@pytest.mark.parametrize("options", [{}, {"u": "table"}, {"tol": 1e-9, "control_period": 0.1}])
+def test_jumps_at_multiples_of_h_act_once(
+    clock: ModuleType, h: float, options: dict[str, Any]
 ) -> None:
-    """One rounding before the end of a step they happened twice, and were said to accumulate."""
-    for at in (0.3, 0.5, 0.7, 0.9, round(7 * h, 6), 9 * h):
-        given = dict(how)
-        if given.get("u"):
-            given["u"] = np.zeros((round(1 / h), 1))
-        elif not given:
-            given["control_period"] = h
-        if "tol" not in given:
-            given["h"] = h
-        run = clock.simulate(params={"at": at}, duration=1.0, **given)
-        assert run.status == "ok" and run.events["strike"].t == pytest.approx([at], abs=1e-15)
-        assert run.q[-1, 0] == pytest.approx(2 - at, abs=1e-12)
-        ticks = clock.simulate(h=h, duration=1.0).events["tick"].t  # the last at its end, or not
+    """Regression: a rounding before the end of a step they acted twice and seemed to accumulate."""
+    for strike_time in (0.3, 0.5, 0.7, 0.9, round(7 * h, 6), 9 * h):
+        arguments = dict(options)
+        if arguments.get("u"):
+            arguments["u"] = np.zeros((round(1 / h), 1))
+        elif not arguments:
+            arguments["control_period"] = h
+        if "tol" not in arguments:
+            arguments["h"] = h
+        run = clock.simulate(params={"at": strike_time}, duration=1.0, **arguments)
+        assert run.status == "ok" and run.events["strike"].t == pytest.approx(
+            [strike_time], abs=1e-15
+        )
+        assert run.q[-1, 0] == pytest.approx(2 - strike_time, abs=1e-12)
+        # the last at the end of the run, or not at all
+        ticks = clock.simulate(h=h, duration=1.0).events["tick"].t
         assert ticks == pytest.approx(0.1 * np.arange(1, len(ticks) + 1), abs=1e-14)
         assert len(ticks) in (9, 10)
 
 
-@pytest.mark.parametrize("how", ["fixed", "tol", "period"])
-def test_jumps_some_roundings_before_an_end_happen_once(clock: ModuleType, how: str) -> None:
-    """In what was left of the step, or of the run, they happened again."""
-    ways = {
+@pytest.mark.parametrize("case", ["fixed", "tol", "period"])
+def test_jumps_some_roundings_before_an_end_act_once(clock: ModuleType, case: str) -> None:
+    """Regression: they acted again in the rest of the step or of the run."""
+    options = {
         "fixed": {"h": 0.1, "duration": 1.0},
         "tol": {"tol": 1e-9},
         "period": {
@@ -292,22 +300,22 @@ def test_jumps_some_roundings_before_an_end_happen_once(clock: ModuleType, how: 
         },
     }
     for k in (3, 7, 9):
-        for by in (-40, -17, -5, -1, 0, 2, 30):
-            at = 0.1 * k * (1 + by * 2.0**-53)
-            end = {"duration": 0.1 * k} if how == "tol" else {}
-            run = clock.simulate(params={"at": at}, **ways[how], **end)
+        for roundings in (-40, -17, -5, -1, 0, 2, 30):
+            strike_time = 0.1 * k * (1 + roundings * 2.0**-53)
+            end = {"duration": 0.1 * k} if case == "tol" else {}
+            run = clock.simulate(params={"at": strike_time}, **options[case], **end)
             assert run.status == "ok" and len(run.events["strike"]) <= 1
-            if how != "tol":
-                assert run.q[-1, 0] == pytest.approx(2 - at, abs=1e-12)
+            if case != "tol":
+                assert run.q[-1, 0] == pytest.approx(2 - strike_time, abs=1e-12)
             q, _ = run([0.05, run.t[-1]])
             assert q[0] == pytest.approx([0.05]) and q[1] == pytest.approx(run.q[-1], abs=1e-14)
-            rows = clock.simulate(params={"at": at}, times=[0, 0.15, 0.1 * k], tol=1e-9)
+            rows = clock.simulate(params={"at": strike_time}, times=[0, 0.15, 0.1 * k], tol=1e-9)
             assert len(rows) == 3
 
 
 @pytest.fixture(scope="module")
 def clock(modules: Modules) -> ModuleType:
-    """A body that is struck at a time."""
+    """A body that is struck at a given time."""
     return modules.unoptimised(CLOCK)
 
 
@@ -336,7 +344,7 @@ h = 0.01
 """
 
 
-def test_events_that_a_call_asks_for(tmp_path: Path) -> None:
+def test_events_passed_to_a_call_are_detected_in_fixed_steps(tmp_path: Path) -> None:
     scene = tmp_path / "asked_stepped.toml"
     scene.write_text(FREE.format(name="asked_stepped", events="[run]\nduration = 1"))
     module = eomc.load(scene, tmp_path / "build")
@@ -344,7 +352,7 @@ def test_events_that_a_call_asks_for(tmp_path: Path) -> None:
     assert run.events["third"].t == pytest.approx([1 / 3], rel=1e-14)
 
 
-STUCK = """eomc = 1
+STICKING = """eomc = 1
 name = "stepped_stick"
 [coordinates]
 x = { unit = "m", start = 1.0, friction = 1.7 }
@@ -358,9 +366,9 @@ friction = "stick"
 """
 
 
-def test_friction_sticks(modules: Modules) -> None:
-    """Each half period is one around +-0.17: it stops at -0.66, 0.32 and 0.02, there for good."""
-    run = modules.unoptimised(STUCK).simulate(h=0.02)
+def test_friction_sticks_in_fixed_steps(modules: Modules) -> None:
+    """Each half period is centred at +-0.17: it stops at -0.66, 0.32 and 0.02, where it stays."""
+    run = modules.unoptimised(STICKING).simulate(h=0.02)
     half = math.pi / math.sqrt(10)
     assert run.events["x_stops"].t == pytest.approx(half * np.arange(1, 4), rel=1e-6)
     assert run.events["x_slips"].t == pytest.approx(half * np.arange(3), abs=1e-6)
@@ -401,13 +409,13 @@ def test_jumps_stay_on_constraints(modules: Modules) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["double", "float"])
 @pytest.mark.parametrize("folder", ["", "fast"])
-def test_a_program_in_c_takes_any_step(folder: str, real: str, tmp_path: Path) -> None:
+def test_c_program_may_pass_any_step_function(folder: str, real: str, tmp_path: Path) -> None:
     run = f'[run]\nmethod = {METHODS}\nreal = "{real}"'
     text = BALL.replace("bouncing", "embedded").replace("[run]", run)
-    made = eomc.sources(from_scene(parse(text, "c.toml"))).files
-    for end in "hc":
-        file = tmp_path / f"embedded.{end}"
-        file.write_text(made[f"{folder}/embedded.{end}".lstrip("/")], encoding="utf-8")
+    sources = eomc.sources(from_scene(parse(text, "c.toml"))).files
+    for suffix in "hc":
+        file = tmp_path / f"embedded.{suffix}"
+        file.write_text(sources[f"{folder}/embedded.{suffix}".lstrip("/")], encoding="utf-8")
     (tmp_path / "main.c").write_text(
         f"""#include "embedded.h"
 #include <stdio.h>
@@ -437,24 +445,24 @@ int main(void)
     flags = ["-Wall", "-Wextra", "-Werror"] if folder else STRICT
     compiled("cc", *flags, "-O2", "-c", "embedded.c", "-o", "scene.o", cwd=tmp_path)
     compiled("cc", "main.c", "scene.o", "-O1", "-o", "a", "-lm", cwd=tmp_path)
-    said = subprocess.run([str(tmp_path / "a")], capture_output=True, text=True)
-    times = [float(line) for line in said.stdout.split()]
-    assert said.returncode == 0
+    process = subprocess.run([str(tmp_path / "a")], capture_output=True, text=True)
+    times = [float(line) for line in process.stdout.split()]
+    assert process.returncode == 0
     assert times == pytest.approx(impacts(0.8, 3), rel=1e-13 if real == "double" else 3e-6)
 
 
-@pytest.mark.parametrize("how", [{}, {"h": 0.1}])
-def test_a_recorder_counts_a_zero_once_from_which_another_jumps_back(
-    recorded: ModuleType, how: dict[str, float]
+@pytest.mark.parametrize("options", [{}, {"h": 0.1}])
+def test_recording_event_detects_a_zero_once_if_another_jumps_back(
+    recorded: ModuleType, options: dict[str, float]
 ) -> None:
-    run = recorded.simulate(**how)
+    run = recorded.simulate(**options)
     assert run.events["low"].t.tolist() == run.events["impact"].t.tolist()
     assert len(run.events["impact"]) == 3
 
 
 @pytest.fixture(scope="module")
 def recorded(modules: Modules) -> ModuleType:
-    """A ball whose impacts another event takes note of, in both directions."""
+    """A ball whose impacts another event records, in both directions."""
     text = BALL.replace("bouncing", "recorded_ball").replace("duration = 3", "duration = 2")
     low = event("low", "y")
     return modules.unoptimised(
@@ -463,24 +471,24 @@ def recorded(modules: Modules) -> ModuleType:
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.01}, {"tol": 1e-9}, {"times": [0.0, 3.0]}])
-def test_a_section_crosses_between_jumps(ball: ModuleType, steps: dict[str, Any]) -> None:
-    """The floor is touched and not crossed, and an impact carries the velocity over zero."""
+def test_section_is_crossed_between_jumps(ball: ModuleType, steps: dict[str, Any]) -> None:
+    """The floor is touched but not crossed, and an impact carries the velocity across zero."""
     run = ball.simulate(**steps)
-    hits, e = impacts(0.8, 6), 0.8 ** np.arange(1, 7)
+    impact_times, e = impacts(0.8, 6), 0.8 ** np.arange(1, 7)
     tops = run.section("y_dot")
-    assert tops["t"] == pytest.approx(hits + math.sqrt(2 / G) * e, rel=1e-12)
+    assert tops["t"] == pytest.approx(impact_times + math.sqrt(2 / G) * e, rel=1e-12)
     assert tops["y"] == pytest.approx(e**2, rel=1e-12)
     assert not len(run.section("y")["t"]) and not len(run.section("y_dot", rising=True)["t"])
-    up = run.section("y", 0.25, rising=True)
+    rising = run.section("y", 0.25, rising=True)
     speed = np.sqrt(2 * G * (e[:3] ** 2 - 0.25))
-    assert up["y_dot"] == pytest.approx(speed, rel=1e-12)
+    assert rising["y_dot"] == pytest.approx(speed, rel=1e-12)
     assert run.section("t", 0.1, period=0.5)["t"] == pytest.approx(0.1 + 0.5 * np.arange(6))
     with pytest.raises(KeyError, match="did you mean 'y_dot'"):
         run.section("y_dott")
 
 
-def test_a_section_where_a_jump_changes_what_acts(modules: Modules) -> None:
-    """x passes 0 there; s falls back from 1 to 0, from which it begins."""
+def test_section_where_a_jump_changes_the_forces(modules: Modules) -> None:
+    """x crosses 0 there; s jumps back from 1 to 0, where it starts."""
     events = (
         event("turn", "x", 'action = "jump"', 'a = "-a"'),
         event("back", "s - 1", 'action = "jump"', "s = 0"),
@@ -498,32 +506,32 @@ def test_a_section_where_a_jump_changes_what_acts(modules: Modules) -> None:
     assert not len(run.section("s", 1.0)["t"]) and not len(run.section("s", 5.0)["late"])
 
 
-@pytest.mark.parametrize("behind", [1.0, -1.0])
+@pytest.mark.parametrize("slope", [1.0, -1.0])
 @pytest.mark.parametrize("noise", [0.0, 1e-17, -1e-17])
-def test_what_rests_crosses_once_where_it_leaves_to_the_other_side(
-    behind: float, noise: float
+def test_section_at_rest_is_crossed_once_when_left_to_the_other_side(
+    slope: float, noise: float
 ) -> None:
-    """It comes down to 0, stays there up to t = 2, and goes on."""
+    """It comes down to 0, stays there until t = 2, and moves on."""
     piece = np.linspace(0.0, 1.0, 9)
     rest = noise * (-1.0) ** np.arange(9)
     columns = {
         "t": np.concatenate([piece, 1 + piece, 2 + piece]),
-        "v": np.concatenate([1 - piece + rest, rest, behind * piece]),
+        "v": np.concatenate([1 - piece + rest, rest, slope * piece]),
     }
     for level, period in ((0.0, None), (0.0, 10.0), (-10.0, 10.0)):
-        found = section.crossings(columns, "v", level, None, period)
-        assert found["t"] == pytest.approx([2.0] if behind < 0 else [])
+        crossings = section.crossings(columns, "v", level, None, period)
+        assert crossings["t"] == pytest.approx([2.0] if slope < 0 else [])
     with_nan = columns | {"v": np.where(columns["t"] < 0.5, np.nan, columns["v"] - 0.3)}
     assert len(section.crossings(with_nan, "v", 0.0, False, None)["t"]) == 1
 
 
-def test_a_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:
+def test_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:
     run = ball.simulate(times=[3.0], params={"far": 0.5})
     assert run.stopped == "away" and {len(x) for x in run.to_dict().values()} == {0}
 
 
-def test_single_precision_takes_a_row_a_step(modules: Modules) -> None:
-    """Its time resolves h so badly that a row seemed to lack, and time ran ahead of the state."""
+def test_single_precision_has_a_row_per_step(modules: Modules) -> None:
+    """Regression: with h near the resolution of time, a row was missing and time ran ahead."""
     module = modules.unoptimised(CLOCK.replace("struck", "struck_float") + 'real = "float"\n')
     for t0, h, steps in ((0.0, 0.003, 777), (0.1, 0.01, 2000), (123.4, 0.0007, 999)):
         run = module.simulate(
@@ -571,7 +579,7 @@ MISSED = (
 
 @pytest.fixture(scope="module")
 def tops(modules: Modules) -> ModuleType:
-    """x = sin t, with events at heights that parameters set."""
+    """x = sin t, with events at heights given by parameters."""
     return modules.unoptimised(TOPS)
 
 
@@ -579,7 +587,7 @@ def tops(modules: Modules) -> ModuleType:
 @pytest.mark.parametrize(
     ("height", "name"), [("ends", "end"), ("marks", "mark"), ("turns", "turn")]
 )
-def test_an_event_that_steps_pass_over_is_reported(
+def test_event_passed_over_by_steps_is_reported(
     tops: ModuleType, h: float, height: str, name: str
 ) -> None:
     """x exceeds 0.999 from t = 1.526 to 1.616, between two steps."""
@@ -592,22 +600,24 @@ def test_an_event_that_steps_pass_over_is_reported(
         assert np.isinf(error.q[-1]).all() and error.digits["x"] == 0
 
 
-@pytest.mark.parametrize("how", [{"h": 0.05}, {"h": 0.05, "times": [0.5, 1.0, 9.0]}, {"tol": 1e-6}])
-def test_events_that_are_detected_are_resolved(tops: ModuleType, how: dict[str, Any]) -> None:
-    exact = math.asin(0.999)
+@pytest.mark.parametrize(
+    "options", [{"h": 0.05}, {"h": 0.05, "times": [0.5, 1.0, 9.0]}, {"tol": 1e-6}]
+)
+def test_detected_events_are_resolved(tops: ModuleType, options: dict[str, Any]) -> None:
+    expected = math.asin(0.999)
     for height, name in (("ends", "end"), ("marks", "mark"), ("turns", "turn")):
-        run = tops.simulate(params={height: 0.999}, **how)
+        run = tops.simulate(params={height: 0.999}, **options)
         error = run.estimate()
         assert error.resolved and not error.missed and np.max(error.q) < 1e-4
-        late = abs(run.events[name].t[0] - exact)
-        assert error.events[name][0] == pytest.approx(late, rel=0.1, abs=1e-11)
+        time_error = abs(run.events[name].t[0] - expected)
+        assert error.events[name][0] == pytest.approx(time_error, rel=0.1, abs=1e-11)
 
 
-def test_an_event_at_the_end_is_not_missed(tops: ModuleType) -> None:
-    """Of two runs one may end a rounding before it."""
+def test_event_at_the_end_is_not_missed(tops: ModuleType) -> None:
+    """One of two runs may end a rounding before it."""
     end = math.asin(0.5)
-    for part in (0.0, 1e-15, -1e-15):
+    for rounding in (0.0, 1e-15, -1e-15):
         for height in ("ends", "marks"):
-            how = {"duration": end + part, "tol": 1e-9}
-            error = tops.simulate(params={height: 0.5}, estimate=True, **how).error
+            options = {"duration": end + rounding, "tol": 1e-9}
+            error = tops.simulate(params={height: 0.5}, estimate=True, **options).error
             assert error.resolved and np.max(error.q) < 1e-9

@@ -1,4 +1,4 @@
-"""`[run] friction = "stick"`: Coulomb friction, exactly, beside closed forms and SciPy's events."""
+"""`[run] friction = "stick"`: exact Coulomb friction, against closed forms and SciPy's events."""
 
 from __future__ import annotations
 
@@ -97,94 +97,95 @@ def block(modules: Modules) -> ModuleType:
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
-def test_a_block_comes_to_rest_where_it_should(block: ModuleType, tol: float) -> None:
+def test_block_comes_to_rest_at_the_closed_form(block: ModuleType, tol: float) -> None:
     run = cases.block_at_rest(block, tol)
-    held = run.multipliers["x_sticks"][-1]
-    assert held == pytest.approx(10 * run.q[-1, 0], abs=1e-12)
+    friction_force = run.multipliers["x_sticks"][-1]
+    assert friction_force == pytest.approx(10 * run.q[-1, 0], abs=1e-12)
     assert len(run.events["x_slips"]) == len(run.events["x_stops"]) == 5
 
 
-def test_starts_need_no_modes_and_batches_are_as_one(block: ModuleType) -> None:
+def test_starts_need_no_modes_and_batches_equal_single_runs(block: ModuleType) -> None:
     starts, rates = np.array([[1.0], [0.05], [-0.7]]), np.array([[0.0], [0.0], [2.0]])
-    many = block.simulate_batch(starts, rates, tol=1e-10, times=[0.0, 1.0, 5.0])
-    for q, qd, rows in zip(starts, rates, many.q, strict=True):
+    batch = block.simulate_batch(starts, rates, tol=1e-10, times=[0.0, 1.0, 5.0])
+    for q, qd, rows in zip(starts, rates, batch.q, strict=True):
         run = block.simulate(q, qd, tol=1e-10, times=[0.0, 1.0, 5.0])
         assert run.q.tolist() == rows.tolist()
-        whole = block.simulate([*q, 1.0], [*qd, 0.0], tol=1e-10, times=[0.0, 1.0, 5.0])
-        assert whole.q.tolist() == run.q.tolist()  # its velocity says how it slides
-    assert many.q[1, -1].tolist() == [0.05, 0.0]  # held where it lies
+        expected = block.simulate([*q, 1.0], [*qd, 0.0], tol=1e-10, times=[0.0, 1.0, 5.0])
+        # the velocity determines the direction of sliding
+        assert expected.q.tolist() == run.q.tolist()
+    assert batch.q[1, -1].tolist() == [0.05, 0.0]  # friction holds it at its start
     half = block.simulate(tol=1e-12, duration=2.5)
-    rest = block.simulate(half.q[-1], half.qd[-1], tol=1e-12, t0=2.5, duration=3.5)
-    whole = block.simulate(tol=1e-12, duration=6.0)
-    np.testing.assert_allclose(rest.q[-1], whole.q[-1], rtol=0, atol=1e-13)
+    second_half = block.simulate(half.q[-1], half.qd[-1], tol=1e-12, t0=2.5, duration=3.5)
+    expected = block.simulate(tol=1e-12, duration=6.0)
+    np.testing.assert_allclose(second_half.q[-1], expected.q[-1], rtol=0, atol=1e-13)
 
 
-def test_without_friction_it_never_sticks(block: ModuleType) -> None:
+def test_block_never_sticks_without_friction(block: ModuleType) -> None:
     run = block.simulate(tol=1e-12, duration=6.0, params={"mu": 0.0})
     assert run.q[-1, 0] == pytest.approx(math.cos(6 * math.sqrt(10.0)), abs=1e-10)
 
 
-def reference(F: float, duration: float) -> tuple[list[float], list[tuple[str, float]]]:
-    """The cart by SciPy, piece by piece; its end, and the events."""
+def solve_with_scipy(F: float, duration: float) -> tuple[list[float], list[tuple[str, float]]]:
+    """Solve the cart piecewise with SciPy; return its final state and the events."""
     M, m, length, g = 1.0, 0.3, 0.5, 9.81
 
-    def held(y: Any) -> Any:
+    def friction_force(y: Any) -> Any:
         a = -g / length * np.sin(y[1])
         return m * length * (np.cos(y[1]) * a - np.sin(y[1]) * y[3] ** 2)
 
-    def rates(t: float, y: Any, s: float) -> list[float]:
+    def rhs(t: float, y: Any, s: float) -> list[float]:
         if s == 0:
             return [0, y[3], 0, -g / length * np.sin(y[1])]
-        across = m * length * np.cos(y[1])
-        D = [[M + m, across], [across, m * length**2]]
+        coupling = m * length * np.cos(y[1])
+        D = [[M + m, coupling], [coupling, m * length**2]]
         b = [m * length * np.sin(y[1]) * y[3] ** 2 - F * s, -m * g * length * np.sin(y[1])]
         return [y[2], y[3], *np.linalg.solve(D, b)]
 
-    def stops(t: float, y: Any, s: float) -> Any:
+    def stopping_event(t: float, y: Any, s: float) -> Any:
         return s * y[2]
 
-    def slips(t: float, y: Any, s: float) -> Any:
-        return F - abs(held(y))
+    def slipping_event(t: float, y: Any, s: float) -> Any:
+        return F - abs(friction_force(y))
 
-    for event in (stops, slips):
+    for event in (stopping_event, slipping_event):
         event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
-    t, y, s, found = 0.0, np.array([0, 0.5, 0, 0]), 0.0, []
+    t, y, s, events = 0.0, np.array([0, 0.5, 0, 0]), 0.0, []
     while t < duration:
-        if s == 0 and slips(t, y, s) < 1e-12:
-            s = -np.sign(held(y))
-            found.append(("x_slips", t))
-        made = solve_ivp(
-            rates, (t, duration), y, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02, args=(s,),
-            events=slips if s == 0 else stops,
+        if s == 0 and slipping_event(t, y, s) < 1e-12:
+            s = -np.sign(friction_force(y))
+            events.append(("x_slips", t))
+        solution = solve_ivp(
+            rhs, (t, duration), y, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02, args=(s,),
+            events=slipping_event if s == 0 else stopping_event,
         )  # fmt: skip
-        t, y = made.t[-1], made.y[:, -1]
-        if made.status == 1 and s:
+        t, y = solution.t[-1], solution.y[:, -1]
+        if solution.status == 1 and s:
             s, y[2] = 0.0, 0.0
-            found.append(("x_stops", t))
-    return y.tolist(), found
+            events.append(("x_stops", t))
+    return y.tolist(), events
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("F", [0.15, 0.4, 0.6])
-def test_a_cart_beside_scipy(modules: Modules, F: float) -> None:
+def test_cart_agrees_with_scipy(modules: Modules, F: float) -> None:
     run = modules.unoptimised(CART).simulate(params={"F": F})
-    end, events = reference(F, 5.0)
+    end, events = solve_with_scipy(F, 5.0)
     np.testing.assert_allclose([*run.q[-1, :2], *run.qd[-1, :2]], end, rtol=0, atol=1e-8)
     for name in ("x_stops", "x_slips"):
-        times = [t for which, t in events if which == name]
+        times = [t for event_name, t in events if event_name == name]
         np.testing.assert_allclose(run.events[name].t, times, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow
-def test_an_arm_comes_to_rest(modules: Modules) -> None:
+def test_arm_comes_to_rest(modules: Modules) -> None:
     arm = modules.unoptimised(ARM)
     random = np.random.default_rng(0)
     for _ in range(6):
         q, qd = random.normal(size=(2, 3)) * [[2], [4]]
-        run, finer = (arm.simulate(q, qd, tol=tol) for tol in (1e-10, 1e-13))
+        run, fine = (arm.simulate(q, qd, tol=tol) for tol in (1e-10, 1e-13))
         assert run.status == "ok" and np.all(np.diff(run.energy) < 1e-8)
-        np.testing.assert_allclose(run.q[-1], finer.q[-1], rtol=0, atol=1e-8)
-        counts = [[len(e) for e in r.events.values()] for r in (run, finer)]
+        np.testing.assert_allclose(run.q[-1], fine.q[-1], rtol=0, atol=1e-8)
+        counts = [[len(e) for e in r.events.values()] for r in (run, fine)]
         assert counts[0] == counts[1] and min(counts[0]) > 0
         assert np.all(np.abs(run.qd[-1]) < 1e-20)
         for k in (1, 2, 3):
@@ -192,8 +193,8 @@ def test_an_arm_comes_to_rest(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_slides_against_its_velocity(modules: Modules) -> None:
-    """Some of these slip where another drives them back at once."""
+def test_friction_never_acts_along_the_velocity(modules: Modules) -> None:
+    """In some of these runs a joint slips, and another drives it back immediately."""
     arm, random = modules.unoptimised(ARM), np.random.default_rng(5)
     for _ in range(165):
         q, qd = random.normal(size=(2, 3)) * [[2], [4]]
@@ -211,7 +212,7 @@ def test_rounding_of_a_velocity_at_rest_does_not_move_a_block(block: ModuleType)
 
 
 @pytest.mark.slow
-def test_rounding_of_a_velocity_at_rest_is_none(modules: Modules) -> None:
+def test_rounding_of_velocities_at_rest_does_not_move_an_arm(modules: Modules) -> None:
     arm = modules.unoptimised(ARM)
     rest = arm.simulate(tol=1e-10).q[-1, :3]
     for rates in ([3e-31, -2e-31, 0], [1e-31, 1e-30, 1e-32]):
@@ -221,20 +222,20 @@ def test_rounding_of_a_velocity_at_rest_is_none(modules: Modules) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_sticks_at_a_dead_point(modules: Modules) -> None:
-    """The rocker turns where the crank goes on; both rest in the end, and the loop holds."""
+def test_mechanism_does_not_stick_at_a_dead_point(modules: Modules) -> None:
+    """The rocker reverses while the crank moves on; finally both rest, with the loop closed."""
     bar = modules.unoptimised(FOUR_BAR)
     run = bar.simulate(tol=1e-10)
     assert run.status == "ok" and run.steps < 300
     assert np.abs(bar.constraints(run.q, run.qd)).max() < 1e-9
     turns = run.events["q3_stops"]
-    assert np.sum(np.abs(turns.qd[:, 0]) > 0.5) > 3  # the crank goes on
+    assert np.sum(np.abs(turns.qd[:, 0]) > 0.5) > 3  # the crank moves on
     assert np.all(np.diff(run.energy) < 1e-8) and np.all(np.abs(run.qd[-1]) < 1e-20)
     assert not run.estimate().verdict
 
 
-def test_a_jump_sets_the_mode_of_what_it_turns(modules: Modules) -> None:
-    """Thrown at a wall it comes back: v^2 falls by 2 mu g a metre, and by e^2 there."""
+def test_jump_sets_the_mode_of_the_velocity_that_it_reverses(modules: Modules) -> None:
+    """A thrown block rebounds from a wall: v^2 falls by 2 mu g per metre, by e^2 at the wall."""
     text = BLOCK.replace('potential = "k*x**2/2"', "").replace("start = 1.0,", "rate = 2.0,")
     text = text.replace("k  = 10.0\n", "e  = 0.9\n").replace("dry_block", "thrown_block")
     wall = (
@@ -242,50 +243,54 @@ def test_a_jump_sets_the_mode_of_what_it_turns(modules: Modules) -> None:
         'x_dot = "-e*x_dot"\n'
     )
     run = modules.unoptimised(text + wall).simulate(duration=8.0)
-    back = 0.81 * (4 - 2 * 0.981)
+    speed_squared = 0.81 * (4 - 2 * 0.981)
     assert run.status == "ok" and len(run.events["wall"]) == len(run.events["x_stops"]) == 1
-    assert run.q[-1].tolist() == [pytest.approx(1 - back / (2 * 0.981), abs=1e-12), 0]
+    assert run.q[-1].tolist() == [pytest.approx(1 - speed_squared / (2 * 0.981), abs=1e-12), 0]
 
 
-def test_systems_made_in_python_have_it() -> None:
+def test_systems_from_python_can_stick() -> None:
     x, F, m = sympy.symbols("x F m")
     v = sympy.Symbol("x_dot")
-    made = System.make("slab", {x: (0, 1)}, m * v**2 / 2, parameters={m: 2, F: 1}, friction={x: F})
-    assert [c.name for c in made.coordinates] == ["x", "x_slides"]
-    assert made.coordinates[1].start == 1 and made.run.tolerance == 1e-9
-    for wrong, said in (
+    system = System.make(
+        "slab", {x: (0, 1)}, m * v**2 / 2, parameters={m: 2, F: 1}, friction={x: F}
+    )
+    assert [c.name for c in system.coordinates] == ["x", "x_slides"]
+    assert system.coordinates[1].start == 1 and system.run.tolerance == 1e-9
+    for invalid, message in (
         ({v: F}, "coordinates are x"),
         ({x: v}, "x_dot is no parameter"),
         ({x: -F}, "is -1, and can't be negative"),
     ):
-        with pytest.raises(EomcError, match=said):
-            System.make("slab", {x: 0}, m * v**2 / 2, parameters={m: 2, F: 1}, friction=wrong)
+        with pytest.raises(EomcError, match=message):
+            System.make("slab", {x: 0}, m * v**2 / 2, parameters={m: 2, F: 1}, friction=invalid)
 
 
-def test_what_a_start_is_assembled_from_is_still_told() -> None:
-    told = [str(w) for w in assembled(made_of(FOUR_BAR)).warnings]
-    assert any("the start is assembled: q2 = " in text for text in told)
+def test_assembly_of_a_start_is_reported() -> None:
+    messages = [str(w) for w in assembled(made_of(FOUR_BAR)).warnings]
+    assert any("the start is assembled: q2 = " in text for text in messages)
 
 
-def test_names_that_it_needs_are_not_taken() -> None:
+def test_names_of_modes_are_reserved() -> None:
     text = BLOCK.replace("k  = 10.0", "k  = 10.0\nx_slides = 1.0")
     with pytest.raises(SceneError, match=r"needs the name 'x_slides': rename yours"):
         made_of(text)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("text", "times"), [(CART, 5), (ARM, 8)], ids=["cart", "arm"])
-def test_it_takes_fewer_steps_than_smoothed(text: str, times: float, modules: Modules) -> None:
-    """The figures of docs/adaptive.md: pytest -s tests/runtime/test_sticking.py -k fewer."""
+@pytest.mark.parametrize(("text", "factor"), [(CART, 5), (ARM, 8)], ids=["cart", "arm"])
+def test_sticking_takes_fewer_steps_than_smoothed_friction(
+    text: str, factor: float, modules: Modules
+) -> None:
+    """The numbers of docs/adaptive.md: pytest -s tests/runtime/test_sticking.py -k fewer."""
     smooth = text.replace('friction = "stick"', 'friction = "smooth"\ntolerance = 1e-9')
     smooth = smooth.replace("tolerance = 1e-10\n", "").replace("dry_", "rubbed_")
     smooth = smooth.replace('friction = "F" }', 'friction = "F", friction_width = 0.001 }')
     smooth = smooth.replace('friction = "F/', 'friction_width = 0.001\nfriction = "F/')
-    exact, other = (
+    exact, smoothed = (
         modules.unoptimised(x).simulate(tol=1e-9, duration=5.0).steps for x in (text, smooth)
     )
-    print(f"{exact} steps, smoothed by tanh(v/0.001) {other}")
-    assert times * exact < other
+    print(f"{exact} steps, smoothed by tanh(v/0.001) {smoothed}")
+    assert factor * exact < smoothed
 
 
 @pytest.mark.slow
@@ -298,7 +303,7 @@ def test_check_passes(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["gauss8", "gauss16"])
-def test_implicit_steps_are_refused_by_the_key_that_is_meant(method: str) -> None:
+def test_implicit_methods_are_refused_and_the_key_is_named(method: str) -> None:
     text = BLOCK.replace("[run]\n", f'[run]\nmethod = "{method}"\n')
     with pytest.raises(EomcError, match=r'friction = "stick".*: write friction = "smooth", or '):
         eomc.sources(from_scene(parse(text, "test.toml")))

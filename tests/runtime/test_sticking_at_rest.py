@@ -1,4 +1,4 @@
-"""Friction that sticks from the start, at zero, while forces grow: steps follow no rounding."""
+"""Stick friction at rest at zero under growing forces: steps do not follow rounding."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from links import made_of
 import eomc
 
 BOTH = ", friction = 0.02"
-SLIPS = math.asin(0.4) / 3  # where 0.05 sin(3 t) exceeds 0.02
+SLIP_TIME = math.asin(0.4) / 3  # where 0.05 sin(3 t) exceeds 0.02
 
 JOINT = """eomc = 1
 name = "stuck_joint"
@@ -40,7 +40,7 @@ INPUT = '[inputs]\nu = { signal = "0.05*sin(3*t)", limits = [-0.04, 0.04] }\n[en
 LIMITED = (JOINT.replace("[energy]", INPUT).replace('phi = "0.05*sin(3*t)"', 'phi = "u"')
            .replace("stuck_joint", "stuck_limited"))  # fmt: skip
 
-# the drive psi turns phi by a gear: what holds one holds the other by a row that rounds
+# psi drives phi through a gear: one holds the other through a constraint, which rounds
 GEAR = """eomc = 1
 name = "stuck_gear"
 [coordinates]
@@ -58,7 +58,7 @@ tolerance = 1e-10
 duration = 1
 """
 
-BESIDE = JOINT.replace("[parameters]", "y = { unit = 'm' }\n[parameters]").replace(
+TWO_BODIES = JOINT.replace("[parameters]", "y = { unit = 'm' }\n[parameters]").replace(
     "J*phi_dot**2/2", "J*phi_dot**2/2 + y_dot**2/2"
 ).replace("phi = \"0.05*sin(3*t)\"", 'phi = "0.05*sin(3*t)"\ny = "1e-3*cos(2*t)"').replace(
     "stuck_joint", "stuck_beside"
@@ -70,105 +70,111 @@ def joint(modules: Modules) -> ModuleType:
     return modules.unoptimised(JOINT)
 
 
-def turned(t: float, J: float) -> float:
-    """phi at t, from J phi_ddot = 0.05 sin(3 t) - 0.02 after it slips."""
-    s = t - SLIPS
-    swung = math.cos(3 * SLIPS) * s / 3 - (math.sin(3 * t) - math.sin(3 * SLIPS)) / 9
-    return (0.05 * swung - 0.01 * s**2) / J
+def sliding_angle(t: float, J: float) -> float:
+    """Return phi at t, from J phi_ddot = 0.05 sin(3 t) - 0.02 after it slips."""
+    s = t - SLIP_TIME
+    integral = math.cos(3 * SLIP_TIME) * s / 3 - (math.sin(3 * t) - math.sin(3 * SLIP_TIME)) / 9
+    return (0.05 * integral - 0.01 * s**2) / J
 
 
-def held(run: object, name: str = "phi") -> None:
-    """It rests at 0 to the last bit until it slips, once."""
+def assert_rests_until_slip(run: object, name: str = "phi") -> None:
+    """Assert that it rests at 0 bit for bit until it slips, once."""
     t, q = run.t, run[name]  # type: ignore[attr-defined, index]
     slips = run.events[f"{name}_slips"].t  # type: ignore[attr-defined]
-    assert slips.tolist() == [pytest.approx(SLIPS, abs=1e-14)]
-    assert not np.any(q[t < SLIPS])
+    assert slips.tolist() == [pytest.approx(SLIP_TIME, abs=1e-14)]
+    assert not np.any(q[t < SLIP_TIME])
 
 
 @pytest.mark.parametrize("stiff", [False, True])
 @pytest.mark.parametrize("J", [0.003, 0.01, 0.3, 0.7, 1.0, 3.0, 10.0])
-def test_a_joint_at_zero_rests_until_it_slips(joint: ModuleType, J: float, stiff: bool) -> None:
+def test_joint_at_zero_rests_until_it_slips(joint: ModuleType, J: float, stiff: bool) -> None:
     for tol in (1e-3, 1e-6, 1e-9, 1e-10, 1e-12, 1e-15):
         run = joint.simulate(tol=tol, params={"J": J}, stiff=stiff)
-        held(run)
+        assert_rests_until_slip(run)
         assert run.status == "ok" and run.steps < 30
-        assert run.q[-1, 0] == pytest.approx(turned(1.0, J), rel=max(tol, 1e-14))
+        assert run.q[-1, 0] == pytest.approx(sliding_angle(1.0, J), rel=max(tol, 1e-14))
 
 
-def test_where_it_starts_does_not_matter(joint: ModuleType) -> None:
+def test_initial_position_does_not_matter(joint: ModuleType) -> None:
     starts = np.array([[0.0], [1e-300], [-1e-20], [1e-6], [0.3]])
-    many = joint.simulate_batch(starts, np.zeros_like(starts), times=[0.0, 0.1, 1.0])
-    assert many.q[:, 1, 0].tolist() == starts[:, 0].tolist()
-    np.testing.assert_allclose(many.q[:, 2, 0] - starts[:, 0], turned(1.0, 0.003), rtol=1e-13)
+    batch = joint.simulate_batch(starts, np.zeros_like(starts), times=[0.0, 0.1, 1.0])
+    assert batch.q[:, 1, 0].tolist() == starts[:, 0].tolist()
+    np.testing.assert_allclose(
+        batch.q[:, 2, 0] - starts[:, 0], sliding_angle(1.0, 0.003), rtol=1e-13
+    )
     for duration in (10.0, 1000.0):
         run = joint.simulate(duration=duration)
-        assert run.events["phi_slips"].t[0] == pytest.approx(SLIPS, abs=1e-14)
+        assert run.events["phi_slips"].t[0] == pytest.approx(SLIP_TIME, abs=1e-14)
         assert run.steps < 3 * duration + 10
 
 
 @pytest.mark.parametrize("text", tiers([BOUNDED, LIMITED], BOUNDED), ids=["bounded", "limited"])
-def test_forces_with_corners_hold_it_too(modules: Modules, text: str) -> None:
-    made = modules.unoptimised(text)
-    bend = math.asin(0.8) / 3
-    speed = (0.05 * (math.cos(3 * SLIPS) - 0.6) / 3 - 0.02 * (bend - SLIPS)) / 0.003
-    out = math.pi / 3 - bend
-    at_out = speed + 0.02 * (out - bend) / 0.003
-    end = turned(bend, 0.003) + speed * (out - bend) + 0.01 * (out - bend) ** 2 / 0.003
-    s = 1 - out
-    swung = math.cos(3 * out) * s / 3 - (math.sin(3) - math.sin(3 * out)) / 9
-    end += at_out * s + (0.05 * swung - 0.01 * s**2) / 0.003
+def test_joint_rests_under_forces_with_kinks(modules: Modules, text: str) -> None:
+    module = modules.unoptimised(text)
+    kink_time = math.asin(0.8) / 3
+    speed = (0.05 * (math.cos(3 * SLIP_TIME) - 0.6) / 3 - 0.02 * (kink_time - SLIP_TIME)) / 0.003
+    release_time = math.pi / 3 - kink_time
+    release_speed = speed + 0.02 * (release_time - kink_time) / 0.003
+    end = (
+        sliding_angle(kink_time, 0.003)
+        + speed * (release_time - kink_time)
+        + 0.01 * (release_time - kink_time) ** 2 / 0.003
+    )
+    s = 1 - release_time
+    integral = math.cos(3 * release_time) * s / 3 - (math.sin(3) - math.sin(3 * release_time)) / 9
+    end += release_speed * s + (0.05 * integral - 0.01 * s**2) / 0.003
     for tol in (1e-3, 1e-6, 1e-9, 1e-12):
         for stiff in (False, True):
-            run = made.simulate(tol=tol, stiff=stiff)
-            held(run)
+            run = module.simulate(tol=tol, stiff=stiff)
+            assert_rests_until_slip(run)
             assert run.status == "ok" and run.steps < 120
             assert run.q[-1, 0] == pytest.approx(end, rel=max(10 * tol, 1e-12))
 
 
 @pytest.mark.parametrize("friction", tiers(["", BOTH], BOTH), ids=["one", "both"])
 @pytest.mark.parametrize("bounded", tiers([False, True], True), ids=["smooth", "bounded"])
-def test_what_hangs_on_it_rests_too(modules: Modules, friction: str, bounded: bool) -> None:
-    """psi turns phi/0.3: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
+def test_coupled_bodies_rest_too(modules: Modules, friction: str, bounded: bool) -> None:
+    """psi = 0.3 phi: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
     text = GEAR.replace(" FRICTION", friction)
     if bounded:
         text = text.replace("0.05*sin(3*t)", "min(max(0.05*sin(3*t), -0.04), 0.04)")
-    made = modules.unoptimised(text)
+    module = modules.unoptimised(text)
     for q0 in ([0.0, 0.0], [0.5, 0.15]):
         for tol in (1e-4, 1e-7, 1e-10, 1e-13):
-            run = made.simulate(q0, tol=tol)
+            run = module.simulate(q0, tol=tol)
             assert run.status == "ok" and run.steps < 250
-            rest = run.t < (2 if friction else SLIPS)
+            rest = run.t < (2 if friction else SLIP_TIME)
             np.testing.assert_allclose(run.q[rest, :2], [q0] * np.sum(rest), rtol=0, atol=1e-14)
             if not friction:
-                assert run.events["psi_slips"].t.tolist() == [pytest.approx(SLIPS, abs=1e-11)]
+                assert run.events["psi_slips"].t.tolist() == [pytest.approx(SLIP_TIME, abs=1e-11)]
             if not friction and not bounded:
-                end = turned(1.0, 0.0007 + 0.003 / 0.09)
+                end = sliding_angle(1.0, 0.0007 + 0.003 / 0.09)
                 assert run["psi"][-1] - q0[1] == pytest.approx(end, rel=max(tol, 1e-11))
 
 
-def test_one_rests_while_another_moves(modules: Modules) -> None:
-    made = modules.unoptimised(BESIDE)
+def test_one_body_rests_while_another_moves(modules: Modules) -> None:
+    module = modules.unoptimised(TWO_BODIES)
     for tol in (1e-3, 1e-6, 1e-9, 1e-12):
-        run = made.simulate(tol=tol)
-        held(run)
+        run = module.simulate(tol=tol)
+        assert_rests_until_slip(run)
         assert run.status == "ok" and run.steps < 40
         assert run["y"][-1] == pytest.approx(2.5e-4 * (1 - math.cos(2)), rel=max(tol, 1e-13))
 
 
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("text", tiers([JOINT, BOUNDED], BOUNDED), ids=["smooth", "bounded"])
-def test_the_plain_form_does_the_same(modules: Modules, text: str, tmp_path: Path) -> None:
-    fast, plain = modules.unoptimised(text), eomc.load(made_of(text), tmp_path, form="plain")
+def test_portable_form_rests_too(modules: Modules, text: str, tmp_path: Path) -> None:
+    fast, portable = modules.unoptimised(text), eomc.load(made_of(text), tmp_path, form="plain")
     for tol in (1e-3, 1e-10):
-        run, other = fast.simulate(tol=tol), plain.simulate(tol=tol)
-        held(other)
-        assert other.status == "ok" and other.steps < 80
-        np.testing.assert_allclose(other.q[-1], run.q[-1], rtol=max(10 * tol, 1e-12))
+        run, portable_run = fast.simulate(tol=tol), portable.simulate(tol=tol)
+        assert_rests_until_slip(portable_run)
+        assert portable_run.status == "ok" and portable_run.steps < 80
+        np.testing.assert_allclose(portable_run.q[-1], run.q[-1], rtol=max(10 * tol, 1e-12))
 
 
-def test_a_force_by_sign_is_told_what_to_be(modules: Modules) -> None:
-    """Where the scene says \"stick\" already, that is no remedy."""
-    text = BESIDE.replace("y = {", "y = { rate = 0.01,").replace(
+def test_force_by_sign_is_reported_with_advice(modules: Modules) -> None:
+    r"""Where the scene says \"stick\" already, that is not the advice."""
+    text = TWO_BODIES.replace("y = {", "y = { rate = 0.01,").replace(
         "1e-3*cos(2*t)", "-0.1*sign(y_dot)"
     )
     with pytest.warns(RuntimeWarning, match="give its coordinate friction = in place of"):
