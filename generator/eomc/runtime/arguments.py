@@ -590,8 +590,10 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
     module. t0: start of the run, s. span: duration of the run, s. h: size of fixed steps, s; None:
     adaptive steps.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        least = float(np.spacing(dtype.type(abs(t0) + abs(span))))
+    least = math.ulp(abs(t0) + abs(span))
+    if dtype.itemsize == 4:
+        with np.errstate(over="ignore", invalid="ignore"):
+            least = float(np.spacing(dtype.type(abs(t0) + abs(span))))
     least = least if least < math.inf else math.inf
     if span and h is not None and h < least:
         raise ValueError(

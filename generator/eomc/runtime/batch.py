@@ -170,7 +170,7 @@ class Batch(Component):
         every = min(as_count(options.every, "every", 1), MAX_EVERY)
         u, hold = options.inputs_and_hold(self.info, t0, h, steps, 1)
         batch_adaptive.no_signals(self.model, u, options.control_period)
-        instances = self.instances(options._replace(u=u), -(-steps // hold), t0)
+        instances = self.instances(options, u, -(-steps // hold), t0)
         inputs = instances.inputs
         if inputs is not None and hold > 1 and inputs.shape[1] > 1:
             inputs = np.ascontiguousarray(np.repeat(inputs, hold, axis=1)[:, :steps])
@@ -285,13 +285,15 @@ class Batch(Component):
         )  # fmt: skip
         return status
 
-    def instances(self, options: SimulationArguments, steps: int | None, t0: float) -> Instances:
+    def instances(
+        self, options: SimulationArguments, u: Any, steps: int | None, t0: float
+    ) -> Instances:
         """Check the initial states, parameters and inputs of a batch.
 
-        steps: number of rows of a table of inputs. t0: time, s, at which the initial states are
-        assembled on the constraints.
+        u: inputs, cut to the steps of the run. steps: number of rows of a table of inputs. t0:
+        time, s, at which the initial states are assembled on the constraints.
         """
-        q0, qd0, params, u = options.q0, options.qd0, options.params, options.u
+        q0, qd0, params = options.q0, options.qd0, options.params
         start, table = self.info.initial_state, self.arguments.parameter_rows(params)
         if (params is not None and self.info.start_formulas) or is_by_name(q0, qd0):
             q0, qd0 = initial_state_for_parameters(self.model, q0, qd0, table, many_values=True)

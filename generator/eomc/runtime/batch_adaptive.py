@@ -277,7 +277,7 @@ def _run(
     if count is not None and options.duration is not None:
         u = cut_table(u, model.info.nu, count_periods(options.duration, plan.period), count, 1)
     no_signals(model, u, plan.period or None)
-    instances = model.batch.instances(options._replace(u=u), count, plan.t0)
+    instances = model.batch.instances(options, u, count, plan.t0)
     _, table, inputs, _ = instances
     q, qd = (
         model.arguments.array(x, name, model.info.nq)

@@ -350,13 +350,13 @@ class Constraints(Component):
 
     def assemble(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
         """Return an initial state on the constraints; values that the scene fixes are unchanged."""
+        if q0 is None and qd0 is None and params is None and t0 == 0:
+            return q0, qd0
         q0, qd0 = self.info.with_discrete(q0, 0), self.info.with_discrete(qd0, 1)
         for x, name in ((q0, "q0"), (qd0, "qd0")):
             if x is not None:
                 self.arguments.initial_half(x, name)
-        if not self.info.constraints.names or (
-            q0 is None and qd0 is None and params is None and t0 == 0
-        ):
+        if not self.info.constraints.names:
             return q0, qd0
         q, qd = self.info.initial_state
         return self._project_start(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)

@@ -109,6 +109,10 @@ class SceneInfo:
         Whether the scene is plane: a twist has three components instead of six.
     constraints : ConstraintInfo
         Facts about the constraint equations.
+    discrete_count : int
+        Number of the coordinates that only state jumps change.
+    nq, nu : int
+        Numbers of coordinates and of inputs.
     """
 
     name: str
@@ -133,6 +137,7 @@ class SceneInfo:
     frames: tuple[str, ...]
     plane: bool
     constraints: ConstraintInfo
+    discrete_count: int
     nq: int
     nu: int
 
@@ -153,6 +158,7 @@ class SceneInfo:
             return array
 
         q, qd = scene["start"]
+        constraints = ConstraintInfo(*scene.get("constrained", ()))
         return cls(
             name=scene["name"],
             title=scene["title"],
@@ -175,7 +181,8 @@ class SceneInfo:
             events=tuple(scene.get("events", ())),
             frames=tuple(scene.get("frames", ())),
             plane=scene.get("plane", False),
-            constraints=ConstraintInfo(*scene.get("constrained", ())),
+            constraints=constraints,
+            discrete_count=len(constraints.modes) + constraints.discrete,
             nq=len(scene["coordinates"]),
             nu=len(scene["inputs"]),
         )
@@ -200,11 +207,6 @@ class SceneInfo:
         return self.coordinates[self.nq - self.discrete_count :]
 
     @property
-    def discrete_count(self) -> int:
-        """Number of the coordinates that only state jumps change."""
-        return len(self.constraints.modes) + self.constraints.discrete
-
-    @property
     def frame_size(self) -> int:
         """Number of components of a twist or wrench: 6, in plane scenes 3."""
         return 3 if self.plane else 6
@@ -220,7 +222,7 @@ class SceneInfo:
         array of any other shape, or None, is returned unchanged.
         """
         count = self.discrete_count
-        if not count or np.shape(x)[-1:] != (self.nq - count,):
+        if x is None or not count or np.shape(x)[-1:] != (self.nq - count,):
             return x
         shape = (*np.shape(x)[:-1], count)
         values = self.initial_state[half][-count:]

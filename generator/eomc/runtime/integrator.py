@@ -337,6 +337,10 @@ class Integrator(Component):
             return short
         estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self.model.constraints.assemble(q0, qd0, t0, params)
+        if is_simple and u is duration is tol is h_most is None and stiff is False:
+            run = self._short_run((q0, qd0), h, steps, every, params, method, t0)
+            if run is not None:
+                return run
         options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, out,
             progress, tol, times, h_most, stiff,
@@ -345,24 +349,22 @@ class Integrator(Component):
             return self._finish(adaptive.simulate(self.model, options), estimate)
         if self.info.events and not self.ignores_events:
             return self._finish(adaptive.simulate_fixed_steps(self.model, options), estimate)
-        if is_simple and u is duration is None and type(steps) is type(every) is int:
-            run = self._short_run(options)
-            if run is not None:
-                return run
         return self._finish(self._fixed_steps(options), estimate)
 
-    def _short_run(self, options: SimulationArguments) -> Run | None:
+    def _short_run(
+        self, start: tuple[Any, Any], h: float | None, steps: Any, every: Any, params: Any,
+        method: str | None, t0: float,
+    ) -> Run | None:  # fmt: skip
         """Simulate a short run by fixed steps in a single call of C.
 
         Return None, and let the caller take the general path, if the run has many steps, does not
-        reach its end, or begins so late that its times need a check.
+        reach its end, or begins so late that its times need a check. start: q0 and qd0. The
+        arguments are those of `simulate`, of which only the initial state is checked already.
         """
-        q0, qd0, h, steps, every, params = (
-            options.q0, options.qd0, options.h, cast(int, options.steps), options.every,
-            options.params,
-        )  # fmt: skip
-        info, t0 = self.info, options.t0
-        method = options.method or info.methods[0]
+        if not (type(steps) is type(every) is int and (method is None or type(method) is str)):
+            return None
+        info, (q0, qd0) = self.info, start
+        method = method or info.methods[0]
         if (loop := self.loops.get(method)) is None or not 0 < every <= loop.short >= steps >= 0:
             return None
         h = info.h if h is None else as_step_size(h, info.dtype)
