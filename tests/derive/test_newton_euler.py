@@ -422,9 +422,9 @@ def flops(text: str) -> int:
 @pytest.mark.parametrize("arms", tiers([2, 6], 2))
 def test_zero_blocks_between_branches_are_not_computed(arms: int) -> None:
     """The arms of a star cost as much together as they cost one by one."""
-    column_name, many = program_from(trees.star(1, 2)), program_from(trees.star(arms, 2))
+    single, many = program_from(trees.star(1, 2)), program_from(trees.star(arms, 2))
     for name in ("acceleration", "D", "bias", "g"):
-        assert abs(many[name].cost.flops - arms * column_name[name].cost.flops) <= arms, name
+        assert abs(many[name].cost.flops - arms * single[name].cost.flops) <= arms, name
     n = 2 * arms
     D = np.array([o.coefficient != 0 for o in many["D"].outputs]).reshape(n, n)
     assert not np.any(D & ~np.kron(np.eye(arms, dtype=bool), np.ones((2, 2), bool)))
@@ -472,10 +472,10 @@ def test_grouped_inertias_save_flops_and_preserve_the_motion(
     )
     plain = every_route(system, accelerations)
     for route in ("composite", "articulated"):
-        column_name, other = (functions["acceleration", route] for functions in (grouped, plain))
-        assert column_name.cost.flops < other.cost.flops
+        one, other = (functions["acceleration", route] for functions in (grouped, plain))
+        assert one.cost.flops < other.cost.flops
         for state in states(system):
-            (a, _), (b, _) = evaluate(column_name, state), evaluate(other, state)
+            (a, _), (b, _) = evaluate(one, state), evaluate(other, state)
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.max(np.abs(b)))
 
 

@@ -21,10 +21,7 @@ TOLERANCE = 25  # of 255, for the mean of a block: versions of matplotlib smooth
 
 
 def render_image(drawing):
-    """Render the last instant and the paths without axes and texts, whose fonts differ:
-
-    (SIZE, SIZE).
-    """
+    """Render the last instant and the paths without axes and texts; return (SIZE, SIZE)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

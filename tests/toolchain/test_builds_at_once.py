@@ -1,4 +1,4 @@
-"""Builds of one name side by side: each has its own module, or the last."""
+"""Simultaneous builds of one name: each loads its own module, or the last one."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_module_that_another_build_replaces_is_not_taken_for_ones_own(
+def test_module_replaced_by_another_build_is_not_loaded(
     scene: Path, root: Path, found: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A scene of the same name, built between this one's build and its loading: tried again."""
+    """A scene of the same name is built between this build and its loading, which is repeated."""
     other, load, times = tmp_path / "other.toml", cache.load, 0
     other.write_text(CHANGED, encoding="utf-8")
 
-    def late(built: cache.Built) -> ModuleType:
+    def build_other_scene(built: cache.Built) -> ModuleType:
         nonlocal times
         times += 1
         if times <= most:
             eomc.build(other, root)
         return load(built)
 
-    monkeypatch.setattr(cache, "load", late)
+    monkeypatch.setattr(cache, "load", build_other_scene)
     most = 2
     assert eomc.load(scene, root).g([1.0])[0] == pytest.approx(8.2548, abs=1e-3)
     assert times == 3
@@ -40,12 +40,12 @@ def test_a_module_that_another_build_replaces_is_not_taken_for_ones_own(
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_a_face_that_another_build_replaces_meanwhile_is_not_loaded(
+def test_module_with_the_manifest_of_another_build_is_not_loaded(
     scene: Path, root: Path, found: None, tmp_path: Path
 ) -> None:
-    """The manifest, which is moved last, is still the old one's."""
+    """The manifest, which is moved last, is still the old one."""
     folder, other = root / "simple_pendulum", tmp_path / "other.toml"
-    scene.write_text(TEXT.replace('"m*g*y"', '"3*m*g*y"'), encoding="utf-8")  # loaded by no test
+    scene.write_text(TEXT.replace('"m*g*y"', '"3*m*g*y"'), encoding="utf-8")  # no test loads it
     old = eomc.build(scene, root)
     manifest = (folder / "build.json").read_bytes()
     other.write_text(CHANGED, encoding="utf-8")
@@ -59,8 +59,8 @@ def test_a_face_that_another_build_replaces_meanwhile_is_not_loaded(
     assert how == "raised" and str(words).startswith("ReplacedError: "), words
 
 
-def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
-    """One of them builds, the other waits and finds."""
+def test_two_simultaneous_builds_succeed(scene: Path, root: Path) -> None:
+    """One of them builds; the other waits and uses the result."""
     both = [started(scene, root) for _ in range(2)]
     for process in both:
         process.join(60)
@@ -70,8 +70,10 @@ def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path: Path) -> None:
-    """The last one stays, and it is whole."""
+def test_simultaneous_builds_of_two_scenes_of_one_name(
+    scene: Path, root: Path, tmp_path: Path
+) -> None:
+    """The last module remains and is complete."""
     other = tmp_path / "other.toml"
     other.write_text(CHANGED, encoding="utf-8")
     both = [started(file, root) for file in (scene, other)]

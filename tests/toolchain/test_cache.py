@@ -1,4 +1,4 @@
-"""A build is done once: what it depends on, and which compiler it takes."""
+"""A build is done once: its dependencies and its compiler."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 # --- when ----------------------------------------------------------------------------------------
 
 
-def test_nothing_is_built_where_nothing_has_changed(
+def test_unchanged_scene_is_not_built_again(
     scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = eomc.build(scene, root)
@@ -40,18 +40,18 @@ def test_nothing_is_built_where_nothing_has_changed(
     before = marks(first.folder)
     assert {"simple_pendulum.c", "simple_pendulum.h", "main.c", "__init__.py"} <= set(before)
 
-    def never(*_: object, **__: object) -> None:
+    def fail_if_called(*_: object, **__: object) -> None:
         raise AssertionError("nothing is to be read or derived")
 
-    monkeypatch.setattr(eomc, "read", never)
-    monkeypatch.setattr(eomc, "sources", never)
+    monkeypatch.setattr(eomc, "read", fail_if_called)
+    monkeypatch.setattr(eomc, "sources", fail_if_called)
     second = eomc.build(scene, root)
     assert not second.fresh
     assert marks(second.folder) == before
 
 
-def test_what_is_found_is_found_without_sympy(scene: Path, root: Path, found: None) -> None:
-    """That is what makes it take a tenth of a second."""
+def test_current_build_is_loaded_without_sympy(scene: Path, root: Path, found: None) -> None:
+    """The command then takes a tenth of a second."""
     assert not eomc.build(scene, root).fresh
     code = "import sys, eomc; eomc.load(*sys.argv[1:]).D([0.0]); sys.exit('sympy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code, str(scene), str(root)], check=True)
@@ -59,28 +59,28 @@ def test_what_is_found_is_found_without_sympy(scene: Path, root: Path, found: No
 
 @pytest.fixture
 def bytecode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder in which Python keeps bytecode; those of the package are there."""
+    """Set an empty folder as the cache of Python's bytecode, with the package's own subfolder."""
     monkeypatch.setattr(sys, "pycache_prefix", str(tmp_path / "kept"))
     Path(importlib.util.cache_from_source(render.__file__)).parent.mkdir(parents=True)
     return tmp_path / "kept"
 
 
-def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
+def test_templates_are_compiled_once_and_cached_with_bytecode(
     scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
-    system, made = eomc.read(scene), []
+    system, files_of_builds = eomc.read(scene), []
     for k in range(3):
         render.environment.cache_clear()
-        made.append(eomc.sources(system).files)
+        files_of_builds.append(eomc.sources(system).files)
         files = list(bytecode.rglob("eomc-template-*.cache"))
         assert len(files) > 5
-        for file in files:  # whatever happens to them
+        for file in files:  # even if they are damaged
             file.write_bytes(b"nonsense" if k else file.read_bytes()[:-40])
-    assert made[0] == made[1] == made[2]
+    assert files_of_builds[0] == files_of_builds[1] == files_of_builds[2]
 
 
-def test_no_bytecode_is_written_where_python_may_write_none(
+def test_no_bytecode_is_written_if_python_may_not(
     scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     render.environment.cache_clear()
@@ -89,7 +89,7 @@ def test_no_bytecode_is_written_where_python_may_write_none(
     assert not [path for path in bytecode.rglob("*") if path.is_file()]
 
 
-def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
+def test_garbage_collection_is_restored(scene: Path, tmp_path: Path) -> None:
     assert gc.isenabled()
     eomc.sources(eomc.read(scene))
     assert gc.isenabled()
@@ -97,7 +97,7 @@ def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(eomc.SceneError):
         eomc.read(scene)
     assert gc.isenabled()
-    gc.disable()  # somebody else's wish
+    gc.disable()  # the caller has disabled it
     try:
         with pytest.raises(eomc.SceneError):
             eomc.read(scene)
@@ -106,27 +106,27 @@ def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
         gc.enable()
 
 
-def test_what_a_build_depends_on(
+def test_key_depends_on_scene_flags_compiler_and_generator(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scene, flags, compiler, generator: each of them changed gives another key."""
+    """A change of any of them gives another key."""
     keys: list[str] = []
 
     def key() -> str:
         return cache.key(pipeline.name_and_digest(scene)[1])
 
-    def new() -> bool:
+    def is_new_key() -> bool:
         keys.append(key())
         assert key() == keys[-1]
         return keys[-1] not in keys[:-1]
 
-    assert new()
+    assert is_new_key()
     scene.write_text(TEXT + "\n# a comment\n", encoding="utf-8")
-    assert new()
+    assert is_new_key()
     monkeypatch.setenv("EOMC_CFLAGS", "-O1")
-    assert new()
+    assert is_new_key()
     monkeypatch.setenv("CC", script(tmp_path / "mycc", 'exec cc "$@"\n'))
-    assert new()
+    assert is_new_key()
     generator = tmp_path / "clone" / "generator" / "eomc"
     shutil.copytree(resources.PACKAGE, generator)
     for part in ("templates", "csrc"):
@@ -134,63 +134,63 @@ def test_what_a_build_depends_on(
     monkeypatch.setattr(resources, "PACKAGE", generator)
     cache.generator_digest.cache_clear()
     try:
-        assert not new()  # an exact copy
+        assert not is_new_key()  # an exact copy
         with (generator / "derive" / "tape.py").open("a") as file:
             file.write("\n")
         cache.generator_digest.cache_clear()
-        assert new()
+        assert is_new_key()
     finally:
         cache.generator_digest.cache_clear()
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_bytecode_of_the_build_before_is_not_taken(scene: Path, root: Path, found: None) -> None:
-    """Python knows it by the second and the size of its source, which may be the same."""
+def test_bytecode_of_the_previous_build_is_not_used(scene: Path, root: Path, found: None) -> None:
+    """Python identifies it by the second and the size of its source, which may be the same."""
     files = sorted((root / "simple_pendulum").glob("*.py"))
-    ahead = time.time() + 100
+    future = time.time() + 100
     for file in files:
-        os.utime(file, (ahead, ahead))
+        os.utime(file, (future, future))
     scene.write_text(CHANGED, encoding="utf-8")
     assert eomc.build(scene, root).fresh
-    assert all(int(file.stat().st_mtime) > int(ahead) for file in files)
+    assert all(int(file.stat().st_mtime) > int(future) for file in files)
 
 
-def test_builds_of_other_versions_are_kept_some_of_them(
+def test_some_previous_builds_are_archived(
     scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For what they have pickled; not of the same scene with other flags."""
+    """Pickled runs need them; a build of the same scene with other flags is not archived."""
     monkeypatch.setattr(cache, "MAX_ARCHIVED_BUILDS", 1)
     folder = root / "simple_pendulum"
-    kept, keys = folder / ".builds", [json.loads((folder / cache.MANIFEST).read_text())["key"]]
+    archive, keys = folder / ".builds", [json.loads((folder / cache.MANIFEST).read_text())["key"]]
     monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DOTHER")
     eomc.build(scene, root)
-    assert not kept.exists()
+    assert not archive.exists()
     for text in (CHANGED, CHANGED + "# a comment\n"):
         keys.append(json.loads((folder / cache.MANIFEST).read_text())["key"])
         scene.write_text(text, encoding="utf-8")
         eomc.build(scene, root)
-        assert [place.name for place in kept.iterdir()] == [keys[-1][:12]]
-        assert cache.is_built(kept / keys[-1][:12], keys[-1])
+        assert [place.name for place in archive.iterdir()] == [keys[-1][:12]]
+        assert cache.is_built(archive / keys[-1][:12], keys[-1])
 
 
-def test_a_list_of_files_that_lacks_one_is_no_build(root: Path, found: None) -> None:
-    """Whatever lies there would be run."""
+def test_manifest_without_a_required_file_is_no_build(root: Path, found: None) -> None:
+    """A file that is not listed would be executed unchecked."""
     folder = root / "simple_pendulum"
     manifest = json.loads((folder / cache.MANIFEST).read_text(encoding="utf-8"))
     key, files = manifest["key"], manifest["files"]
     assert cache.is_built(folder, key)
 
-    def altered(**change: object) -> bool:
+    def write_altered_manifest(**change: object) -> bool:
         text = json.dumps({k: x for k, x in (manifest | change).items() if x is not None})
         (folder / cache.MANIFEST).write_text(text, encoding="utf-8")
         return cache.is_built(folder, key)
 
-    assert altered()
+    assert write_altered_manifest()
     for name in files:
-        assert not altered(files={n: x for n, x in files.items() if n != name}), name
+        assert not write_altered_manifest(files={n: x for n, x in files.items() if n != name}), name
     for change in ({"files": {}}, {"files": {}, "files_digest": None}, {"files_digest": None}):
-        assert not altered(**change)
-    assert not altered(files=[]) and not altered(files=None)
+        assert not write_altered_manifest(**change)
+    assert not write_altered_manifest(files=[]) and not write_altered_manifest(files=None)
 
 
 @pytest.fixture
@@ -201,10 +201,10 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiler.importlib.util, "find_spec", hidden)
 
 
-def test_what_is_built_and_unchanged_needs_no_compiler(
+def test_current_build_needs_no_compiler(
     scene: Path, root: Path, found: None, no_compiler: None
 ) -> None:
-    """Of any compiler; not where anything else has changed."""
+    """Whatever compiler built it; after any other change a compiler is needed."""
     built = cache.Built("simple_pendulum", root / "simple_pendulum", False)
     before = marks(built.folder)
     assert not eomc.build(scene, root).fresh and marks(built.folder) == before
@@ -215,14 +215,14 @@ def test_what_is_built_and_unchanged_needs_no_compiler(
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
     scene.write_text(TEXT, encoding="utf-8")
-    (built.folder / "_runtime" / "status.py").write_text("", encoding="utf-8")  # no longer whole
+    (built.folder / "_runtime" / "status.py").write_text("", encoding="utf-8")  # damaged
     with pytest.raises(eomc.EomcError, match="no C compiler found"):
         eomc.build(scene, root)
 
 
 @pytest.mark.usefixtures("no_compiler")
-def test_no_compiler_at_all(scene: Path, root: Path) -> None:
-    """One sentence, and the one thing that pip can install."""
+def test_missing_compiler_is_reported_with_a_remedy(scene: Path, root: Path) -> None:
+    """The message is one sentence and names the package that pip can install."""
     with pytest.raises(eomc.EomcError) as fault:
         eomc.build(scene, root)
     assert "\n" not in str(fault.value)
@@ -231,7 +231,7 @@ def test_no_compiler_at_all(scene: Path, root: Path) -> None:
     assert not root.exists()
 
 
-def test_a_compiler_that_is_not_there(
+def test_unknown_compiler_is_reported(
     scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", "/nowhere/cc -m64")
@@ -240,7 +240,7 @@ def test_a_compiler_that_is_not_there(
 
 
 @pytest.mark.parametrize("cc", tiers(["clang", "gcc -m64"], "gcc -m64"))
-def test_the_compiler_that_was_asked_for(
+def test_requested_compiler_is_used(
     scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch, cc: str
 ) -> None:
     needs(cc.split()[0])
@@ -252,10 +252,10 @@ def test_the_compiler_that_was_asked_for(
     assert cc.split()[-1] in (root / "simple_pendulum" / "build.json").read_text()
 
 
-def test_what_compilers_vectorise_goes_into_half_of_the_widest_registers(
+def test_compilers_vectorise_with_half_of_the_widest_registers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Straight-line code is faster so; lanes are as wide as they are asked to be."""
+    """Straight-line code is faster so; lanes have the requested width."""
     monkeypatch.delenv("EOMC_CFLAGS", raising=False)
     monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2 avx512f")
     assert compiler.flags()[-1] == "-mprefer-vector-width=256"
@@ -263,10 +263,10 @@ def test_what_compilers_vectorise_goes_into_half_of_the_widest_registers(
     assert compiler.flags() == compiler.FLAGS
 
 
-def test_a_relative_root_survives_another_current_folder(
+def test_relative_root_is_valid_in_another_current_folder(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pendulum: tuple[Path, float]
 ) -> None:
-    """Python caches a finder for each path; that of a relative one looked in the old folder."""
+    """Python caches a finder for each path; that of a relative path searched the old folder."""
     shutil.copytree(pendulum[0], tmp_path / "one" / "build" / "simple_pendulum")
     for place in ("one", "other"):
         (tmp_path / place).mkdir(exist_ok=True)
@@ -275,16 +275,16 @@ def test_a_relative_root_survives_another_current_folder(
         scene.write_text(CHANGED, encoding="utf-8")
 
 
-def test_a_system_of_which_something_was_replaced_is_built_anew(tmp_path: Path) -> None:
-    made = eomc.System.make("swing", {"a": 1.0}, "a_dot**2/2", "-cos(a)")
-    assert eomc.load(made, tmp_path).methods == ("rk4",)
-    other = replace(made, run=replace(made.run, methods=("dp8",)))
+def test_system_with_a_replaced_part_is_rebuilt(tmp_path: Path) -> None:
+    system = eomc.System.make("swing", {"a": 1.0}, "a_dot**2/2", "-cos(a)")
+    assert eomc.load(system, tmp_path).methods == ("rk4",)
+    other = replace(system, run=replace(system.run, methods=("dp8",)))
     assert eomc.load(other, tmp_path).methods == ("dp8",)
     assert not pipeline.build(other, tmp_path).fresh
 
 
-def test_the_folder_of_a_model_lists_what_its_user_needs(root: Path, scene: Path) -> None:
-    """Python's own files are in `_runtime`; those that a former version left are removed."""
+def test_folder_of_a_model_contains_the_files_for_its_user(root: Path, scene: Path) -> None:
+    """Python's own files are in `_runtime`; those of a previous version are removed."""
     built = eomc.build(scene, root)
     manifest = built.folder / "build.json"
     contents = json.loads(manifest.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Which compiler is called, and what is said of one that takes its time."""
+"""Choice of the compiler, and the message while ziglang prepares its libraries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eomc.toolchain import compiler
 
 @pytest.fixture
 def ziglang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """ziglang is the only compiler, here a script that calls gcc; where it keeps its libraries."""
+    """Make ziglang the only compiler, by a script that calls gcc; return its library cache."""
     package = tmp_path / "site" / "ziglang"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("", encoding="utf-8")
@@ -34,20 +34,20 @@ def ziglang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_the_first_build_by_ziglang_says_that_it_prepares(
+def test_first_build_by_ziglang_reports_its_preparation(
     scene: Path, root: Path, ziglang: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
 
-    told: list[str] = []
-    assert eomc.build(scene, root, warn=lambda p: told.append(str(p))).fresh
-    assert len(told) == 1 and "note: ziglang prepares its libraries" in told[0]
+    messages: list[str] = []
+    assert eomc.build(scene, root, warn=lambda p: messages.append(str(p))).fresh
+    assert len(messages) == 1 and "note: ziglang prepares its libraries" in messages[0]
     (ziglang / "o").mkdir(parents=True)
     scene.write_text(CHANGED, encoding="utf-8")
-    assert eomc.build(scene, root, warn=lambda p: told.append(str(p))).fresh
-    assert len(told) == 1
+    assert eomc.build(scene, root, warn=lambda p: messages.append(str(p))).fresh
+    assert len(messages) == 1
 
 
-def test_other_compilers_prepare_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_compilers_report_no_preparation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/nowhere")
     assert compiler.first_call_note() == ""

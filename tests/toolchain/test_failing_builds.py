@@ -1,4 +1,4 @@
-"""A build that fails, or is ended, leaves what was there, and says why."""
+"""A failed or interrupted build leaves the previous module and reports the reason."""
 
 from __future__ import annotations
 
@@ -22,16 +22,22 @@ import eomc
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def test_a_failing_compiler_is_heard(
+def test_message_of_a_failing_compiler_is_printed(
     scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In its own words, with the command; the old module stays, and nothing half-made."""
+    """With the command; the old module remains, and no incomplete file."""
     before = marks(root / "simple_pendulum")
-    failing = script(tmp_path / "failing", "echo 'out of cheese' >&2\nexit 3\n")
-    monkeypatch.setenv("CC", failing)
+    failing_compiler = script(tmp_path / "failing", "echo 'out of cheese' >&2\nexit 3\n")
+    monkeypatch.setenv("CC", failing_compiler)
     with pytest.raises(eomc.EomcError) as fault:
         eomc.build(scene, root)
-    for words in ("simple_pendulum", "out of cheese", "status 3", failing, "simple_pendulum.c"):
+    for words in (
+        "simple_pendulum",
+        "out of cheese",
+        "status 3",
+        failing_compiler,
+        "simple_pendulum.c",
+    ):
         assert words in str(fault.value)
     assert marks(root / "simple_pendulum") == before
     assert leftovers(root) == []
@@ -41,7 +47,7 @@ def test_a_failing_compiler_is_heard(
     assert gravity(root) == 2 * built
 
 
-def test_a_failing_linker_is_heard(
+def test_message_of_a_failing_linker_is_printed(
     scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = 'case "$*" in *-shared*) echo "no such library"; exit 1;; esac\nexec cc "$@"\n'
@@ -52,10 +58,10 @@ def test_a_failing_linker_is_heard(
     assert gravity(root) == built
 
 
-def test_no_compiler_is_left_running_after_a_failure(
+def test_no_compiler_runs_after_a_failure(
     scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both compilations are over when the error comes, whichever of them failed."""
+    """Both compilations have ended when the error is raised, whichever of them failed."""
     text = 'case "$*" in *binding.c*) exec sleep 3;; esac\necho "out of cheese"; exit 1\n'
     monkeypatch.setenv("CC", script(tmp_path / "failing", text))
 
@@ -71,10 +77,10 @@ def test_no_compiler_is_left_running_after_a_failure(
     assert in_a_fork(build, 20) == ("done", True), "a compiler is still running"
 
 
-def test_a_compiler_that_is_ended_removes_its_temporary_files(
+def test_terminated_compiler_removes_its_temporary_files(
     scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One compilation fails while the other has a file of its own, as gcc has."""
+    """One compilation fails while the other has a temporary file, as gcc has."""
     own = tmp_path / "ccOwn.s"
     text = f"""case "$*" in *binding.c*)
         trap 'rm {own}; exit 1' TERM; touch {own}; sleep 20 & wait;; esac
@@ -86,7 +92,7 @@ def test_a_compiler_that_is_ended_removes_its_temporary_files(
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Bytes and dates of the files below, by path."""
+    """Return contents and dates of the files below a folder, by path."""
     files = (f for f in folder.rglob("*") if f.is_file() and f.suffix != ".pyc")
     return {str(f): (f.read_bytes(), f.stat().st_mtime_ns) for f in files}
 
@@ -101,17 +107,17 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     ],
     ids=["full-links", "full-copies", "ctrl_c-links", "ctrl_c-copies"],
 )
-def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
+def test_build_that_cannot_be_moved_leaves_all_files_unchanged(
     fault: BaseException, links: bool, scene: Path, root: Path, built: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Header, C, Python's files and library, at whichever of them it fails."""
+    """Header, C, Python's files and library are unchanged, whichever of them the move fails at."""
     folder, move, moved = root / "simple_pendulum", os.replace, list[str]()
     (folder / "_runtime" / "status.py").write_text("of another version", encoding="utf-8")
-    (folder / "_runtime" / "inputs.py").unlink()  # which that had not yet
+    (folder / "_runtime" / "inputs.py").unlink()  # the previous build had no such file
     before, last = contents(folder), ""
 
-    def failing(old: Path, new: Path) -> None:
+    def failing_replace(old: Path, new: Path) -> None:
         if ".old" not in Path(old).parts:
             moved.append(str(Path(new).relative_to(folder)))
             if moved[-1] == last:
@@ -121,7 +127,7 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
     def no_links(*_: Path) -> None:
         raise OSError(errno.EPERM, "not here")
 
-    monkeypatch.setattr(os, "replace", failing)
+    monkeypatch.setattr(os, "replace", failing_replace)
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     for last in ("simple_pendulum.c", "_runtime/status.py", "__init__.py", "build.json"):
@@ -136,9 +142,10 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
 
 @contextlib.contextmanager
 def sleeping_compiler(folder: Path) -> Iterator[tuple[str, Path]]:
-    """A compiler that sleeps, and the file where it tells its process ids.
+    """Write a compiler that sleeps, and the file with its process ids.
 
-    It tells them late: by then who has started it knows it too, and may be interrupted.
+    It writes them after a delay, when the process that started it knows them and may be
+    interrupted.
     """
     pids = folder / "pids"
     cc = script(folder / "sleeping", f"sleep 0.3\necho $$ >> {pids}\nexec sleep 60\n")
@@ -150,14 +157,14 @@ def sleeping_compiler(folder: Path) -> Iterator[tuple[str, Path]]:
                 os.kill(int(pid), signal.SIGKILL)
 
 
-def sleepers(pids: Path) -> list[int]:
-    """Those of the compilers that are still there."""
-    found = []
+def running_compilers(pids: Path) -> list[int]:
+    """Return the ids of compilers that still run."""
+    running = []
     for pid in map(int, pids.read_text().split()):
         with contextlib.suppress(OSError):
             if "sleep" in Path(f"/proc/{pid}/cmdline").read_text():
-                found.append(pid)
-    return found
+                running.append(pid)
+    return running
 
 
 def wait_for(file: Path, lines: int) -> None:
@@ -169,12 +176,12 @@ def wait_for(file: Path, lines: int) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=["SIGKILL", "SIGINT"])
-def test_a_build_that_is_killed_leaves_the_old_module(
+def test_killed_build_leaves_the_old_module(
     scene: Path, root: Path, built: float, tmp_path: Path, how: signal.Signals
 ) -> None:
-    """What SIGKILL leaves the next build clears away; Ctrl-C ends the compilers too.
+    """The next build removes the files left by SIGKILL; Ctrl-C terminates the compilers as well.
 
-    Even where they did not hear of it themselves.
+    This holds even if the signal did not reach the compilers.
     """
     with sleeping_compiler(tmp_path) as (cc, pids):
         process = started(scene, root, CC=cc)
@@ -187,10 +194,10 @@ def test_a_build_that_is_killed_leaves_the_old_module(
         if how is signal.SIGINT:
             assert leftovers(root) == []
             for _ in range(50):
-                if not sleepers(pids):
+                if not running_compilers(pids):
                     break
                 time.sleep(0.1)
-            assert sleepers(pids) == []
+            assert running_compilers(pids) == []
     if how is signal.SIGKILL:
         assert leftovers(root) != []
         assert eomc.build(scene, root).fresh
@@ -199,10 +206,10 @@ def test_a_build_that_is_killed_leaves_the_old_module(
 
 
 @pytest.mark.parametrize("n", tiers([1, 2, 3], 2))
-def test_ctrl_c_while_a_compiler_is_started_ends_it_too(
+def test_ctrl_c_during_the_start_of_a_compiler_terminates_it(
     n: int, scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the n-th, the linker at last, the process is there, but Popen not over."""
+    """The n-th process, at last the linker, has started, but Popen has not returned."""
 
     class Popen(subprocess.Popen):  # type: ignore[type-arg]
         count = 0
@@ -218,14 +225,14 @@ def test_ctrl_c_while_a_compiler_is_started_ends_it_too(
         linker = f'case "$*" in *-shared*) exec {cc};; esac\nexec cc "$@"\n'
         monkeypatch.setenv("CC", cc if n < 3 else script(tmp_path / "linker", linker))
         monkeypatch.setattr(subprocess, "Popen", Popen)
-        begun = time.monotonic()
+        start = time.monotonic()
         how, words = in_a_fork(lambda: eomc.build(scene, root).name, 20)
         assert (how, words) == ("raised", "KeyboardInterrupt: ")
-        assert sleepers(pids) == [] and time.monotonic() - begun < 10
+        assert running_compilers(pids) == [] and time.monotonic() - start < 10
     assert leftovers(root) == [] and gravity(root) == built
 
 
-def test_a_place_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
+def test_unwritable_root_is_reported(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     with pytest.raises(
         eomc.EomcError, match=r"file.*can't be written .*: choose another folder, root="
@@ -234,14 +241,14 @@ def test_a_place_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_place(scene: Path, root: Path) -> None:
+def test_read_only_root_is_reported(scene: Path, root: Path) -> None:
     root.mkdir()
     root.chmod(0o500)
     with pytest.raises(eomc.EomcError, match=r"can't be written \(Permission denied\).*--build"):
         eomc.build(scene, root)
 
 
-def test_a_faulty_scene_is_not_built(scene: Path, root: Path, found: None) -> None:
+def test_invalid_scene_is_not_built(scene: Path, root: Path, found: None) -> None:
     before = marks(root / "simple_pendulum")
     scene.write_text(TEXT.replace('"m*g*y"', '"m*gg*y"'), encoding="utf-8")
     with pytest.raises(eomc.SceneError, match="'gg'"):

@@ -1,6 +1,6 @@
-"""Units of FMI in an importer: both versions, both kinds, against the scene's own module.
+"""Compare FMUs in an importer, of both versions and both kinds, with the scene's module.
 
-Co-simulation has the bits of the plain form, from which its binary is compiled.
+Co-simulation agrees bitwise with the portable form, from which its binary is compiled.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ def _fmpy() -> None:
 
 
 def states(scene: str) -> list[str]:
-    """The names of coordinates and velocities."""
+    """Return the names of coordinates and velocities."""
     if "\n" not in scene:
         scene = (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
     names = [c.name for c in from_scene(parse(scene, "test.toml")).coordinates]
     return [*names, *(f"{n}_dot" for n in names)]
 
 
-def moved(run: Any) -> np.ndarray:
-    """The rows of a run, [q, qd]."""
+def states_of_run(run: Any) -> np.ndarray:
+    """Return the rows of a run, [q, qd]."""
     return np.hstack([run.q, run.qd])
 
 
-# the scene's own functions are the same in both; what only tells them is tested in both quickly
+# both versions share the scene's functions; code that differs is tested for both in the quick tier
 NAMED = ("fmi2", "fmi3")
 both = pytest.mark.parametrize("version", VERSIONS, ids=NAMED)
 
@@ -67,14 +67,14 @@ def version(request: pytest.FixtureRequest) -> int:
 
 @pytest.fixture
 def hosts() -> Iterator[list[Host]]:
-    """Instances that are freed at the end."""
-    found: list[Host] = []
-    yield found
-    for host in found:
+    """Yield a list of instances, which are freed at the end."""
+    instances: list[Host] = []
+    yield instances
+    for host in instances:
         host.free()
 
 
-# rows and multipliers, events and outputs, single precision; then what adds little to them
+# constraints and multipliers, events and outputs, single precision; then cases that add little
 SCENES_TESTED = [
     "four_bar", BALL, FLOAT, "cartpole", "cartpole_driven", "kapitza_pendulum", "cartpole_bodies",
 ]  # fmt: skip
@@ -83,7 +83,7 @@ IDS = [s if "\n" not in s else s.split('"')[1] for s in SCENES_TESTED]
 
 @both
 @pytest.mark.parametrize("scene", tiers(SCENES_TESTED, *SCENES_TESTED[:3]), ids=IDS)
-def test_it_is_valid(scene: str, version: int) -> None:
+def test_fmu_is_valid(scene: str, version: int) -> None:
     from fmpy.validation import validate_fmu
 
     assert validate_fmu(str(exported(scene, version))) == []
@@ -94,7 +94,7 @@ def test_it_is_valid(scene: str, version: int) -> None:
     "scene",
     tiers(["cartpole", "kapitza_pendulum", "cartpole_bodies", "four_bar"], "cartpole", "four_bar"),
 )
-def test_whole_steps_have_the_bits_of_the_module(
+def test_whole_steps_agree_bitwise_with_the_module(
     scene: str, version: int, hosts: list[Host]
 ) -> None:
     module, names = plain(scene), states(scene)
@@ -102,23 +102,23 @@ def test_whole_steps_have_the_bits_of_the_module(
     host = Host(exported(scene, version))
     hosts.append(host)
     host.start()
-    assert np.array_equal(rows(host, names, 3 * run.h, 20), moved(run)[::3])
+    assert np.array_equal(rows(host, names, 3 * run.h, 20), states_of_run(run)[::3])
     (total,) = host.get("energy.total")
     assert total == pytest.approx(run.energy[-1], rel=1e-14, abs=1e-14)
 
 
-def test_a_start_on_constraints_is_assembled(version: int, hosts: list[Host]) -> None:
-    """What the scene holds stays as it is set; guesses move as in a run of the module."""
+def test_initial_state_with_constraints_is_assembled(version: int, hosts: list[Host]) -> None:
+    """Fixed values of the scene are unchanged; guesses move as in a run of the module."""
     run = plain("four_bar").simulate(q0=[0.9, 0.4, 1.2], qd0=[3.0, 0, 0], steps=30)
     names = states("four_bar")
     host = Host(exported("four_bar", version))
     hosts.append(host)
     host.set_all(dict(zip(names, (0.9, 0.4, 1.2, 3.0, 0.0, 0.0), strict=True)))
     host.start()
-    assert np.array_equal(rows(host, names, 3 * run.h, 10), moved(run)[::3])
+    assert np.array_equal(rows(host, names, 3 * run.h, 10), states_of_run(run)[::3])
 
 
-def test_a_start_that_no_linkage_has_is_told(version: int, hosts: list[Host]) -> None:
+def test_inconsistent_initial_state_is_reported(version: int, hosts: list[Host]) -> None:
     host = Host(exported("four_bar", version))
     hosts.append(host)
     host.set(c=0.01)
@@ -127,15 +127,15 @@ def test_a_start_that_no_linkage_has_is_told(version: int, hosts: list[Host]) ->
     assert any("no state near obeys the constraints" in text for _, text in host.said)
 
 
-def test_there_is_no_model_exchange_under_constraints(version: int) -> None:
-    """An importer that integrates would leave them; it isn't offered, and refused in words."""
+def test_model_exchange_with_constraints_is_refused(version: int) -> None:
+    """An importer's integration would violate them; it is refused with a message."""
     from fmpy import read_model_description
 
     described = read_model_description(str(exported("four_bar", version)))
     assert described.modelExchange is None and described.coSimulation is not None
 
 
-def test_other_communication_steps_end_in_a_shorter_one(version: int, hosts: list[Host]) -> None:
+def test_other_communication_steps_end_with_a_shorter_step(version: int, hosts: list[Host]) -> None:
     module = plain("cartpole")
     host = Host(exported("cartpole", version))
     hosts.append(host)
@@ -148,26 +148,26 @@ def test_other_communication_steps_end_in_a_shorter_one(version: int, hosts: lis
             q, qd = module.step(q, qd, 0.005)
         if size - whole * 0.005 > 1e-9:
             q, qd = module.step(q, qd, size - whole * 0.005)
-        found = np.array(host.get("x", "theta", "x_dot", "theta_dot"))
-        assert found == pytest.approx([*q, *qd], rel=1e-13)
+        result = np.array(host.get("x", "theta", "x_dot", "theta_dot"))
+        assert result == pytest.approx([*q, *qd], rel=1e-13)
     assert host.get("theta_dot") == host.get("der(theta)")
 
 
-def test_many_short_steps_drift_no_further_than_their_sum(version: int, hosts: list[Host]) -> None:
-    """A thousand communication points that were added up are the same as whole steps of the run."""
+def test_summed_communication_points_are_exact_steps(version: int, hosts: list[Host]) -> None:
+    """A thousand summed communication points are the same as whole steps of the run."""
     module = plain("cartpole")
     host = Host(exported("cartpole", version))
     hosts.append(host)
     host.start()
     for _ in range(1000):
-        host.step(0.005)  # whose sums are not n h
+        host.step(0.005)  # the sums differ from n h
     run = module.simulate(steps=1000)
     assert host.t != 1000 * 0.005
     assert np.array_equal(host.get("x", "theta"), run.q[-1])
 
 
 @both
-def test_inputs_are_held_over_steps(version: int, hosts: list[Host]) -> None:
+def test_inputs_are_constant_over_steps(version: int, hosts: list[Host]) -> None:
     module = plain("cartpole_driven")
     forces = np.array([[0.5], [-0.2], [0.1], [0.0], [1.0]])
     run = module.simulate(steps=5, u=forces)
@@ -182,24 +182,24 @@ def test_inputs_are_held_over_steps(version: int, hosts: list[Host]) -> None:
         )
 
 
-def test_the_scenes_signals_act_where_that_is_wished(version: int, hosts: list[Host]) -> None:
+def test_signals_of_the_scene_are_applied_on_request(version: int, hosts: list[Host]) -> None:
     names, module = states("cartpole_driven"), plain("cartpole_driven")
     run = module.simulate(steps=200)
     host = Host(exported("cartpole_driven", version))
     hosts.append(host)
     host.follow_signals()
     host.start()
-    assert np.array_equal(rows(host, names, 0.025, 40), moved(run)[::5])
+    assert np.array_equal(rows(host, names, 0.025, 40), states_of_run(run)[::5])
     assert host.get("force") == pytest.approx([0.01 * np.sin(1.0)], rel=1e-12)
-    still = Host(exported("cartpole_driven", version))
-    hosts.append(still)
-    still.start()  # and its inputs are zero otherwise
-    still.step(1.0)
-    assert still.get("x", "x_dot", "force") == pytest.approx([0, 0, 0], abs=1e-12)
+    without_signals = Host(exported("cartpole_driven", version))
+    hosts.append(without_signals)
+    without_signals.start()  # otherwise its inputs are zero
+    without_signals.step(1.0)
+    assert without_signals.get("x", "x_dot", "force") == pytest.approx([0, 0, 0], abs=1e-12)
 
 
 @both
-def test_parameters_and_starts_are_set(version: int, hosts: list[Host]) -> None:
+def test_parameters_and_initial_values_can_be_set(version: int, hosts: list[Host]) -> None:
     module = plain("cartpole")
     run = module.simulate(steps=40, params={"m_p": 3.5, "l": 1.5}, q0=[0.1, 0.2], qd0=[0.3, -0.4])
     host = Host(exported("cartpole", version))
@@ -208,7 +208,7 @@ def test_parameters_and_starts_are_set(version: int, hosts: list[Host]) -> None:
     host.start()
     assert host.get("m_p", "theta", "g") == [3.5, 0.2, 9.8]
     host.step(0.2)
-    assert np.array_equal(host.get("x", "theta", "x_dot", "theta_dot"), moved(run)[-1])
+    assert np.array_equal(host.get("x", "theta", "x_dot", "theta_dot"), states_of_run(run)[-1])
     host.set(g=1.0)  # parameters may change between steps
     host.step(0.1)
     on = module.simulate(
@@ -217,7 +217,7 @@ def test_parameters_and_starts_are_set(version: int, hosts: list[Host]) -> None:
     assert np.array_equal(host.get("x", "theta"), on.q[-1])
 
 
-def test_accelerations_and_outputs_are_the_modules(version: int, hosts: list[Host]) -> None:
+def test_accelerations_and_outputs_agree_with_the_module(version: int, hosts: list[Host]) -> None:
     module = plain(BALL)
     host = Host(exported(BALL, version))
     hosts.append(host)
@@ -225,8 +225,8 @@ def test_accelerations_and_outputs_are_the_modules(version: int, hosts: list[Hos
     host.start()
     host.step(0.1)
     q, qd = (np.array(host.get(*n)) for n in (("y", "x"), ("y_dot", "x_dot")))
-    found = host.get("der(y)", "der(x)", "der(y_dot)", "der(x_dot)")
-    assert found == pytest.approx([*qd, *module.acceleration(q, qd, u=[0.7])], rel=1e-15)
+    result = host.get("der(y)", "der(x)", "der(y_dot)", "der(x_dot)")
+    assert result == pytest.approx([*qd, *module.acceleration(q, qd, u=[0.7])], rel=1e-15)
     outputs = module.output(q, qd, u=[0.7])
     assert host.get("ax", "height") == pytest.approx(list(outputs), rel=1e-15)
     energies = host.get("energy.kinetic", "energy.potential", "energy.total")
@@ -237,59 +237,59 @@ def test_accelerations_and_outputs_are_the_modules(version: int, hosts: list[Hos
 
 
 @both
-def test_states_are_kept_and_restored(version: int, hosts: list[Host]) -> None:
+def test_states_are_stored_and_restored(version: int, hosts: list[Host]) -> None:
     host, other = Host(exported(BALL, version)), Host(exported(BALL, version))
     hosts += [host, other]
     for each in (host, other):
         each.start()
     host.step(0.4)
-    kept, at = host.kept(), host.t
+    state, at = host.kept(), host.t
     host.step(0.3)  # beyond an impact
     once = host.get("y", "y_dot", "x", "x_dot")
-    host.restore(kept)
+    host.restore(state)
     host.t = at
     host.step(0.3)
     assert host.get("y", "y_dot", "x", "x_dot") == once
-    written = host.unit.serializeFMUState(kept)
+    written = host.unit.serializeFMUState(state)
     read = other.unit.deserializeFMUState(written)
     other.restore(read)
     other.t = at
     other.step(0.3)
     assert other.get("y", "y_dot", "x", "x_dot") == once
-    host.unit.freeFMUState(kept)
+    host.unit.freeFMUState(state)
     other.unit.freeFMUState(read)
 
 
-def test_bytes_that_are_no_state_are_refused(version: int, hosts: list[Host]) -> None:
+def test_bytes_of_no_state_are_refused(version: int, hosts: list[Host]) -> None:
     host = Host(exported(BALL, version))
     hosts.append(host)
     host.start()
-    kept = host.kept()
-    written = bytearray(host.unit.serializeFMUState(kept))
+    state = host.kept()
+    written = bytearray(host.unit.serializeFMUState(state))
     for wrong in (bytes(written[:-1]), bytes([written[0] ^ 1]) + bytes(written[1:]), b"x"):
         with pytest.raises(Exception, match="status 3"):
             host.unit.deserializeFMUState(wrong)
         assert host.said.pop()[1].endswith("no state of this unit, or of another build of it")
-    host.unit.freeFMUState(kept)
+    host.unit.freeFMUState(state)
 
 
-def test_instances_know_nothing_of_one_another(version: int, hosts: list[Host]) -> None:
+def test_instances_are_independent(version: int, hosts: list[Host]) -> None:
     names = states("cartpole")
-    alone = Host(exported("cartpole", version))
+    single = Host(exported("cartpole", version))
     heavy, light = Host(exported("cartpole", version)), Host(exported("cartpole", version))
-    hosts += [alone, heavy, light]
+    hosts += [single, heavy, light]
     heavy.set(m_p=9.0)
-    for each in (alone, heavy, light):
+    for each in (single, heavy, light):
         each.start()
-    found = rows(alone, names, 0.01, 20)
+    result = rows(single, names, 0.01, 20)
     for k in range(20):
         heavy.step(0.01)
         light.step(0.01)
-        assert np.array_equal(light.get(*names), found[k + 1])
+        assert np.array_equal(light.get(*names), result[k + 1])
     assert light.get("theta") != heavy.get("theta") and light.get("m_p") == [2.0]
 
 
-def test_a_reset_unit_is_as_new(version: int, hosts: list[Host]) -> None:
+def test_reset_unit_is_as_new(version: int, hosts: list[Host]) -> None:
     host = Host(exported("cartpole", version))
     hosts.append(host)
     for _ in range(2):
@@ -302,7 +302,7 @@ def test_a_reset_unit_is_as_new(version: int, hosts: list[Host]) -> None:
         host.unit.reset()
 
 
-def test_events_are_those_of_the_module(version: int, hosts: list[Host]) -> None:
+def test_events_agree_with_the_module(version: int, hosts: list[Host]) -> None:
     run = plain(FALLS).simulate(tol=1e-9, u=[0.0], times=[1.0, 2.0, 3.0])
     host = Host(exported(FALLS, version), logging=True)
     hosts.append(host)
@@ -310,17 +310,19 @@ def test_events_are_those_of_the_module(version: int, hosts: list[Host]) -> None
     for k in range(3):
         for _ in range(4):
             assert not host.step(0.25)
-        # other steps, by the same tolerance
+        # other steps with the same tolerance
         assert host.get("y", "x") == pytest.approx(run.q[k], abs=1e-8)
-    found = [text for category, text in host.said if category == "logEvents"]
+    logged_events = [text for category, text in host.said if category == "logEvents"]
     for name in ("impact", "top"):
-        times = [float(x[0]) for t in found if (x := re.findall(rf"'{name}' at t = (\S+) s", t))]
+        times = [
+            float(x[0]) for t in logged_events if (x := re.findall(rf"'{name}' at t = (\S+) s", t))
+        ]
         assert times == pytest.approx(run.events[name].t, abs=1e-8), name
     assert len(run.events["impact"].t) == 6
 
 
 @both
-def test_an_event_stops_the_unit(version: int, hosts: list[Host]) -> None:
+def test_stop_event_terminates_the_unit(version: int, hosts: list[Host]) -> None:
     run = plain(BALL).simulate(tol=1e-9, duration=3.0, u=[0.0])
     host = Host(exported(BALL, version))
     hosts.append(host)
@@ -332,7 +334,7 @@ def test_an_event_stops_the_unit(version: int, hosts: list[Host]) -> None:
     assert host.step(0.25) and host.get("x") == pytest.approx([0.9], abs=1e-9)
 
 
-def test_a_stop_inside_a_step_returns_early_and_a_complete_step_does_not(
+def test_stop_inside_a_step_returns_early(
     hosts: list[Host],
 ) -> None:
     end = plain(BALL).simulate(tol=1e-9, duration=3.0, u=[0.0]).t[-1]
@@ -342,14 +344,14 @@ def test_a_stop_inside_a_step_returns_early_and_a_complete_step_does_not(
     while not host.step(0.25):
         assert not host.returned_early
     assert host.returned_early and host.t == pytest.approx(end, abs=1e-9)
-    # a step that ends exactly where the motion has stopped is complete
+    # a step that ends exactly at the stop is complete
     host.unit.reset()
     host.start()
     assert host.step(end) is host.returned_early
 
 
 @pytest.mark.parametrize("scene", ["cartpole", "cartpole_driven", "kapitza_pendulum", FALLS])
-def test_model_exchange_by_cvode(scene: str, version: int) -> None:
+def test_model_exchange_with_cvode_agrees(scene: str, version: int) -> None:
     from fmpy import simulate_fmu
 
     names, driven = states(scene), scene in ("cartpole_driven",)
@@ -361,13 +363,13 @@ def test_model_exchange_by_cvode(scene: str, version: int) -> None:
     module = plain(scene)
     how: dict[str, Any] = {"tol": 1e-12} if scene == FALLS else {"h": 2.5e-4}
     run = module.simulate(duration=1.5, **({"u": [0.0]} if scene == FALLS else {}), **how)
-    found = np.array([result[n][-1] for n in names])
-    # CVode's own tolerance, of a motion that magnifies it a few hundred times
-    assert found == pytest.approx(moved(run)[-1], rel=1e-5, abs=1e-6)
+    final_state = np.array([result[n][-1] for n in names])
+    # CVode's tolerance, which the motion magnifies a few hundred times
+    assert final_state == pytest.approx(states_of_run(run)[-1], rel=1e-5, abs=1e-6)
 
 
 def test_model_exchange_by_euler_converges(version: int) -> None:
-    """The derivatives alone: Euler's method at two steps, continued to none."""
+    """Only derivatives are used: Euler's method with two step sizes, extrapolated to zero."""
     from fmpy import simulate_fmu
 
     ends = []
@@ -377,13 +379,13 @@ def test_model_exchange_by_euler_converges(version: int) -> None:
             step_size=h, stop_time=0.5, output_interval=h, output=states("cartpole"),
         )  # fmt: skip
         ends.append(np.array([result[n][-1] for n in states("cartpole")]))
-    expected = moved(plain("cartpole").simulate(duration=0.5))[-1]
-    apart = [np.abs(e - expected).max() for e in ends]
-    assert apart[0] / apart[1] == pytest.approx(2, rel=0.01)
+    expected = states_of_run(plain("cartpole").simulate(duration=0.5))[-1]
+    errors = [np.abs(e - expected).max() for e in ends]
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.01)
     assert 2 * ends[1] - ends[0] == pytest.approx(expected, abs=1e-5)
 
 
-def test_events_in_model_exchange(version: int) -> None:
+def test_events_in_model_exchange_are_recorded(version: int) -> None:
     from fmpy import simulate_fmu
 
     result = simulate_fmu(
@@ -391,7 +393,7 @@ def test_events_in_model_exchange(version: int) -> None:
         relative_tolerance=1e-10, output_interval=0.1, output=["y", "y_dot"],
     )  # fmt: skip
     run = plain(FALLS).simulate(tol=1e-12, duration=3.0, u=[0.0])
-    # an event is recorded before and behind it
+    # an event is recorded before and after its jump
     times = np.array([t for t, n in zip(result["time"], np.diff(result["time"], prepend=-1),
                                         strict=True) if n == 0])  # fmt: skip
     expected = np.sort(np.concatenate([run.events[n].t for n in ("impact", "top")]))
@@ -401,7 +403,7 @@ def test_events_in_model_exchange(version: int) -> None:
 
 
 @both
-def test_an_event_ends_model_exchange(version: int) -> None:
+def test_stop_event_ends_model_exchange(version: int) -> None:
     from fmpy import simulate_fmu
 
     result = simulate_fmu(
@@ -414,7 +416,7 @@ def test_an_event_ends_model_exchange(version: int) -> None:
 
 @both
 @pytest.mark.parametrize("kind", KINDS)
-def test_directional_derivatives_are_the_modules(
+def test_directional_derivatives_agree_with_the_module(
     kind: str, version: int, hosts: list[Host]
 ) -> None:
     module = plain(BALL)
@@ -428,11 +430,11 @@ def test_directional_derivatives_are_the_modules(
     rates = [f"der({n})" for n in state]
     whole = np.vstack([np.hstack([A, B]), np.hstack([C, D])])
     for k, known in enumerate([*state, "wind"]):
-        found = host.slope([*rates, "ax", "height"], [known], [2.0])
-        assert found == pytest.approx(2 * whole[:, k], rel=1e-14, abs=1e-15)
+        result = host.slope([*rates, "ax", "height"], [known], [2.0])
+        assert result == pytest.approx(2 * whole[:, k], rel=1e-14, abs=1e-15)
     seeds = [0.3, -0.1, 0.7, 0.2, 1.1]
-    found = host.slope([*rates, "ax", "height", "x"], [*state, "wind"], seeds)
-    assert found == pytest.approx([*(whole @ seeds), -0.1], rel=1e-14, abs=1e-15)
+    result = host.slope([*rates, "ax", "height", "x"], [*state, "wind"], seeds)
+    assert result == pytest.approx([*(whole @ seeds), -0.1], rel=1e-14, abs=1e-15)
 
 
 PULLED = """
@@ -456,20 +458,18 @@ linearize = true
 """
 
 
-def test_slopes_of_outputs_may_read_accelerations(version: int, hosts: list[Host]) -> None:
+def test_derivatives_of_outputs_may_read_accelerations(version: int, hosts: list[Host]) -> None:
     module, host = plain(PULLED), Host(exported(PULLED, version), "ModelExchange")
     hosts.append(host)
     host.set(th=0.4, th_dot=1.5, T=0.7)
     host.start()
     *_, C, D = module.linearize([0.4], [1.5], u=[0.7], outputs=True)
-    found = [host.slope(["ax"], [known], [1.0])[0] for known in ("th", "th_dot", "T")]
-    assert found == pytest.approx([*C[0], *D[0]], rel=1e-14)
+    slopes = [host.slope(["ax"], [known], [1.0])[0] for known in ("th", "th_dot", "T")]
+    assert slopes == pytest.approx([*C[0], *D[0]], rel=1e-14)
 
 
 @both
-def test_derivatives_with_respect_to_parameters_are_the_modules(
-    version: int, hosts: list[Host]
-) -> None:
+def test_parameter_derivatives_agree_with_the_module(version: int, hosts: list[Host]) -> None:
     module, host = plain(RIG), Host(exported(RIG, version))
     hosts.append(host)
     host.set(x=0.7, y=-0.4, x_dot=0.2, y_dot=0.1, force=0.5, pull=5.0, push=0.3)
@@ -483,15 +483,15 @@ def test_derivatives_with_respect_to_parameters_are_the_modules(
             module.output(q, qd, u=u, params={name: module.defaults[name] + d}) for d in (h, -h)
         )
         by_differences = (above - below) / (2 * h)
-        found = host.slope([*rates, *outputs, "x", "der(x)"], [name], [2.0])
-        assert found[:2] == pytest.approx(2 * E[:, k], rel=1e-14)
-        assert found[2:4] == pytest.approx(2 * by_differences, rel=1e-8, abs=1e-8)
-        assert found[4:] == [0, 0]
-    # the least upper limit of the pull acts, so that the acceleration of x follows it
+        result = host.slope([*rates, *outputs, "x", "der(x)"], [name], [2.0])
+        assert result[:2] == pytest.approx(2 * E[:, k], rel=1e-14)
+        assert result[2:4] == pytest.approx(2 * by_differences, rel=1e-8, abs=1e-8)
+        assert result[4:] == [0, 0]
+    # the lowest upper limit of the pull is active, so that the acceleration of x depends on it
     assert host.slope(["der(x_dot)"], ["most"], [1.0]) == [1.0]
     both_at_once = host.slope(rates, ["k", "y"], [0.5, 3.0])
-    alone = np.array([host.slope(rates, [name], [1.0]) for name in ("k", "y")])
-    assert both_at_once == pytest.approx(alone.T @ [0.5, 3.0], rel=1e-14)
+    columns = np.array([host.slope(rates, [name], [1.0]) for name in ("k", "y")])
+    assert both_at_once == pytest.approx(columns.T @ [0.5, 3.0], rel=1e-14)
     host.follow_signals()
     with pytest.raises(Exception, match="status 3"):
         host.slope(rates, ["k"], [1.0])
@@ -500,7 +500,7 @@ def test_derivatives_with_respect_to_parameters_are_the_modules(
 
 @both
 @pytest.mark.parametrize("kind", KINDS)
-def test_starts_that_are_formulas_follow_parameters(
+def test_initial_values_by_formula_follow_parameters(
     kind: str, version: int, hosts: list[Host]
 ) -> None:
     host = Host(exported(RIG, version), kind)
@@ -508,11 +508,11 @@ def test_starts_that_are_formulas_follow_parameters(
     assert host.get("x", "x_dot") == [0.25, 0.05]
     host.set(x0=0.5, w=0.2)
     assert host.get("x", "x_dot", "y") == [1.2, 0.2, 0.3]
-    host.set(x=3.0)  # the importer's own start stays
+    host.set(x=3.0)  # the importer's own initial value is unchanged
     host.set(x0=0.7)
     host.start()
     assert host.get("x", "x_dot") == [3.0, 0.2]
-    host.set(w=0.9)  # after the start a parameter moves no state
+    host.set(w=0.9)  # after the start a parameter changes no state
     assert host.get("x", "x_dot") == [3.0, 0.2]
     host.unit.reset()
     host.set(w=0.1)
@@ -522,9 +522,7 @@ def test_starts_that_are_formulas_follow_parameters(
     assert host.get("x", "x_dot") == [0.25, 0.05]
 
 
-def test_derivatives_that_there_are_not_are_refused_in_words(
-    version: int, hosts: list[Host]
-) -> None:
+def test_missing_derivatives_are_refused_with_a_message(version: int, hosts: list[Host]) -> None:
     for scene, unknown, known, words in (
         ("cartpole", "der(x_dot)", "x", "[run] linearize = true"),
         (BALL, "energy.total", "x", "of coordinates, velocities, accelerations and outputs only"),
@@ -542,18 +540,18 @@ def test_derivatives_that_there_are_not_are_refused_in_words(
         assert words in host.said.pop()[1]
 
 
-def test_single_precision(version: int, hosts: list[Host]) -> None:
+def test_single_precision_agrees_with_the_module(version: int, hosts: list[Host]) -> None:
     module = plain(FLOAT)
     run = module.simulate(steps=100)
     host = Host(exported(FLOAT, version))
     hosts.append(host)
     host.follow_signals()
     host.start()
-    assert np.array_equal(rows(host, ["phi", "phi_dot"], 0.05, 20), moved(run)[::5])
+    assert np.array_equal(rows(host, ["phi", "phi_dot"], 0.05, 20), states_of_run(run)[::5])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_failures_are_told_in_plain_words(kind: str, version: int, hosts: list[Host]) -> None:
+def test_failures_are_logged_with_a_message(kind: str, version: int, hosts: list[Host]) -> None:
     host = Host(exported(BLOWS_UP, version), kind)
     hosts.append(host)
     if kind == "CoSimulation":
@@ -575,7 +573,7 @@ def test_failures_are_told_in_plain_words(kind: str, version: int, hosts: list[H
 
 
 @pytest.mark.parametrize("name", ["energy.total", "der(theta)", "der(theta_dot)", "t"])
-def test_what_is_calculated_can_not_be_set(name: str, version: int, hosts: list[Host]) -> None:
+def test_calculated_variables_cannot_be_set(name: str, version: int, hosts: list[Host]) -> None:
     host = Host(exported("cartpole", version))
     hosts.append(host)
     host.of.setdefault("t", 0)
@@ -584,7 +582,7 @@ def test_what_is_calculated_can_not_be_set(name: str, version: int, hosts: list[
     assert "is calculated and can't be set" in host.said[-1][1]
 
 
-def test_other_misuse_is_told(version: int, hosts: list[Host]) -> None:
+def test_other_misuse_is_reported(version: int, hosts: list[Host]) -> None:
     host = Host(exported("cartpole", version))
     hosts.append(host)
     for misuse, words in (
@@ -612,7 +610,7 @@ def test_other_misuse_is_told(version: int, hosts: list[Host]) -> None:
     assert "begins where the last one ended" in host.said[-1][1]
 
 
-def test_a_start_that_is_not_zero(version: int, hosts: list[Host]) -> None:
+def test_start_time_other_than_zero(version: int, hosts: list[Host]) -> None:
     module = plain("kapitza_pendulum")
     host = Host(exported("kapitza_pendulum", version))
     hosts.append(host)
@@ -623,7 +621,7 @@ def test_a_start_that_is_not_zero(version: int, hosts: list[Host]) -> None:
     assert host.get("theta") != [module.simulate(steps=50).q[-1, 0]]
 
 
-def test_an_importers_tolerance_counts(version: int, hosts: list[Host]) -> None:
+def test_tolerance_of_the_importer_is_used(version: int, hosts: list[Host]) -> None:
     exact = plain(FALLS).simulate(tol=1e-14, u=[0.0], times=[2.0]).q[-1]
     errors = []
     for tolerance in (1e-3, 1e-12):
@@ -637,8 +635,8 @@ def test_an_importers_tolerance_counts(version: int, hosts: list[Host]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["cartpole_driven", BALL], ids=["cartpole_driven", "ball"])
-def test_it_is_compiled_from_its_sources(scene: str, version: int, tmp_path: Path) -> None:
-    """By FMPy, with CMake, without a word of the compiler's about our C."""
+def test_fmu_is_compiled_from_its_sources(scene: str, version: int, tmp_path: Path) -> None:
+    """By FMPy with CMake, without a compiler's warning about the generated C."""
     import shutil
 
     from fmpy import extract
@@ -661,8 +659,8 @@ def test_it_is_compiled_from_its_sources(scene: str, version: int, tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["x86_64-windows-gnu", "aarch64-macos", "aarch64-linux-gnu"])
-def test_it_compiles_for_other_machines(target: str, version: int, tmp_path: Path) -> None:
-    """By ziglang, without a warning; nothing here can run it."""
+def test_fmu_compiles_for_other_machines(target: str, version: int, tmp_path: Path) -> None:
+    """By ziglang without a warning; the result cannot run here."""
     pytest.importorskip("ziglang", reason="ziglang is not installed: pip install '.[cc]'")
     import sys
 
@@ -670,7 +668,7 @@ def test_it_compiles_for_other_machines(target: str, version: int, tmp_path: Pat
     from fmpy import extract
 
     extract(str(exported(BALL, version)), str(tmp_path))
-    # the standard's own headers declare functions without prototypes
+    # the headers of the standard declare functions without prototypes
     flags = "-std=c99 -O2 -Wall -Wextra -Werror -Wno-strict-prototypes -shared".split()
     compiled(
         sys.executable, "-m", "ziglang", "cc", "-target", target, *flags, "ball.c",
@@ -717,8 +715,10 @@ duration = 3
 """
 
 
-def test_events_both_ways_at_once_and_of_the_time(version: int, hosts: list[Host]) -> None:
-    """Two at one time, one that bounces to and fro, one that carries another over its zero."""
+def test_simultaneous_events_in_both_directions_and_of_time(
+    version: int, hosts: list[Host]
+) -> None:
+    """Two events at one time, one that bounces repeatedly, one that moves another over its zero."""
     from fmpy import simulate_fmu
 
     # bounces at t = 1, where its other velocity doubles, and is moved at 2.5
@@ -727,8 +727,8 @@ def test_events_both_ways_at_once_and_of_the_time(version: int, hosts: list[Host
         str(exported(WALLS, version)), fmi_type="ModelExchange", stop_time=3.0,
         relative_tolerance=1e-10, output_interval=0.05, output=["x", "y", "x_dot", "y_dot"],
     )  # fmt: skip
-    found = [result[n][-1] for n in ("x", "y", "x_dot", "y_dot")]
-    assert found == pytest.approx(expected, abs=1e-6)
+    final_state = [result[n][-1] for n in ("x", "y", "x_dot", "y_dot")]
+    assert final_state == pytest.approx(expected, abs=1e-6)
     host = Host(exported(WALLS, version), logging=True)
     hosts.append(host)
     host.start(tolerance=1e-12)
@@ -738,7 +738,7 @@ def test_events_both_ways_at_once_and_of_the_time(version: int, hosts: list[Host
     assert len([c for c, _ in host.said if c == "logEvents"]) == 3
 
 
-def test_what_is_at_zero_at_the_start_has_not_happened(version: int) -> None:
+def test_event_at_zero_initially_is_not_triggered(version: int) -> None:
     from fmpy import simulate_fmu
 
     scene = FALLS.replace('y = { unit = "m", start = 1.0 }', "y = { rate = 2.0 }")
@@ -755,8 +755,8 @@ def test_what_is_at_zero_at_the_start_has_not_happened(version: int) -> None:
 
 
 @both
-def test_casadi_reads_it(version: int, tmp_path: Path) -> None:
-    """Derivatives, outputs and their exact Jacobians in CasADi."""
+def test_casadi_imports_the_fmu(version: int, tmp_path: Path) -> None:
+    """CasADi evaluates derivatives, outputs and their exact Jacobians."""
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed")
     from fmpy import extract
 
@@ -774,8 +774,8 @@ def test_casadi_reads_it(version: int, tmp_path: Path) -> None:
     assert y_x[4:] == pytest.approx(C, rel=1e-14) and y_u[4:] == pytest.approx(D, rel=1e-14)
 
 
-def test_libcosim_reads_it() -> None:
-    """Co-simulation of FMI 2.0 in the Open Simulation Platform, two units with a connection."""
+def test_libcosim_imports_the_fmu() -> None:
+    """Co-simulation of two connected FMI 2.0 units in the Open Simulation Platform."""
     pytest.importorskip("libcosimpy", reason="libcosimpy is not installed")
     from libcosimpy.CosimExecution import CosimExecution
     from libcosimpy.CosimObserver import CosimObserver
@@ -792,8 +792,8 @@ def test_libcosim_reads_it() -> None:
         for v in execution.slave_variables(slave_index=index)
     }
     names = ("x", "theta", "energy.total")
-    found = observer.last_real_values(
+    result = observer.last_real_values(
         slave_index=index, variable_references=[references[n] for n in names]
     )
     run = plain("cartpole").simulate(duration=1.0)
-    assert [*found] == pytest.approx([*run.q[-1], run.energy[-1]], rel=1e-13, abs=1e-13)
+    assert [*result] == pytest.approx([*run.q[-1], run.energy[-1]], rel=1e-13, abs=1e-13)

@@ -1,4 +1,4 @@
-"""Units of FMI as libraries of Windows, loaded there by a small importer, under Wine."""
+"""Windows libraries of FMUs, loaded by a small importer under Wine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fmus import BALL, VERSIONS, Host, exported, extracted, needs_fmpy
 
 pytestmark = pytest.mark.slow
 NAMES = ("y", "x", "y_dot", "x_dot", "energy.total")
-# it asks the library by name for each function, as importers do, and steps to 0.9 s
+# it looks up each function by name, as importers do, and steps to 0.9 s
 HOST = r"""
 #include <stdio.h>
 #include <string.h>
@@ -87,8 +87,8 @@ int main(void)
 
 
 @pytest.mark.parametrize("version", VERSIONS, ids=["fmi2", "fmi3"])
-def test_a_library_of_windows_computes_the_same(version: int, tmp_path: Path) -> None:
-    """A thrown ball that hits the ground, to rounding of another libm."""
+def test_windows_library_computes_the_same_motion(version: int, tmp_path: Path) -> None:
+    """A thrown ball hits the ground; results agree to the rounding of another libm."""
     needs_fmpy()
     from fmpy import extract, read_model_description
 
@@ -101,15 +101,15 @@ def test_a_library_of_windows_computes_the_same(version: int, tmp_path: Path) ->
     text = text.replace("REFERENCES", ", ".join(str(number[name]) for name in NAMES))
     at = tmp_path / "sources"
     (at / "host.c").write_text(text, encoding="utf-8")
-    made = ("-shared", "ball.c", f"fmi/fmi{version}.c", "-o", "ball.dll")
-    for words in (made, (f"-DVERSION={version}", "host.c", "-o", "host.exe")):
+    arguments = ("-shared", "ball.c", f"fmi/fmi{version}.c", "-o", "ball.dll")
+    for words in (arguments, (f"-DVERSION={version}", "host.c", "-o", "host.exe")):
         subprocess.run([gcc, "-std=c99", "-O2", "-I.", *words], cwd=at, check=True)
     quiet = os.environ | {"WINEDEBUG": "-all"}
-    done = subprocess.run(
+    process = subprocess.run(
         [wine, "host.exe"], cwd=at, capture_output=True, text=True, env=quiet, timeout=120
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    there = [float(word) for word in done.stdout.split()]
+    assert process.returncode == 0, process.stdout + process.stderr
+    there = [float(word) for word in process.stdout.split()]
     host = Host(exported(BALL, version), folder=extracted(exported(BALL, version)))
     host.start()
     for _ in range(9):

@@ -1,4 +1,4 @@
-"""What pip installs is enough: wheel, sdist and clone in a fresh environment, by every command."""
+"""Test every command after installation by pip, from the wheel, the sdist and a clone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from cases import SCENES
 from conftest import ROOT
-from toolchain.test_packaging import made
+from toolchain.test_packaging import build_distribution
 
 from eomc import pipeline
 
@@ -41,7 +41,7 @@ COMMANDS = (
 
 
 def environment() -> dict[str, str]:
-    """Ours without what would show a clone to Python."""
+    """Return the environment without variables that make the clone visible to Python."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "EOMC_CFLAGS")
     return {name: value for name, value in os.environ.items() if name not in hidden}
 
@@ -53,91 +53,94 @@ def pip(python: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def fresh(folder: Path) -> Path:
-    """The Python of a new environment."""
+def create_environment(folder: Path) -> Path:
+    """Create a virtual environment and return its Python."""
     venv.create(folder, with_pip=True)
     return folder / "bin" / "python"
 
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment with what the wheel asks for, with pictures."""
+    """Return the Python of an environment with the wheel, its dependencies and matplotlib."""
     folder = tmp_path_factory.mktemp("installed")
-    wheel = made("wheel", ROOT, folder, "")
-    found = fresh(folder / "venv")
-    done = pip(found, f"{wheel}[plot]")
-    if done.returncode:
-        pytest.skip(f"its dependencies can't be installed: {done.stderr.strip()[-200:]}")
-    return found
+    wheel = build_distribution("wheel", ROOT, folder, "")
+    executable = create_environment(folder / "venv")
+    result = pip(executable, f"{wheel}[plot]")
+    if result.returncode:
+        pytest.skip(f"its dependencies can't be installed: {result.stderr.strip()[-200:]}")
+    return executable
 
 
 def interpreter(version: str) -> str:
-    """Another Python, of the system or of pyenv; the test is skipped where there is none."""
-    kept = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
-    for found in (shutil.which(f"python{version}"), *kept.glob(f"{version}.*/bin/python")):
+    """Return another Python, of the system or of pyenv; skip the test if there is none."""
+    pyenv_versions = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    for candidate in (
+        shutil.which(f"python{version}"),
+        *pyenv_versions.glob(f"{version}.*/bin/python"),
+    ):
         code = "import sys; print('%d.%d' % sys.version_info[:2])"
-        done = subprocess.run([found or "false", "-c", code], capture_output=True, text=True)
-        if done.stdout.strip() == version:
-            return str(found)
+        result = subprocess.run([candidate or "false", "-c", code], capture_output=True, text=True)
+        if result.stdout.strip() == version:
+            return str(candidate)
     pytest.skip(f"there is no Python {version}")
 
 
-def assert_says(python: Path, folder: Path, words: str, said: str) -> None:
-    """The command in a folder, by the eomc beside that Python."""
-    done = subprocess.run(
+def assert_output(python: Path, folder: Path, words: str, expected: str) -> None:
+    """Run a command in a folder by the eomc of that Python, and check its output."""
+    result = subprocess.run(
         [str(python.parent / "eomc"), *words.split()], capture_output=True, text=True,
         cwd=folder, env=environment(), stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
-    assert said in done.stdout, f"{words}: {done.stdout}"
+    assert result.returncode == 0, f"{words}: {result.stdout}{result.stderr}"
+    assert expected in result.stdout, f"{words}: {result.stdout}"
 
 
 @pytest.mark.parametrize("version", ["3.12", "3.13", "3.14"])
-def test_other_pythons_build_and_run(
+def test_other_python_versions_build_and_run(
     version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scenes, and the wheel of a model that this Python has made."""
+    """Build scenes, and the wheel of a model, which this Python builds."""
     other = interpreter(version)
     subprocess.run([other, "-m", "venv", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv" / "bin" / "python"
-    done = pip(python, str(made("wheel", ROOT, tmp_path, "")))
-    if done.returncode:
-        pytest.skip(f"its dependencies can't be installed: {done.stderr.strip()[-200:]}")
+    result = pip(python, str(build_distribution("wheel", ROOT, tmp_path, "")))
+    if result.returncode:
+        pytest.skip(f"its dependencies can't be installed: {result.stderr.strip()[-200:]}")
     (tmp_path / "work").mkdir()
-    for words, said in COMMANDS:
+    for words, expected in COMMANDS:
         if words.split()[0] in ("new", "build", "check", "show"):
-            assert_says(python, tmp_path / "work", words, said)
+            assert_output(python, tmp_path / "work", words, expected)
     monkeypatch.setenv("EOMC_CFLAGS", "-O1")
     wheel = pipeline.write_wheel(SCENES / "furuta_pendulum.toml", tmp_path)
     assert pip(python, "--no-deps", str(wheel)).returncode == 0
     code = "import furuta_pendulum; print(furuta_pendulum.simulate(steps=100).status)"
-    done = subprocess.run(
+    result = subprocess.run(
         [python, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment()
     )
-    assert done.stdout == "ok\n", done.stderr
+    assert result.stdout == "ok\n", result.stderr
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist", "clone"])
-def test_every_command_works_where_pip_has_installed_it(
+def test_every_command_works_after_installation_by_pip(
     kind: str, python: Path, tmp_path: Path
 ) -> None:
     if kind != "wheel":
-        what = ROOT if kind == "clone" else made("sdist", ROOT, tmp_path, "")
-        done = pip(python, "--no-deps", "--force-reinstall", str(what))
-        assert done.returncode == 0, done.stderr
+        what = ROOT if kind == "clone" else build_distribution("sdist", ROOT, tmp_path, "")
+        result = pip(python, "--no-deps", "--force-reinstall", str(what))
+        assert result.returncode == 0, result.stderr
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "arm.urdf").write_text(ROBOT, encoding="utf-8")
-    for words, said in COMMANDS:
-        assert_says(python, tmp_path / "work", words, said)
+    for words, expected in COMMANDS:
+        assert_output(python, tmp_path / "work", words, expected)
 
 
-def test_the_version_is_written_in_one_place(python: Path) -> None:
-    said = subprocess.run(
+def test_version_is_written_in_one_place(python: Path) -> None:
+    output = subprocess.run(
         [str(python.parent / "eomc"), "--version"], capture_output=True, text=True,
         env=environment(),
     ).stdout  # fmt: skip
     code = "from importlib.metadata import version; print(version('eomc'))"
     command = [str(python), "-c", code]
     version = subprocess.run(command, capture_output=True, text=True, env=environment()).stdout
-    assert re.fullmatch(r"eomc, version (\S+)\n", said)
-    assert said.split()[-1] == version.strip() and sys.version_info >= (3, 11)
+    assert re.fullmatch(r"eomc, version (\S+)\n", output)
+    assert output.split()[-1] == version.strip() and sys.version_info >= (3, 11)

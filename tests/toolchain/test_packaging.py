@@ -1,4 +1,4 @@
-"""The wheel holds all that a build needs, and so does the wheel made of the sdist."""
+"""The wheel contains all files that a build needs, and so does a wheel built from the sdist."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ pytestmark = pytest.mark.slow
 RUN = "import eomc; print(eomc.__file__); print(eomc.load('cartpole.toml').simulate().status)"
 
 
-def ran(*command: str, at: Path, **variables: str) -> str:
-    done = subprocess.run(
+def run_command(*command: str, at: Path, **variables: str) -> str:
+    process = subprocess.run(
         command, cwd=at, capture_output=True, text=True, env={**os.environ, **variables}
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process.stdout
 
 
-def expected() -> set[str]:
-    """The files of the package, as a wheel has them."""
+def package_files() -> set[str]:
+    """Return the files of the package, named as in a wheel."""
     places = {ROOT / "generator/eomc": "eomc"}
     places |= {ROOT / kind: f"eomc/{kind}" for kind in ("templates", "csrc", "scenes")}
     return {
@@ -41,57 +41,61 @@ def expected() -> set[str]:
 
 @pytest.fixture(scope="module")
 def backend(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A PYTHONPATH that has hatchling."""
+    """Return a PYTHONPATH that contains hatchling."""
     if importlib.util.find_spec("hatchling") is not None:
         return ""
     folder = tmp_path_factory.mktemp("backend")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(folder), "hatchling"]
-    done = subprocess.run([*pip, "--retries", "0"], capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"hatchling is not here and can't be installed: {done.stderr.strip()[-200:]}")
+    process = subprocess.run([*pip, "--retries", "0"], capture_output=True, text=True)
+    if process.returncode:
+        pytest.skip(
+            f"hatchling is not here and can't be installed: {process.stderr.strip()[-200:]}"
+        )
     return str(folder)
 
 
-def made(kind: str, source: Path, out: Path, backend: str) -> Path:
-    """A wheel or sdist of a source tree."""
+def build_distribution(kind: str, source: Path, out: Path, backend: str) -> Path:
+    """Build a wheel or sdist of a source tree and return its path."""
     code = f"from hatchling.build import build_{kind} as b; print(b({str(out)!r}))"
-    name = ran(sys.executable, "-c", code, at=source, PYTHONPATH=backend)
+    name = run_command(sys.executable, "-c", code, at=source, PYTHONPATH=backend)
     return out / name.splitlines()[-1]
 
 
-def test_a_wheel_and_one_of_the_sdist(tmp_path: Path, backend: str) -> None:
-    """The same files, and a scene builds from the installed one, beside a folder called eomc."""
-    wheel = made("wheel", ROOT, tmp_path, backend)
-    sdist = made("sdist", ROOT, tmp_path, backend)
+def test_wheels_of_the_clone_and_of_the_sdist_are_equal(tmp_path: Path, backend: str) -> None:
+    """A scene also builds from the installed wheel, beside a folder called eomc."""
+    wheel = build_distribution("wheel", ROOT, tmp_path, backend)
+    sdist = build_distribution("sdist", ROOT, tmp_path, backend)
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "unpacked", filter="data")
     (unpacked,) = (tmp_path / "unpacked").iterdir()
     (tmp_path / "second").mkdir()
-    second = made("wheel", unpacked, tmp_path / "second", backend)
-    held = set(zipfile.ZipFile(wheel).namelist())
-    assert held == set(zipfile.ZipFile(second).namelist())
-    assert {name for name in held if not name.split("/")[0].endswith(".dist-info")} == expected()
-    assert "eomc/py.typed" in held
+    second = build_distribution("wheel", unpacked, tmp_path / "second", backend)
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert names == set(zipfile.ZipFile(second).namelist())
+    assert {
+        name for name in names if not name.split("/")[0].endswith(".dist-info")
+    } == package_files()
+    assert "eomc/py.typed" in names
 
     site, empty = tmp_path / "site", tmp_path / "empty"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"]
-    ran(*pip, str(site), str(second), at=tmp_path)
+    run_command(*pip, str(site), str(second), at=tmp_path)
     (empty / "eomc").mkdir(parents=True)
     shutil.copy(SCENES / "cartpole.toml", empty)
     how = {"PYTHONPATH": str(site), "EOMC_CFLAGS": "-O0"}
-    said = ran(sys.executable, "-m", "eomc", "build", "cartpole.toml", at=empty, **how)
-    assert said.startswith("build/cartpole/: built in ")
-    place, status = ran(sys.executable, "-c", RUN, at=empty, **how).split()
+    output = run_command(sys.executable, "-m", "eomc", "build", "cartpole.toml", at=empty, **how)
+    assert output.startswith("build/cartpole/: built in ")
+    place, status = run_command(sys.executable, "-c", RUN, at=empty, **how).split()
     assert Path(place).is_relative_to(site) and status == "ok"
     script = (site / "bin" / "eomc").read_text(encoding="utf-8")
     assert "from eomc.cli.main import main" in script
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
-def test_the_same_sources_make_the_same_bytes(kind: str, tmp_path: Path, backend: str) -> None:
-    """In another folder, with other times and rights of its files: no date goes in."""
+def test_same_sources_give_the_same_bytes(kind: str, tmp_path: Path, backend: str) -> None:
+    """In another folder, with other dates and permissions: the archives contain no date."""
     keep = "generator templates csrc scenes README.md LICENSE CHANGELOG.md pyproject.toml".split()
-    found = []
+    archives = []
     for place, mask, stamp in (
         ("one", 0o022, 1_000_000_000),
         ("other/deeper", 0o002, 1_500_000_000),
@@ -108,7 +112,7 @@ def test_the_same_sources_make_the_same_bytes(kind: str, tmp_path: Path, backend
             os.utime(file, (stamp, stamp))
             file.chmod(0o777 & ~mask if file.is_dir() else 0o666 & ~mask)
         (tmp_path / place / "out").mkdir()
-        made(kind, source, tmp_path / place / "out", backend)
+        build_distribution(kind, source, tmp_path / place / "out", backend)
         (file,) = (tmp_path / place / "out").iterdir()
-        found.append((file.name, file.read_bytes()))
-    assert found[0] == found[1]
+        archives.append((file.name, file.read_bytes()))
+    assert archives[0] == archives[1]

@@ -1,4 +1,4 @@
-"""What lies in a build's way, damages it, or calls itself a compiler: said, and nothing is lost."""
+"""Obstacles to a build, damaged builds and false compilers are reported, and no file is lost."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 @contextmanager
 def at_most(seconds: int) -> Iterator[None]:
-    """A TimeoutError, also out of a call of the system that waits."""
+    """Raise TimeoutError after some seconds, even out of a blocking system call."""
 
-    def expired(*_: Any) -> None:
+    def raise_timeout(*_: Any) -> None:
         raise TimeoutError(f"after {seconds} s")
 
-    before = signal.signal(signal.SIGALRM, expired)
+    before = signal.signal(signal.SIGALRM, raise_timeout)
     signal.alarm(seconds)
     try:
         yield
@@ -42,10 +42,10 @@ def at_most(seconds: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("what", ["link", "dangling link", "FIFO", "folder", "device", "socket"])
-def test_only_a_file_is_locked(
+def test_lock_must_be_a_regular_file(
     what: str, scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A FIFO that was opened to be written would wait for ever for somebody to read it."""
+    """A FIFO opened for writing would block until another process reads it."""
     root.mkdir()
     lock, precious = root / ".simple_pendulum.lock", tmp_path / "precious"
     precious.write_text("my thesis", encoding="utf-8")
@@ -61,9 +61,9 @@ def test_only_a_file_is_locked(
         case "socket":
             import socket
 
-            with socket.socket(socket.AF_UNIX) as made:
-                monkeypatch.chdir(root)  # a socket's path is short
-                made.bind(lock.name)
+            with socket.socket(socket.AF_UNIX) as unix_socket:
+                monkeypatch.chdir(root)  # the path of a socket must be short
+                unix_socket.bind(lock.name)
         case "device":
             try:
                 os.mknod(lock, stat.S_IFCHR | 0o600, os.makedev(1, 3))
@@ -77,11 +77,13 @@ def test_only_a_file_is_locked(
     assert not (tmp_path / "nowhere").exists() and not (root / "simple_pendulum").exists()
 
 
-def test_a_lock_is_not_emptied(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lock_file_is_not_truncated(
+    scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root.mkdir()
     lock = root / ".simple_pendulum.lock"
     lock.write_text("a hard link to something", encoding="utf-8")
-    monkeypatch.setenv("CC", "false")  # called while the lock is held
+    monkeypatch.setenv("CC", "false")  # called while the build has the lock
     with pytest.raises(eomc.EomcError, match="the C compiler failed"):
         eomc.build(scene, root)
     assert lock.read_text(encoding="utf-8") == "a hard link to something"
@@ -91,7 +93,7 @@ def test_a_lock_is_not_emptied(scene: Path, root: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("what", ["file", "dangling link", "link to a file"])
-def test_something_else_where_the_module_would_lie(what: str, scene: Path, root: Path) -> None:
+def test_other_file_in_place_of_the_module_is_reported(what: str, scene: Path, root: Path) -> None:
     root.mkdir()
     if what == "file":
         (root / "simple_pendulum").write_text("mine", encoding="utf-8")
@@ -106,10 +108,10 @@ def test_something_else_where_the_module_would_lie(what: str, scene: Path, root:
         assert (root / "simple_pendulum").read_text(encoding="utf-8") == "mine"
 
 
-def test_a_package_of_somebody_else_is_not_replaced(scene: Path, root: Path) -> None:
+def test_foreign_package_is_not_replaced(scene: Path, root: Path) -> None:
     folder = root / "simple_pendulum"
     (folder / "_runtime").mkdir(parents=True)
-    for file in ("__init__.py", "build.json"):  # both are names of files of a build
+    for file in ("__init__.py", "build.json"):  # a build has files of both names
         (folder / file).write_text("mine = 1", encoding="utf-8")
     with pytest.raises(eomc.EomcError, match="a package that eomc did not build"):
         eomc.build(scene, root)
@@ -117,8 +119,8 @@ def test_a_package_of_somebody_else_is_not_replaced(scene: Path, root: Path) -> 
     assert (folder / "__init__.py").read_text(encoding="utf-8") == "mine = 1"
 
 
-def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path, found: None) -> None:
-    """A damaged extension of the right size would end the process that loads it."""
+def test_every_bit_of_a_build_is_verified(scene: Path, root: Path, found: None) -> None:
+    """A damaged extension of the right size would terminate the process that loads it."""
     folder = root / "simple_pendulum"
     files = [f for f in sorted(folder.rglob("*.*")) if f.suffix not in (".json", ".pyc")]
     assert {".so", ".py", ".c", ".h"} <= {f.suffix for f in files}
@@ -169,11 +171,11 @@ RUBBISH = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", RUBBISH)
-def test_a_compiler_that_writes_rubbish(
+def test_compiler_with_invalid_output_is_reported(
     what: str, scene: Path, root: Path, built: float, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """It returns 0; what it made is tried before it takes the place of the old module."""
+    """It returns 0; its library is tested before it replaces the old module."""
     out = 'out=; for w in "$@"; do [ "$last" = -o ] && out="$w"; last="$w"; done\n'
     cc = script(tmp_path / "odd", out + RUBBISH[what] + "\nexit 0\n")
     monkeypatch.setenv("CC", cc)
@@ -187,7 +189,7 @@ def test_a_compiler_that_writes_rubbish(
     assert gravity(root) == 2 * built
 
 
-def test_a_compilers_words_need_not_be_utf8(
+def test_compiler_messages_need_not_be_utf8(
     scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "latin", "printf 'err\\351 \\377'; exit 1\n"))
@@ -197,7 +199,7 @@ def test_a_compilers_words_need_not_be_utf8(
 
 @pytest.mark.parametrize("variable", ["CC", "EOMC_CFLAGS"])
 @pytest.mark.parametrize("value", ["gcc '-O1", 'gcc "-O1', "gcc -O1\\"])
-def test_an_open_quote(
+def test_unbalanced_quote_in_a_variable_is_reported(
     variable: str, value: str, scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(variable, value)
@@ -206,7 +208,7 @@ def test_an_open_quote(
 
 
 @pytest.mark.parametrize("value", ["{root}", "{root}/scene.toml", "  ", "\udcff"])
-def test_what_is_no_compiler(
+def test_program_that_is_no_compiler_is_reported(
     value: str, scene: Path, tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", value.format(root=tmp_path))
@@ -214,33 +216,33 @@ def test_what_is_no_compiler(
         eomc.build(scene, root)
 
 
-def test_flags_that_are_no_text(
+def test_flags_that_are_not_utf8_are_accepted(
     scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The build with others takes the place of that without, once."""
+    """The build with other flags replaces the one without, once."""
     monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DX=\udcff")
     assert eomc.build(scene, root).fresh
     assert not eomc.build(scene, root).fresh
     assert len(list((root / "simple_pendulum").glob("_simple_pendulum_*"))) == 1
 
 
-def test_what_cffi_can_not_rename_is_said_by_its_cause(
+def test_failed_rename_by_cffi_is_reported_with_its_cause(
     scene: Path, root: Path, built: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It then removes what isn't there yet, which fails too."""
+    """cffi then removes a file that does not exist, which fails too."""
 
-    def failing(old: str, new: str) -> None:
+    def failing_rename(old: str, new: str) -> None:
         raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), old, None, new)
 
-    monkeypatch.setenv("CC", "cc")  # else what was compiled before is taken
-    monkeypatch.setattr(os, "rename", failing)
+    monkeypatch.setenv("CC", "cc")  # otherwise the cached compilation is used
+    monkeypatch.setattr(os, "rename", failing_rename)
     with pytest.raises(eomc.EomcError, match=r"binding\.c.*can't be written \(Disk quota exceeded"):
         eomc.build(scene, root)
     assert leftovers(root) == [] and gravity(root) == built
 
 
-def test_a_full_device(scene: Path, root: Path, built: float) -> None:
-    """As `ulimit -f`: the old module stays."""
+def test_full_device_leaves_the_old_module(scene: Path, root: Path, built: float) -> None:
+    """`ulimit -f` simulates the full device."""
 
     def build() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
