@@ -130,7 +130,7 @@ def test_run_in_one_call_equals_run_with_progress(kepler: ModuleType, options: d
     fast = kepler.simulate(duration=PERIOD, tol=1e-8, **options)
     assert 0 < fast.steps + 1 <= kepler._model.integrator.room
     general = kepler.simulate(
-        duration=PERIOD, tol=1e-8, **options, progress=lambda finished, of: None
+        duration=PERIOD, tol=1e-8, **options, progress=lambda finished, total: None
     )
     assert fast == general and fast.message == general.message
     assert fast.evaluations == general.evaluations and fast.h == general.h

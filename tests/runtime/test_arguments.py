@@ -184,9 +184,9 @@ BAD_RUNS = [
 
 
 # the messages are the ids: the repr of a function differs between processes
-@pytest.mark.parametrize(("options", "words"), BAD_RUNS, ids=[words for _, words in BAD_RUNS])
-def test_invalid_argument_of_a_run_is_named(driven: ModuleType, options: Any, words: str) -> None:
-    with pytest.raises(ValueError, match="(?s)^" + words):
+@pytest.mark.parametrize(("options", "message"), BAD_RUNS, ids=[message for _, message in BAD_RUNS])
+def test_invalid_argument_of_a_run_is_named(driven: ModuleType, options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match="(?s)^" + message):
         driven.simulate(**options)
 
 

@@ -94,7 +94,7 @@ def test_new_file_replaces_the_old_one_and_keeps_its_mode(
 
 @pytest.mark.parametrize("name", [n for n in WRITERS if n not in ("run.pdf", "run.gif")])
 def test_scene_or_file_of_another_kind_is_not_replaced(name: str, run: Any, tmp_path: Path) -> None:
-    """Whatever the suffix, and through a link too; an empty file may be replaced."""
+    """This holds for any suffix and through a link; an empty file may be replaced."""
     file, link = tmp_path / name, tmp_path / f"link{Path(name).suffix}"
     link.symlink_to(file)
     for text in (SCENE, *(["words of another kind"] if file.suffix in BEGINNINGS else [])):

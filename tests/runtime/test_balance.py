@@ -129,7 +129,7 @@ def test_work_of_inputs_and_of_forces_are_separate(pushed: ModuleType) -> None:
 def test_balance_error_is_the_error_of_the_method(
     pushed: ModuleType, params: dict[str, float]
 ) -> None:
-    """It falls by 16 or more where h is halved and equals the energy error along the run."""
+    """The balance error falls by 16 or more if h is halved, and equals the error of the energy."""
     balances = [
         pushed.simulate(h=h, duration=8.0, params=params).balance() for h in (0.04, 0.02, 0.01)
     ]

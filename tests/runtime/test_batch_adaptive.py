@@ -18,13 +18,13 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
-MANY = "[run]\nbatch = true\n"
+BATCH_RUN = "[run]\nbatch = true\n"
 
 
 @pytest.fixture(scope="module")
 def orbits(unoptimised_file: None) -> ModuleType:
     """Orbits about the origin."""
-    text = KEPLER.replace("eccentric", "many_orbits").replace("[run]\n", MANY)
+    text = KEPLER.replace("eccentric", "many_orbits").replace("[run]\n", BATCH_RUN)
     return eomc.load(from_scene(parse(text, "orbits.toml")), BUILDS)
 
 
@@ -159,7 +159,7 @@ def test_stiff_instances_take_newton_steps(modules: Modules, stiff: bool) -> Non
 
 @pytest.mark.slow
 def test_signals_and_single_precision_in_a_batch() -> None:
-    text = KEPLER.replace("eccentric", "many_single").replace("[run]\n", MANY)
+    text = KEPLER.replace("eccentric", "many_single").replace("[run]\n", BATCH_RUN)
     text = text.replace('push = { unit = "N" }', 'push = { unit = "N", signal = "0.1*sin(3*t)" }')
     text = text.replace("tolerance = 1e-9", 'tolerance = 1e-4\nreal = "float"')
     module = eomc.load(from_scene(parse(text, "single.toml")), BUILDS)
@@ -224,7 +224,7 @@ def test_saved_batch_is_loaded_unchanged(orbits: ModuleType, tmp_path: Path) -> 
 def test_input_tables_are_applied_over_control_periods_as_in_single_runs(
     orbits: ModuleType, shared: bool, tmp_path: Path
 ) -> None:
-    """Also over a period that the run cuts short, in one or two threads, and between rows."""
+    """The last period is cut short by the run; one or two threads, and states between rows."""
     tables, times = (
         np.random.default_rng(1).normal(0, 0.1, (1 if shared else 20, 8, 1)),
         [0, 0.5, 2.0],

@@ -96,7 +96,7 @@ def test_wide_angles_are_reduced_as_in_a_single_run(real: str, wide: float) -> N
 
 @pytest.mark.parametrize(("real", "wide"), [("double", 2e16), ("float", 4e7)])
 def test_angles_too_wide_for_vector_code_use_libm(real: str, wide: float) -> None:
-    """They are too wide to move; the cart moves by their sines and cosines."""
+    """These angles are too wide to change; the cart moves by their sines and cosines."""
     m = module("cartpole", real=f'"{real}"')
     q0 = np.stack([np.zeros(9), np.linspace(1, 3, 9) * wide], axis=1).astype(m.dtype)
     qd0 = np.tile([0.3, 0.5], (9, 1)).astype(m.dtype)

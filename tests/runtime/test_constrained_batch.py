@@ -14,7 +14,7 @@ from conftest import Modules
 
 COUNT, STEPS, EVERY = 3, 20, 3
 LENGTHS = np.array([0.4, 0.35, 0.3])
-SHORT = {"steps": STEPS, "every": EVERY}
+SHORT_RUN = {"steps": STEPS, "every": EVERY}
 INPUTS: dict[str, Any] = {
     "signals": None,
     "constant": [0.7, 0.1],
@@ -68,7 +68,7 @@ def test_instance_has_the_constraint_forces_of_its_single_run(
     linkage: ModuleType, inputs: str, params: dict[str, Any]
 ) -> None:
     u, initial = INPUTS[inputs], starts(linkage)
-    runs = linkage.simulate_batch(**initial, **SHORT, u=u, params=params)
+    runs = linkage.simulate_batch(**initial, **SHORT_RUN, u=u, params=params)
     rows = runs.q.shape[1]
     assert rows == 8 and (runs.status == "ok").all()
     for columns in (runs.constraints, runs.multipliers):
@@ -80,7 +80,7 @@ def test_instance_has_the_constraint_forces_of_its_single_run(
         single = linkage.simulate(
             initial["q0"][k],
             initial["qd0"][k],
-            **SHORT,
+            **SHORT_RUN,
             u=inputs_of_instance(u, k),
             params=own_params,
         )
@@ -118,7 +118,7 @@ def test_adaptive_and_saved_batches_have_constraint_forces(
 def test_rows_after_a_failure_are_nan(linkage: ModuleType) -> None:
     initial = starts(linkage)
     initial["qd0"][1, 0] = 1e200
-    runs = linkage.simulate_batch(**initial, **SHORT)
+    runs = linkage.simulate_batch(**initial, **SHORT_RUN)
     assert (runs.status == "ok").tolist() == [True, False, True]
     for column in (*runs.constraints.values(), *runs.multipliers.values()):
         assert np.isnan(column[1, 1:]).all() and np.isfinite(column[[0, 2]]).all()

@@ -109,7 +109,7 @@ def difference_quotients(step: Any, x: Any, width: float = 2e-3) -> Any:
 def test_derivatives_equal_differences_of_steps(
     modules: Modules, text: str, method: str, inputs: str
 ) -> None:
-    """Also where the state before the step violates the constraints: steps project it onto them."""
+    """The state before a step may violate the constraints: a step projects any state onto them."""
     m, t, h = modules.unoptimised(text), 0.4, 0.02
     u = INPUTS[inputs] if m.inputs else None
     q, qd = m.project(*m.start, t=t)
@@ -139,7 +139,7 @@ def test_derivatives_equal_differences_of_steps(
     ],
 )
 def test_derivatives_stay_in_the_tangent_space(modules: Modules, text: str) -> None:
-    """Whatever changes before a step, afterwards changes satisfy the constraints, to rounding."""
+    """After a step, any change of the initial state satisfies the constraints, to rounding."""
     m, t, h = modules.unoptimised(text), 0.4, 0.02
     q, qd = m.project(*m.start, t=t)
     Phi, Gamma = m.discretize(q, qd, h, t)

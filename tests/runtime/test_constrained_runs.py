@@ -311,7 +311,7 @@ def test_projection_near_zero_demands_no_more_than_rounding(modules: Modules, si
 
 
 def test_projection_does_not_jump_by_full_turns(four_bar: ModuleType) -> None:
-    """Where the gradients nearly vanish, a full Newton step would be about 1e9 rad."""
+    """With nearly vanishing gradients, a full Newton step would be about 1e9 rad."""
     folded = {"params": {"r": 0.5, "s": 1.0, "l": -0.5}}
     for deviation in (0.0, 1e-9):
         q, _ = four_bar.project([1.0, -1.0 + deviation, 1e-9], np.zeros(3), **folded)
@@ -388,14 +388,16 @@ def test_constraints_that_contradict_each_other_later_are_reported(tmp_path: Pat
 DEPENDENT = ["sin(x) + 0.7*y*y", "0.7*y*y - 2*sin(x)"]
 
 
-@pytest.mark.parametrize("one", tiers(DEPENDENT, DEPENDENT[0]))
-def test_constraint_dependent_on_the_fixed_values_is_redundant(one: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("formula", tiers(DEPENDENT, DEPENDENT[0]))
+def test_constraint_dependent_on_the_fixed_values_is_redundant(
+    formula: str, tmp_path: Path
+) -> None:
     """With z fixed, the second is a multiple of the first up to rounding: no new direction."""
     modules = list[ModuleType]()
-    for name, second in (("one_row", {}), ("two_rows", {"other": f"3.3*({one}) + 7*z"})):
+    for name, second in (("one_row", {}), ("two_rows", {"other": f"3.3*({formula}) + 7*z"})):
         scene_system = system(
             name, {"x": (0.0, 0.0), "y": (0.0, 0.0), "z": (0.0, 0.0)},
-            "x_dot**2/2 + 1.5*y_dot**2 + z_dot**2", "0", {"one": f"{one} + 5*z", **second},
+            "x_dot**2/2 + 1.5*y_dot**2 + z_dot**2", "0", {"one": f"{formula} + 5*z", **second},
             h=0.01, duration=0.1,
         )  # fmt: skip
         modules.append(eomc.load(scene_system, tmp_path))

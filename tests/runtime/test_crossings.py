@@ -16,7 +16,7 @@ from eventful import FREE, built, event
 import eomc
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
-TWO = """eomc = 1
+TWO_SPRINGS = """eomc = 1
 name = "two_springs"
 [coordinates]
 x = { start = 1, rate = 0 }
@@ -42,7 +42,7 @@ when = "x*y_dot - d"
 @pytest.fixture(scope="module")
 def springs() -> ModuleType:
     """Two oscillators of frequencies 1 and sqrt(k), with two events."""
-    return built(TWO)
+    return built(TWO_SPRINGS)
 
 
 def test_close_crossings_in_one_long_step_are_detected(free: ModuleType) -> None:
@@ -63,7 +63,7 @@ def test_dip_between_two_evaluations_is_detected(springs: ModuleType, tol: float
 
 
 FAST = (
-    TWO.replace("two_springs", "fast_events")
+    TWO_SPRINGS.replace("two_springs", "fast_events")
     .replace('"x*y_dot - d"', '"cos(w*x - d)"')
     .replace('"a*x + b*y - c"', '"sin(w*t)"')
     .replace("k = 2", "w = 50\nk = 2")
@@ -86,7 +86,7 @@ def test_events_faster_than_the_motion_are_detected(tol: float) -> None:
 
 
 ROUNDED = (
-    TWO.replace("two_springs", "rounded_events")
+    TWO_SPRINGS.replace("two_springs", "rounded_events")
     .replace('"a*x + b*y - c"', '"x**2 + x_dot**2 - 1"')
     .replace('"x*y_dot - d"', '"min(x, 0.5 - x)"')
 )
@@ -128,18 +128,18 @@ def test_random_events_equal_those_of_the_exact_motion(springs: ModuleType, seed
         q0, qd0, tol=1e-13, duration=12.0, params=dict(zip("kabcd", (k, a, b, c, d), strict=True))
     )
 
-    def motion(t, by):
-        w = by.sqrt(k)
-        x = q0[0] * by.cos(t) + qd0[0] * by.sin(t)
-        y = q0[1] * by.cos(w * t) + qd0[1] / w * by.sin(w * t)
-        return x, y, -q0[1] * w * by.sin(w * t) + qd0[1] * by.cos(w * t)
+    def motion(t, functions):
+        w = functions.sqrt(k)
+        x = q0[0] * functions.cos(t) + qd0[0] * functions.sin(t)
+        y = q0[1] * functions.cos(w * t) + qd0[1] / w * functions.sin(w * t)
+        return x, y, -q0[1] * w * functions.sin(w * t) + qd0[1] * functions.cos(w * t)
 
-    def line(t, by=mpmath):
-        x, y, _ = motion(t, by)
+    def line(t, functions=mpmath):
+        x, y, _ = motion(t, functions)
         return a * x + b * y - c
 
-    def curve(t, by=mpmath):
-        x, _, rate = motion(t, by)
+    def curve(t, functions=mpmath):
+        x, _, rate = motion(t, functions)
         return x * rate - d
 
     for name, f in (("line", line), ("curve", curve)):

@@ -149,7 +149,7 @@ def derivative(text: str, method: str, h: float, t: float, u: Any) -> Any:
 
 
 def is_quick(method: str, inputs: str) -> bool:
-    """Whether the case is no variant of others."""
+    """Return True if other cases do not cover this one."""
     return method in ("rk4", "euler") or (method, inputs) == ("gauss4", "beyond")
 
 

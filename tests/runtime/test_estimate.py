@@ -148,7 +148,7 @@ def linear(modules: Modules) -> ModuleType:
 def test_perturbation_of_oscillators_does_not_grow(
     linear: ModuleType, place: float, options: dict[str, Any]
 ) -> None:
-    """Their flow is a rotation, wherever the origin is and whichever of them moves."""
+    """The flow of oscillators is a rotation, for any origin and any of them in motion."""
     error = simulate_quietly(linear, params={"place": place}, **options).estimate()
     assert error.amplification == pytest.approx(1, abs=0.3)
 
@@ -234,8 +234,7 @@ def test_estimates_of_all_cases() -> None:
     assert not any(silent for _, silent in pairs)
 
 
-# --- runs that are not resolved
-# --------------------------------------------------------------------
+# --- runs that are not resolved -------------------------------------------------------------------
 
 
 TWO_BODIES = """
@@ -450,6 +449,6 @@ def test_linearize_without_its_code_is_refused_with_advice(cartpole: ModuleType)
 def test_diverging_velocities_do_not_set_the_scale_of_positions(
     ends: list[float], expected: list[float]
 ) -> None:
-    """Where positions are 1e40 times smaller, their errors would seem negligible."""
+    """Errors of positions that are 1e40 times smaller would seem negligible."""
     scales = estimate.scales(np.array([[0.0, 0.0, 0.0, 0.0], ends]), 2.0, 2.0**-53)
     np.testing.assert_allclose(scales, expected, rtol=1e-15)

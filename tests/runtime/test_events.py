@@ -218,7 +218,7 @@ def test_c_without_jumps_compiles_without_warnings(tmp_path: Path, action: str) 
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_events_and_tolerance_of_a_system_from_python() -> None:
-    """As in a scene; the targets of a jump are symbols, dynamicsymbols or strings."""
+    """Events work as in a scene; targets of a jump are symbols, dynamicsymbols or strings."""
     x, y = sympy.physics.vector.dynamicsymbols("x y")
     system = eomc.System.make(
         "thrown", {x: (0, 1), y: 1.0}, (x.diff() ** 2 + y.diff() ** 2) / 2, G * y,

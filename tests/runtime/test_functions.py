@@ -45,7 +45,7 @@ def test_values_equal_the_textbook(cartpole: ModuleType) -> None:
 
 
 def test_time_inputs_and_parameters_are_positional_in_this_order() -> None:
-    """They follow the state and the function's own arguments, in all functions of a state."""
+    """In all functions of a state, they follow the state and the function's own arguments."""
     names_checked = []
     parts = (Functions, Frames, Constraints, Statics, Integrator, Batch)
     methods = {name: method for part in parts for name, method in vars(part).items()}

@@ -381,7 +381,7 @@ def test_mass_that_is_not_finite_can_lock_the_constraints(tmp_path: Path) -> Non
 
 
 def test_equilibrium_leaves_discrete_values_unchanged(gripper: ModuleType) -> None:
-    """Where a force is missing, no stiffness is changed; others keep the scene's values."""
+    """Jumped parameters are no unknowns: a missing force does not change a stiffness."""
     q, _, u = gripper.equilibrium([0.1, 0.2], [0.0, 0.0], u=1.0)
     set_by_jumps = gripper.start[0][2:]
     assert q[:2] == pytest.approx([0.25, 0.0], abs=1e-12) and (q[2:] == set_by_jumps).all()

@@ -50,7 +50,7 @@ duration = 2.0
 BATCH = SCENE + 'batch = true\nmethod = ["rk4", "dp8", "euler"]\n'
 IMPLICIT = SCENE + 'method = ["gauss4", "gauss8", "gauss16"]\n'
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
-LEAST, MOST = np.array([-2.0, 0.0, -np.inf]), np.array([3.0, np.inf, np.inf])
+LOWER, UPPER = np.array([-2.0, 0.0, -np.inf]), np.array([3.0, np.inf, np.inf])
 TABLE = np.random.default_rng(3).uniform(-9, 9, (200, 3))
 
 
@@ -88,11 +88,11 @@ def test_input_beyond_its_limit_acts_as_the_limit(text: str, form: str, tmp_path
     """Bit for bit, in every method, for constant inputs and a row per step."""
     module = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form=form)
     q, qd = module.start
-    assert not np.array_equal(np.clip(TABLE, LEAST, MOST), TABLE)
+    assert not np.array_equal(np.clip(TABLE, LOWER, UPPER), TABLE)
     for method in module.methods:
         for u in (TABLE, TABLE[1]):
             run = module.simulate(u=u, method=method)
-            expected = module.simulate(u=np.clip(u, LEAST, MOST), method=method)
+            expected = module.simulate(u=np.clip(u, LOWER, UPPER), method=method)
             assert run.status == "ok" and np.array_equal(run.x, expected.x)
             assert np.array_equal(run.u, expected.u) and not expected.saturated.any()
             assert np.array_equal(run.outputs["pull"], expected.outputs["pull"])
@@ -111,8 +111,8 @@ def test_signals_are_limited_at_every_stage(modules: Modules, limited: ModuleTyp
     run, expected = limited.simulate(), reference.simulate()
     assert run.x == pytest.approx(expected.x, rel=1e-11, abs=1e-11)
     signals = np.array([20 * run.theta + 3 * run.theta_dot, np.sin(9 * run.t), np.cos(run.t)]).T
-    assert run.u == pytest.approx(np.clip(signals, LEAST, MOST), abs=1e-12)
-    beyond = (signals < LEAST) | (signals > MOST)
+    assert run.u == pytest.approx(np.clip(signals, LOWER, UPPER), abs=1e-12)
+    beyond = (signals < LOWER) | (signals > UPPER)
     assert np.array_equal(run.saturated, beyond) and beyond.any(axis=0).tolist() == [
         True,
         True,

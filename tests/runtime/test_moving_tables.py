@@ -58,7 +58,7 @@ batch = true
 
 @pytest.mark.parametrize("e", [0.3, 0.5, 0.9])
 def test_ball_does_not_fall_through_a_moving_table(tmp_path: Path, e: float) -> None:
-    """It comes to rest on the table, or is thrown up again for ever."""
+    """The ball comes to rest on the table, or is thrown up again for ever."""
     file = tmp_path / "table.toml"
     file.write_text(TABLE, encoding="utf-8")
     A = np.linspace(0.002, 0.05, 100)
@@ -74,7 +74,7 @@ def test_ball_does_not_fall_through_a_moving_table(tmp_path: Path, e: float) -> 
 
 
 def test_ball_stays_inside_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
-    """Where the straight and the round part meet, a chord may be as short as rounding."""
+    """Chords near the corners of the wall may be as short as rounding."""
     file = tmp_path / "stadium.toml"
     file.write_text(STADIUM, encoding="utf-8")
     y = np.linspace(-0.9, 0.9, 100)

@@ -61,7 +61,7 @@ def test_batch_takes_inputs_by_name(shape: tuple[int, ...]) -> None:
 
 
 def test_symbols_of_sympy_are_names(driven: ModuleType) -> None:
-    """Of parameters and inputs, in single runs and batches; also as functions of time."""
+    """Symbols name parameters and inputs, in runs and batches; dynamicsymbols work too."""
     m_c, force = sympy.Symbol("m_c", positive=True), dynamicsymbols("force")
     run = driven.simulate(params={m_c: 3.0}, u={force: 0.5}, steps=5)
     assert same(run, driven.simulate(params={"m_c": 3.0}, u={"force": 0.5}, steps=5))

@@ -169,7 +169,7 @@ def test_system_can_be_built_with_inverse_dynamics(modules: Modules) -> None:
 
 
 def test_module_from_sympy_expressions() -> None:
-    """The same compiled interface; K depends on time, and there is an input."""
+    """A time-dependent kinetic energy and an input have the same compiled interface."""
     x, v, m, u = symbol("x"), symbol("x_dot"), symbol("m"), symbol("u")
     system = System.make(
         "rocket", {x: (0.0, 1.0)}, m * (2 - t) * v**2 / 2, parameters={m: 3}, inputs={u: t},

@@ -166,8 +166,7 @@ def test_damaged_build_is_not_loaded(versions: dict[str, Any], folder: Path) -> 
         pickle.loads(versions["first"]["module"]).simulate()
 
 
-# --- all kinds of pickled values
-# -------------------------------------------------------------------
+# --- all kinds of pickled values ------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +247,7 @@ def test_saved_run_with_other_events_is_refused(values: dict[str, Any], tmp_path
 def test_module_imported_by_its_own_name_is_refused_if_another_build_has_the_name(
     cartpole: ModuleType,
 ) -> None:
-    """It is found by that name alone, which another build now has."""
+    """Such a module is found by its name alone, which another build now has."""
     code = """
 import pickle, sys
 import cartpole as m

@@ -76,7 +76,7 @@ def test_adaptive_steps_end_at_the_reference(case: tuple[str, ModuleType], tol: 
 
 
 def test_passage_succeeds_from_any_speed(case: tuple[str, ModuleType]) -> None:
-    """However close the flat position is to a stage or to the end of a step."""
+    """The flat position may be arbitrarily close to a stage or to the end of a step."""
     _, module = case
     q, qd = module.start
     for part in np.random.default_rng(0).uniform(0.7, 1.3, 60):

@@ -47,7 +47,7 @@ duration = 0.1
 tolerance = 1e-9
 batch = true
 """
-MANY = {"k": np.array([30.0, 20.0, 50.0]), "v": np.array([0.5, 0.0, -1.0])}
+BATCH_PARAMS = {"k": np.array([30.0, 20.0, 50.0]), "v": np.array([0.5, 0.0, -1.0])}
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +80,9 @@ def test_run_starts_at_the_values_of_its_parameters(
 def test_each_instance_starts_at_the_values_of_its_parameters(
     hangs: ModuleType, scene: Scene, options: dict
 ) -> None:
-    runs = hangs.simulate_batch(params=MANY, **options)
+    runs = hangs.simulate_batch(params=BATCH_PARAMS, **options)
     for k in range(3):
-        q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
+        q, qd = scene.start({name: float(values[k]) for name, values in BATCH_PARAMS.items()})
         np.testing.assert_allclose(runs.q[k, 0, :3], q, rtol=1e-15)
         np.testing.assert_allclose(runs.qd[k, 0, :3], qd, rtol=1e-15)
     # its parameters are those of the scene: equal bit for bit
@@ -108,9 +108,9 @@ def test_values_by_name_leave_the_others_at_those_of_the_scene(
 
 @pytest.mark.parametrize("options", [{}, {"h": 0.01}])
 def test_values_by_name_for_each_instance(hangs: ModuleType, scene: Scene, options: dict) -> None:
-    runs = hangs.simulate_batch({"x": [1.0, 2.0, 3.0]}, {"x": 0.5}, params=MANY, **options)
+    runs = hangs.simulate_batch({"x": [1.0, 2.0, 3.0]}, {"x": 0.5}, params=BATCH_PARAMS, **options)
     for k in range(3):
-        q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
+        q, qd = scene.start({name: float(values[k]) for name, values in BATCH_PARAMS.items()})
         assert runs.q[k, 0] == pytest.approx([*q[:2], k + 1.0, 2.0], rel=1e-15)
         assert runs.qd[k, 0] == pytest.approx([*qd[:2], 0.5, 0.0], rel=1e-15)
     runs = hangs.simulate_batch({"x": 4.0}, {"theta": np.array([0.1, 0.2])}, **options)
@@ -163,7 +163,7 @@ def test_invalid_names_and_values_are_refused(
     ("q0", "qd0", "params", "message"),
     [
         ({"x": [1.0, 2.0]}, {"x": [1.0, 2.0, 3.0]}, None, "qd0: x: 3 .* where q0: x has 2"),
-        ({"x": [1.0, 2.0]}, None, MANY, "q0: x: 2 instances where params has 3"),
+        ({"x": [1.0, 2.0]}, None, BATCH_PARAMS, "q0: x: 2 instances where params has 3"),
         ({"x": [1.0, np.inf]}, None, None, "q0: x: not all numbers are finite"),
         ({"x": [[1.0]]}, None, None, "q0: x: .* is not a number"),
         ({"x": [1.0, 2.0]}, np.zeros((3, 4)), None, "qd0: 3 instances where q0 has 2"),

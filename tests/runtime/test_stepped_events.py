@@ -80,7 +80,7 @@ def test_ball_bounces_at_the_right_times(ball: ModuleType, h: float, method: str
 
 @pytest.mark.parametrize("h", [0.001, 0.5])
 def test_ball_comes_to_rest(ball: ModuleType, h: float) -> None:
-    """Its last flights last a millionth of a step."""
+    """The last flights take a millionth of a step."""
     with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
         run = ball.simulate(h=h, duration=20.0)
     times = impacts(0.8, len(run.events["impact"]))
@@ -149,7 +149,7 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
 
 
 def test_feedback_law_is_called_at_each_step_or_period(swing: ModuleType) -> None:
-    """It is not called after a jump: inputs are held constant until the next multiple of h."""
+    """No call follows a jump: inputs are held constant until the next multiple of h."""
     call_times: list[float] = []
 
     def recording_law(t: float, q: Any, qd: Any) -> list[float]:
@@ -511,7 +511,7 @@ def test_section_where_a_jump_changes_the_forces(modules: Modules) -> None:
 def test_section_at_rest_is_crossed_once_when_left_to_the_other_side(
     slope: float, noise: float
 ) -> None:
-    """It comes down to 0, stays there until t = 2, and moves on."""
+    """The value falls to 0, stays there until t = 2, and moves on."""
     piece = np.linspace(0.0, 1.0, 9)
     rest = noise * (-1.0) ** np.arange(9)
     columns = {

@@ -13,7 +13,7 @@ from links import made_of
 
 import eomc
 
-BOTH = ", friction = 0.02"
+PHI_FRICTION = ", friction = 0.02"
 SLIP_TIME = math.asin(0.4) / 3  # where 0.05 sin(3 t) exceeds 0.02
 
 JOINT = """eomc = 1
@@ -131,7 +131,7 @@ def test_joint_rests_under_forces_with_kinks(modules: Modules, text: str) -> Non
             assert run.q[-1, 0] == pytest.approx(end, rel=max(10 * tol, 1e-12))
 
 
-@pytest.mark.parametrize("friction", tiers(["", BOTH], BOTH), ids=["one", "both"])
+@pytest.mark.parametrize("friction", tiers(["", PHI_FRICTION], PHI_FRICTION), ids=["one", "both"])
 @pytest.mark.parametrize("bounded", tiers([False, True], True), ids=["smooth", "bounded"])
 def test_coupled_bodies_rest_too(modules: Modules, friction: str, bounded: bool) -> None:
     """psi = 0.3 phi: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
@@ -173,7 +173,7 @@ def test_portable_form_rests_too(modules: Modules, text: str, tmp_path: Path) ->
 
 
 def test_force_by_sign_is_reported_with_advice(modules: Modules) -> None:
-    r"""Where the scene says \"stick\" already, that is not the advice."""
+    """The advice is not friction = "stick", which the scene has already."""
     text = TWO_BODIES.replace("y = {", "y = { rate = 0.01,").replace(
         "1e-3*cos(2*t)", "-0.1*sign(y_dot)"
     )

@@ -161,7 +161,7 @@ def test_rows_are_on_the_constraints(modules: Modules) -> None:
 
 
 def test_many_steps_take_no_memory(cartpole: ModuleType) -> None:
-    """Of 10^12 steps only the requested rows are stored; Ctrl-C stops them."""
+    """A run of 10^12 steps stores only the requested rows; Ctrl-C stops it."""
 
     def interrupt(finished: int, steps: int) -> None:
         raise KeyboardInterrupt
@@ -198,7 +198,7 @@ def test_contradictory_arguments_are_refused(
 
 
 def test_duration_may_exceed_the_output_times(modules: Modules) -> None:
-    """Also a duration that is shorter by a rounding, as a sum of steps."""
+    """A duration that is shorter than the last time by a rounding is accepted too."""
     kepler = modules("kepler_orbit")
     run = kepler.simulate(times=[0, 0.3], duration=1.0, h=0.01)
     assert run == kepler.simulate(times=[0, 0.3], h=0.01)

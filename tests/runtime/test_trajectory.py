@@ -20,7 +20,7 @@ from eomc.verify.symbolic import derive
 
 
 def test_run_can_continue_in_its_output_arrays(driven: ModuleType) -> None:
-    """Its start is a row of them; `u` is a table, and `every` leaves an additional last row."""
+    """The start is a row of these arrays; `u` is a table, and `every` leaves an extra last row."""
     u = np.sin(np.arange(10.0))
     rows = np.empty((5, 2)), np.empty((5, 2))
     first = driven.simulate(Q, QD, steps=10, every=3, u=u, out=rows)
@@ -37,7 +37,7 @@ def test_few_steps_by_the_fast_path_equal_those_by_the_general_path(
 ) -> None:
     """Plain arguments go directly into C; any other argument is checked first."""
     arguments = {"steps": steps, "every": 3, "t0": 0.5, **options}
-    general = driven.simulate(progress=lambda finished, of: None, **arguments)
+    general = driven.simulate(progress=lambda finished, total: None, **arguments)
     monkeypatch.setattr(driven._model.integrator, "run", None)
     fast = driven.simulate(**arguments)
     assert same(general, fast)
@@ -214,7 +214,7 @@ def test_signal_is_evaluated_at_each_stage(driven: ModuleType) -> None:
 def test_function_receives_time_and_state_and_may_store_them(
     driven: ModuleType, every: int
 ) -> None:
-    """Those of each step, whichever rows are stored."""
+    """The function receives them at each step, whichever rows are stored."""
     calls: list[tuple[float, np.ndarray, np.ndarray]] = []
     inputs: list[float] = []
 
