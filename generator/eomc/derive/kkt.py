@@ -293,7 +293,7 @@ def accelerations(
     order = tuple(k for k, _, _ in factored.steps if k < len(D))
     switched_rows = zip(factored.switched.items(), residuals, strict=True)
     parts_of_switched = {
-        rows.solved[r][0][0]: (lack, pivot) for (r, (pivot, _)), lack in switched_rows
+        rows.solved[r][0][0]: (residual, pivot) for (r, (pivot, _)), residual in switched_rows
     }
     return Solution(tape, a, order, factored.pivots, "D", multipliers, parts_of_switched)
 

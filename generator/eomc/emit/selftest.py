@@ -252,12 +252,12 @@ class _Cases:
         results are not finite, or if a pivot of a matrix to be factored is not positive.
         """
         try:
-            found, regular = self.evaluator(name)(values)
+            result, regular = self.evaluator(name)(values)
         except (ArithmeticError, ValueError):
             raise NoCaseError from None
         if not regular:
             raise NoCaseError
-        return found
+        return result
 
     def evaluator(self, name: str) -> Callable[[Mapping[str, float]], tuple[Vector, bool]]:
         """Return a Python function that evaluates the program's function `name`.
@@ -776,19 +776,19 @@ class _Cases:
 
         The first step begins at `point`. There are `steps` steps of size `point.span` (s).
         """
-        x, found, t, h = self.state_of(point), Vector(), point.values[TIME], point.span
+        x, result, t, h = self.state_of(point), Vector(), point.values[TIME], point.span
         for n in range(steps):
             x = self.step(m, point, x, t + n * h, h)
-            found += x
-        return found
+            result += x
+        return result
 
     def rows(self, m: Method, point: TestPoint) -> Vector:
         """Return the results of a run of three steps of method m from a point, as C stores them.
 
         These are the last state [q; qd], then q after each step, then qd after each step.
         """
-        n, found = self.nq, self.after_steps(m, RUN_STEPS, point)
-        states = [found[k : k + 2 * n] for k in range(0, len(found), 2 * n)]
+        n, result = self.nq, self.after_steps(m, RUN_STEPS, point)
+        states = [result[k : k + 2 * n] for k in range(0, len(result), 2 * n)]
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
 
@@ -934,8 +934,8 @@ class _Cases:
 
         Raises NoCaseError if integration with shorter steps gives a different result.
         """
-        found, finer = (self.integrate(point, x, t, span, n) for n in (4, 6))
-        if _off(found, finer) > self.of_runs / 10:
+        result, finer = (self.integrate(point, x, t, span, n) for n in (4, 6))
+        if _off(result, finer) > self.of_runs / 10:
             raise NoCaseError
         return finer
 

@@ -72,22 +72,22 @@ class _Formulas:
             known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
         declared = [*known, *(name for name, _ in scene.definitions)]
         rates = {symbol(c.name): symbol(f"{c.name}_dot") for c in scene.coordinates}
-        builder, made = None, []
+        builder, definitions = None, []
         if scene.assembly:
             sticks = scene.run.friction == "stick"
             builder = Builder(scene.assembly, self.value, rates, declared, sticks)
         if builder:
             builder.build_tree()
-            made += builder.terms.definitions
-            known |= {name.name: name for name, _ in made}
+            definitions += builder.terms.definitions
+            known |= {name.name: name for name, _ in definitions}
         for name, formula in scene.definitions:
-            made.append((symbol(name), self.value(f"definitions.{name}", formula)))
+            definitions.append((symbol(name), self.value(f"definitions.{name}", formula)))
             known[name] = symbol(name)
         if builder:
             builder.build_rest()
             builder.add_forces()
-            made += builder.terms.later
-        return made, builder.terms if builder else Terms()
+            definitions += builder.terms.later
+        return definitions, builder.terms if builder else Terms()
 
     def potential(self, definitions: Sequence[tuple[Symbol, Expr]]) -> tuple[Expr, Expr]:
         """Return the potential of the table [energy] as a pair of expressions.

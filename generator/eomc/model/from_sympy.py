@@ -541,20 +541,23 @@ class Maker:
             arguments.definitions,
         )
         as_text = {one for group in declarations for one in group if isinstance(one, str)}
-        moving, found = {*coordinates}, dict[str, Expr]()
+        moving, replacements = {*coordinates}, dict[str, Expr]()
         for name, one in self.taken.items():
             if name_of(one) in as_text:
                 continue
-            found[name] = one
+            replacements[name] = one
             if one in moving and isinstance(one, AppliedUndef):
                 (time,) = one.args
-                found["t"] = time
-                found[f"{name}_dot"], found[f"{name}_ddot"] = one.diff(time), one.diff(time, 2)
+                replacements["t"] = time
+                replacements[f"{name}_dot"], replacements[f"{name}_ddot"] = (
+                    one.diff(time),
+                    one.diff(time, 2),
+                )
             elif one in moving:
                 for order in ("_dot", "_ddot"):
                     rate = Symbol(f"{one}{order}", real=one.is_real)
-                    found[name + order] = self.used.get(rate.name, rate)
-        return found
+                    replacements[name + order] = self.used.get(rate.name, rate)
+        return replacements
 
 
 # --- functions that formulas of scenes have -------------------------------------------------------

@@ -342,10 +342,10 @@ def _transitions(c: Coordinate, s: Coordinate, force: Expr, row: Constraint) -> 
     If several joints start to slip at one time, each is treated separately. A joint that another
     one drives back sticks again as soon as it moves.
     """
-    lack, pivot = row.parts
+    residual, pivot = row.parts
     sticks = ((c.qd.name, S.Zero), (s.name, S.Zero))
-    slips = sympy.Abs(lack) - force * pivot - s.q**2
-    goes = ((c.qd.name, S.Zero), (s.name, -sympy.sign(lack)))
+    slips = sympy.Abs(residual) - force * pivot - s.q**2
+    goes = ((c.qd.name, S.Zero), (s.name, -sympy.sign(residual)))
     return [
         Event(f"{c.name}_stops", s.q * c.qd, "falling", "jump", sticks, above=True),
         Event(f"{c.name}_slips", slips, "rising", "jump", goes, begins=slips),

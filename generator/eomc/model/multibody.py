@@ -333,8 +333,8 @@ class Builder:
             ratio = self.value(f"{key}.ratio", loop.ratio)
             return loops.derive_gear_equation(loop, ratio, self.value(f"{key}.offset", loop.offset))
         ends, base = [], self.chains.common(*loop.bodies)
-        for name, given in zip(loop.bodies, loop.points, strict=True):
-            place, point = self.places[name], self._vector(f"{key}.points", given)
+        for name, position in zip(loop.bodies, loop.points, strict=True):
+            place, point = self.places[name], self._vector(f"{key}.points", position)
             at, R = place.at, place.R
             if base != WORLD:
                 at, R = self.chains.relative_pose(name, base, self._pose_definer(f"{loop.name}_"))

@@ -108,7 +108,7 @@ def ranks(manifold: Manifold, start: Configuration) -> Ranks:
     The equations are evaluated at configurations on a random walk from `start`, which satisfies the
     constraints.
     """
-    found, places = _ranks(manifold, start)
+    ranks, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
     slopes = np.max([place.slopes**2 for place in places], axis=0)
@@ -116,7 +116,7 @@ def ranks(manifold: Manifold, start: Configuration) -> Ranks:
     slopes = np.where(slopes > 0, slopes, (manifold.typical_gradients * np.max(scale)) ** 2)
     latest = max(place.t for place in places)
     return replace(
-        found,
+        ranks,
         weights=weights,
         slopes=tuple(slopes.tolist()),
         latest=latest,

@@ -91,9 +91,9 @@ def nearest_valid(inertia: Inertia) -> Inertia:
     moments = np.array(listed)
     sums = 1.0 - np.eye(3)
     best, least = np.zeros(3), float(moments @ moments)
-    for kept in ((0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)):
-        second = np.linalg.lstsq(sums[:, kept], moments, rcond=None)[0]
-        candidate = sums[:, kept] @ second
+    for columns in ((0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)):
+        second = np.linalg.lstsq(sums[:, columns], moments, rcond=None)[0]
+        candidate = sums[:, columns] @ second
         deviation = float((candidate - moments) @ (candidate - moments))
         if min(second) >= 0 and deviation < least:
             best, least = candidate, deviation

@@ -196,8 +196,8 @@ class AdaptiveRun(Run):
     @classmethod
     def from_arrays(cls, model: CompiledModel, arrays: Mapping[str, Any], **own: Any) -> Self:
         """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
-        held, values = arrays.get("held"), arrays.get("values")
-        u = held if values is None or held is not None else LEFT_OUT
+        constant, values = arrays.get("held"), arrays.get("values")
+        u = constant if values is None or constant is not None else LEFT_OUT
         run = cls(
             model, arrays["t0"], (arrays["q"], arrays["qd"]), arrays["h"], arrays["steps"],
             arrays["status"], arrays["params"], 1, u, arrays["method"], arrays["evaluations"],

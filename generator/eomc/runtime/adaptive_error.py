@@ -296,7 +296,7 @@ class _Events:
         names = own.model.info.events
         if other is None or not names:
             return cls({}, {}, {}, True, None)
-        reached, came = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
+        reached, other_end = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
                          for r in (own, other))  # fmt: skip
         relative_difference = np.where(np.isfinite(left), left, 0.0) / scale
         wrong = np.flatnonzero((left > _UNRESOLVED_ERROR * scale).any(axis=1))
@@ -327,9 +327,9 @@ class _Events:
             if name not in stick:
                 alone = np.delete(b, others), np.delete(a, mine)
                 missed[name] = alone[0][alone[0] <= until]
-                false[name] = alone[1][alone[1] <= min(until, came - edge)]
-        at_end = bool(other.stopped) and not own.stopped and came >= reached - edge
-        before_end = bool(own.stopped) and not other.stopped and came <= reached + edge
+                false[name] = alone[1][alone[1] <= min(until, other_end - edge)]
+        at_end = bool(other.stopped) and not own.stopped and other_end >= reached - edge
+        before_end = bool(own.stopped) and not other.stopped and other_end <= reached + edge
         same = own.stopped == other.stopped and (
             not own.stopped or bool(np.isfinite(errors[own.stopped][-1]))
         )
@@ -426,9 +426,9 @@ def _verdict(own: Any, left: Array, rounding: Array, amplification: float, event
     if own.status not in COMPLETE_STATUSES:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
     words += (event_messages := events.words(own))
-    lost, wrong = (np.asarray((x > _UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
-    if lost[-1]:
-        words.append(rounding_words(own.model, amplification, float(own.t[np.argmax(lost)])))
+    is_rounding, wrong = (np.asarray((x > _UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
+    if is_rounding[-1]:
+        words.append(rounding_words(own.model, amplification, float(own.t[np.argmax(is_rounding)])))
     if wrong.any() and not (event_messages and np.isinf(left[wrong]).all()):
         row = int(np.argmax(wrong))
         words.append(

@@ -130,13 +130,13 @@ def balance(run: Trajectory) -> Balance | None:
         return None
     braking = np.sum((backward - forward) / 2 * rows.qd, axis=1).astype(float)
     jumps = 1 + np.flatnonzero(np.diff(rows.t) == 0)  # the rows after jumps
-    (work, off), (other, _), (lost, blur) = (
+    (work, off), (other, _), (dissipated_work, blur) = (
         _in_pieces(rows.t, y, jumps) for y in (power, rest, braking)
     )
     jump_energy = np.zeros(len(energy))
     jump_energy[jumps] = energy[jumps] - energy[jumps - 1]
-    inputs, forces = float(work[-1] - other[-1]), float(other[-1] + lost[-1])
-    parts, jump_work = (inputs, forces, float(lost[-1])), np.cumsum(jump_energy)
+    inputs, forces = float(work[-1] - other[-1]), float(other[-1] + dissipated_work[-1])
+    parts, jump_work = (inputs, forces, float(dissipated_work[-1])), np.cumsum(jump_energy)
     off, rounding = max(off, blur), float(np.finfo(model.info.dtype).eps * np.max(np.abs(energy)))
     left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
     jumped = float(jump_work[-1])

@@ -116,16 +116,16 @@ def _by_steps(
     if steps % every:
         q_rows[:, -1], qd_rows[:, -1] = q, qd
     if not whole or work.failed:
-        short = work.done < steps
+        short = work.completed < steps
         for k in short.nonzero()[0]:  # a row exists where its own step was completed
-            completed = 1 + work.done[k] // every
+            completed = 1 + work.completed[k] // every
             q_rows[k, completed:] = qd_rows[k, completed:] = np.nan
         if not whole:
             work.status[(work.status == 0) & short] = _INTERRUPTED
     row_inputs = None if inputs is None else _at_rows(inputs, np.arange(rows) * every, steps)
     step_inputs = inputs if inputs is not None and inputs.shape[1] > 1 and every > 1 else None
     run = BatchRun(
-        model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
+        model, t0, q_rows, qd_rows, h, work.completed, work.status, every, steps, table.copy(),
         row_inputs, model.info.method_name(method),
         None if step_inputs is None else step_inputs.copy(),
     )  # fmt: skip
@@ -145,10 +145,10 @@ def _at_times(
     whole = stepper.rows(places, (q_rows, qd_rows), request.threads, request.progress)
     work, last = stepper.work, int(places[0][-1])
     if not whole:
-        work.status[(work.status == 0) & (work.done < last)] = _INTERRUPTED
+        work.status[(work.status == 0) & (work.completed < last)] = _INTERRUPTED
     row_inputs = None if inputs is None else _at_rows(inputs, places[0], steps)
     run = TimedBatchRun(
-        model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
+        model, t0, q_rows, qd_rows, h, work.completed, work.status, 1, last, table.copy(),
         row_inputs, model.info.method_name(method), None if inputs is None else inputs.copy(),
         _times=times, initial_state=np.array(starts, model.info.dtype),
     )  # fmt: skip

@@ -246,8 +246,8 @@ class BatchRun(Columns):
             If a time is outside of the run.
         """
         times = within(self, t)
-        asked, place = np.unique(times, return_inverse=True)
-        q, qd = self._states(asked)[:, :, place.ravel()]
+        unique_times, place = np.unique(times, return_inverse=True)
+        q, qd = self._states(unique_times)[:, :, place.ravel()]
         shape = (len(self), *times.shape, self.model.info.nq)
         return q.reshape(shape), qd.reshape(shape)
 

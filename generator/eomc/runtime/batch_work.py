@@ -92,7 +92,7 @@ class Work:
 
     Attributes
     ----------
-    done, status : (batch,) arrays of int
+    completed, status : (batch,) arrays of int
         Number of completed steps and status of each instance.
     """
 
@@ -112,9 +112,9 @@ class Work:
         )  # fmt: skip
         q_rows, qd_rows = (None, None) if rows is None else rows
         self.rows = 0 if q_rows is None else q_rows.shape[1]
-        self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
+        self.completed, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
         address, (long, integer) = model.c.tools[0], model.batch.count_types
-        self.ends = address(long, self.done), address(integer, self.status)
+        self.ends = address(long, self.completed), address(integer, self.status)
         self.at = tuple(model.c.pointer(x) for x in (q, qd, q_rows, qd_rows))
         self.failed = self.stop = False
         self.moved = 0
@@ -189,7 +189,7 @@ class Work:
         pointer, null = model.c.pointer, model.c.tools[2]
         end = at + count
         q, qd, q_rows, qd_rows = self._places(at)
-        done, status = (x + at for x in self.ends)
+        completed, status = (x + at for x in self.ends)
         each, times = len(self.table) > 1, len(self.begin) > 1
         begin = pointer(self.begin[at:end] if times else self.begin)
         table = pointer(self.table[at:end] if each else self.table)
@@ -217,7 +217,7 @@ class Work:
             failed = self.step(
                 count, q, qd, begin, int(times), self.h, first, many,
                 u + first * u_step if u_step else u, u_instance, u_step, self.every,
-                q_rows, qd_rows, self.rows, table, 1 if each else 0, done, status,
+                q_rows, qd_rows, self.rows, table, 1 if each else 0, completed, status,
             )  # fmt: skip
             duration = perf_counter() - call_start
             self.failed |= failed

@@ -382,12 +382,16 @@ class Constraints(Component):
         fixed = self.info.constraints.fixed
         if not self.info.constraints.modes:
             return self.project_rows(q, qd, t0, params, fixed)
-        found_q, found_qd, first = self.project_rows(self._sliding(q), qd, t0, params, fixed)
-        found_q, found_qd = self._in_modes(found_q, found_qd)
-        found_q, found_qd, codes = self.project_rows(found_q, found_qd, t0, params, fixed)
+        projected_q, projected_qd, first = self.project_rows(
+            self._sliding(q), qd, t0, params, fixed
+        )
+        projected_q, projected_qd = self._in_modes(projected_q, projected_qd)
+        projected_q, projected_qd, codes = self.project_rows(
+            projected_q, projected_qd, t0, params, fixed
+        )
         codes = np.where(first, first, codes)
         failed = (codes != 0)[:, None]
-        return np.where(failed, q, found_q), np.where(failed, qd, found_qd), codes
+        return np.where(failed, q, projected_q), np.where(failed, qd, projected_qd), codes
 
     def _sliding(self, q: ArrayLike) -> Array:
         """Return q with all friction modes set to sliding."""

@@ -480,21 +480,21 @@ class Functions(Component):
         values = result = empty(at.shape, self.dtype)
         if out is not None:
             result = self.arguments.output_array(out, at.shape)
-        to, function, done = self.c.pointer(values), self.c.lib.acceleration, 0
+        to, function, completed = self.c.pointer(values), self.c.lib.acceleration, 0
         if at.ndim == 1:
             time, (inputs, p) = as_number(t, "t"), self.arguments.input_pointers(u, params)
             code = function(1, to, from_q, from_qd, time, inputs, p, self.c.null)
             status = STATUS[code & 7]
         else:
             n, acts = self.nq, StateArguments(self.arguments, at.shape[:1], t, u, params)
-            done, status = self._all_rows(
+            completed, status = self._all_rows(
                 lambda k, many: function(
                     many, to + n * k, from_q + n * k, from_qd + n * k, *acts.pointers(k)
                 ),
                 len(at), _ROWS // n**2 + 1,
             )  # fmt: skip
         if status != "ok":
-            where = state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
+            where = state_text(np.atleast_2d(at)[completed], np.atleast_2d(moving)[completed])
             what = (
                 STATUS_MESSAGES[status]
                 if status == "singular"
@@ -588,7 +588,7 @@ class Functions(Component):
         out = [(self.c.pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
         from_q, from_qd = self.c.pointer(q), self.c.pointer(qd)
         acts = StateArguments(self.arguments, rows, t, u, params)
-        done, status = self._all_rows(
+        completed, status = self._all_rows(
             lambda k, many: self.c.lib.linearization(
                 many, *(to + k * size for to, size in out), from_q + n * k, from_qd + n * k,
                 *acts.pointers(k),
@@ -601,7 +601,7 @@ class Functions(Component):
                 if status == "singular"
                 else "a derivative is not finite there"
             )
-            where = state_text(*(x.reshape(-1, n)[done] for x in (q, qd)))
+            where = state_text(*(x.reshape(-1, n)[completed] for x in (q, qd)))
             raise MotionError(f"at {where}: {what}", status)
         A[..., :n, n:] = np.eye(n)
         A[..., n:, :n], A[..., n:, n:], B[..., n:, :] = A_q, A_qd, B_u

@@ -238,9 +238,9 @@ class Integrator(Component):
                 from_q + n * k, from_qd + n * k, now, h, steps, inputs, p, own,
             )  # fmt: skip
             if code & 7:
-                done, step = divmod(code >> 3, steps)
-                _refuse(q.reshape(-1, n)[k + done], qd.reshape(-1, n)[k + done],
-                        acts.time(k + done), step, STATUS[code & 7])  # fmt: skip
+                completed, step = divmod(code >> 3, steps)
+                _refuse(q.reshape(-1, n)[k + completed], qd.reshape(-1, n)[k + completed],
+                        acts.time(k + completed), step, STATUS[code & 7])  # fmt: skip
         return (Phi if K is None else Phi + Gamma @ K), Gamma
 
     def simulate(
@@ -499,44 +499,44 @@ class Integrator(Component):
         )
         # a step of an implicit method may solve for all its stages
         numbers = nq**3 if loop.evaluations else nq
-        done, chunk = 0, request.hold if law else FIRST_CALL_NUMBERS // numbers or 1
+        completed, chunk = 0, request.hold if law else FIRST_CALL_NUMBERS // numbers or 1
         # workspace from call to call, with counters; a single call may do without
         is_single = steps <= chunk and loop.evaluations is None and not self.info.constraints.names
         work = null if is_single else self.c.ffi.new(loop.work_type)
         try:
             while True:
-                if law and done < steps:
-                    row = -(-done // every)
+                if law and completed < steps:
+                    row = -(-completed // every)
                     # at the start the rows are still empty
-                    state = (q_rows[row], qd_rows[row]) if done else (request.q, request.qd)
-                    inputs = law(t0 + done * h, *state)
+                    state = (q_rows[row], qd_rows[row]) if completed else (request.q, request.qd)
+                    inputs = law(t0 + completed * h, *state)
                     at_u = address(real, inputs)
-                count = steps - done
+                count = steps - completed
                 if count > chunk:
                     count, start_time = chunk, perf_counter()
                 code = loop.run(
                     to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
                 )
-                done, status = code >> 3, STATUS[code & 7]
+                completed, status = code >> 3, STATUS[code & 7]
                 if status != "ok":
                     break
-                if request.progress is not None and done:
-                    request.progress(done, steps)
-                if done == steps:
+                if request.progress is not None and completed:
+                    request.progress(completed, steps)
+                if completed == steps:
                     break
                 if not law:
                     chunk = next_chunk(count, perf_counter() - start_time)
         except KeyboardInterrupt:
-            done, status = work.completed if work else done, "interrupted"
-            if not done:
+            completed, status = work.completed if work else completed, "interrupted"
+            if not completed:
                 q_rows[0], qd_rows[0] = request.q, request.qd
-        if done < steps:
-            count = 1 - -done // every
+        if completed < steps:
+            count = 1 - -completed // every
             q_rows, qd_rows = q_rows[:count], qd_rows[:count]
-        evaluations = loop.evaluations(work) if loop.evaluations else loop.stages * done
+        evaluations = loop.evaluations(work) if loop.evaluations else loop.stages * completed
         stored = law.law if law else None if inputs is None else inputs.copy()
         result = Run(
-            self.model, t0, (q_rows, qd_rows), h, done, status, request.p, every, stored,
+            self.model, t0, (q_rows, qd_rows), h, completed, status, request.p, every, stored,
             request.method, evaluations,
         )  # fmt: skip
         self.record_singular_steps(result, request.method, work)

@@ -90,8 +90,8 @@ class SimulationArguments(NamedTuple):
             ("method", self.method is not None and self.method != "auto"),
             ("every", self.every is not None and self.every != 1), ("out", self.out is not None),
         )  # fmt: skip
-        for name, is_given in fixed:
-            if is_given:
+        for name, is_present in fixed:
+            if is_present:
                 raise ValueError(f"{name}: {self._why_not_adaptive(info)}")
         most = 0.0 if self.h_most is None else as_step_size(self.h_most, info.dtype, "h_most")
         return as_tolerance(info.tolerance if self.tol is None else self.tol, info.dtype), most
@@ -119,8 +119,8 @@ class SimulationArguments(NamedTuple):
         excluded = {
             "steps": self.steps is not None, "every": self.every != 1, "out": self.out is not None,
         }  # fmt: skip
-        for name, is_given in excluded.items():
-            if is_given:
+        for name, is_present in excluded.items():
+            if is_present:
                 raise ValueError(f"{name}: times say where rows are; give one or the other")
         rows = as_times(self.times, t0, np.dtype(float), self.duration)
         return rows, count_steps(rows, t0, h)

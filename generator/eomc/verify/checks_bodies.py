@@ -461,8 +461,8 @@ class MotionLine:
         """
         frame, zero = self.frames[force.body], 0 * self.nodes
         F, torque = (
-            np.stack([self.evaluate(x) + zero for x in given], axis=1)
-            for given in (force.force, force.torque)
+            np.stack([self.evaluate(x) + zero for x in formulas], axis=1)
+            for formulas in (force.force, force.torque)
         )
         if force.in_body:
             F, torque = rotate(frame.turn, F), rotate(frame.turn, torque)

@@ -180,10 +180,10 @@ class ConstraintChecks:
             names = ("multipliers", "constraint_jacobian")
             multipliers, A = (evaluate_module(self.module, n, s) for n in names)
             b = evaluate_module(self.module, "constraint_rates", replace(s, qd=0 * s.qd))
-            work, done = multipliers * (A @ s.qd), -multipliers * b
+            work, power = multipliers * (A @ s.qd), -multipliers * b
             size = np.abs(multipliers) * e.size["constraint_rates"]
             size = size + e.size["multipliers"] * (np.abs(A) @ np.abs(s.qd))
-            return self.check.units(work, done, size)
+            return self.check.units(work, power, size)
 
         return self.check.largest(error)
 

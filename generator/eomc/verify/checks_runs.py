@@ -126,23 +126,23 @@ def run_in_c(
     u = None if s.u is None else np.array(s.u, model.info.dtype)
     stride = 0 if u is None or u.ndim == 1 else model.info.nu
     work = model.c.ffi.new(loop.work_type) if division.cuts else model.c.tools[2]
-    steps_done, status, p = 0, 0, parameters(model, s)
+    completed_steps, status, p = 0, 0, parameters(model, s)
     for end in (*(c for c in division.cuts if c < steps), steps):
-        if division.moved and steps_done:
-            row = rows[0, -(-steps_done // every)]
+        if division.moved and completed_steps:
+            row = rows[0, -(-completed_steps // every)]
             row[0] += division.moved * (1 + abs(row[0]))  # also if it is large
-        if division.fresh_memory and steps_done:
+        if division.fresh_memory and completed_steps:
             work = model.c.ffi.new(loop.work_type)
-            work.completed = steps_done
+            work.completed = completed_steps
         code = loop.run(
             model.c.pointer(rows[0]), model.c.pointer(rows[1]), model.c.pointer(q),
-            model.c.pointer(qd), s.t, h, end - steps_done, model.c.pointer(u), stride, every,
+            model.c.pointer(qd), s.t, h, end - completed_steps, model.c.pointer(u), stride, every,
             model.c.pointer(p), work,
         )  # fmt: skip
-        steps_done, status = code >> 3, code & 7
+        completed_steps, status = code >> 3, code & 7
         if status:
             break
-    return RunResult(rows, steps_done, status)
+    return RunResult(rows, completed_steps, status)
 
 
 def _reads_time(system: System) -> bool:

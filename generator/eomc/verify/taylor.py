@@ -362,10 +362,10 @@ class _List:
         """
         args = tuple(args)
         of = [self.ops[i] for i in args]
-        moves, rate, given = (
+        moves, rate, constant = (
             max(getattr(a, n) for a in of) for n in ("moves", "rate", "has_inputs")
         )
-        return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", given))
+        return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", constant))
 
     def node(self, e: Any) -> int:
         """Return the index of the operation that evaluates the expression `e`.
