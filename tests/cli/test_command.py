@@ -207,7 +207,7 @@ def test_constant_inputs_on_the_command_line(built_folder: Path, driven: ModuleT
     )
 
 
-def test_inputs_without_zero_order_hold_have_constant_signals(tmp_path: Path) -> None:
+def test_unset_inputs_take_their_constant_signals(tmp_path: Path) -> None:
     scene = tmp_path / "inputs.toml"
     scene.write_text(INPUTS, encoding="utf-8")
     module: Any = SimpleNamespace(inputs=("f", "free", "w"), defaults={"m": 2.0}, start=(0, 0))

@@ -97,7 +97,7 @@ def test_projection_is_minimal_in_the_metric_of_the_mass_matrix() -> None:
     assert np.abs(left).max() < 1e-3 * np.abs(before).max()
 
 
-def test_constraint_with_a_constant_gradient_is_never_redundant() -> None:
+def test_pivot_limit_of_a_row_with_a_nonzero_constant_is_zero() -> None:
     x, zero, one = symbol("x1"), sympy.S.Zero, sympy.S.One
     assert _pivot_limit([x, zero], 1e-5) == sympy.Float("1e-05")
     assert _pivot_limit([zero, zero], 1e-5) == sympy.Float("1e-05")

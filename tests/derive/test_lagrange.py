@@ -356,7 +356,7 @@ def test_derivative_of_a_discontinuity_is_refused() -> None:
 
 
 @pytest.mark.parametrize("mass", ["m/2 + 1/4", "m/2 + sqrt(2)", "m*sqrt(3) + sqrt(2) + 1/3"])
-def test_irrational_factors_of_parameters_are_preserved(mass: str) -> None:
+def test_irrational_constants_with_parameters_agree_with_reference(mass: str) -> None:
     system = from_scene(
         parse(
             f"""

@@ -36,6 +36,6 @@ def test_expanded_product_of_powers_is_recognised(formula: Expr) -> None:
         (x**50 + y) ** 50,
     ],
 )
-def test_other_rows_are_unchanged(formula: Expr) -> None:
+def test_other_formulas_are_not_recognised_as_powers(formula: Expr) -> None:
     """A factor occurs once, or a parameter is squared; long rows are not examined."""
     assert not has_only_repeated_factors(formula, {x, y})

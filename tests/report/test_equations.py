@@ -393,7 +393,7 @@ def test_equations_accept_numbers_for_parameters(pendulum: Path) -> None:
             equations.with_values(m=wrong)
 
 
-def test_fraction_equal_to_the_double_is_printed() -> None:
+def test_only_fractions_equal_to_the_double_are_printed() -> None:
     system = eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0.3333333333333*x")
     text = str(derive(system))
     assert "2.6666" not in text and "[8/3]" in text

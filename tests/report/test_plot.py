@@ -118,7 +118,7 @@ def test_discrete_coordinates_have_no_velocity():
     assert kinds == ["coordinates (m)", "velocities (m/s)", "$x_{3}$", "$E$ (J)"]
 
 
-def test_one_coordinate_has_a_phase_portrait_and_true_energy():
+def test_run_of_one_coordinate_shows_energy_and_phase_portrait():
     *_, energy, phase = plot.make_figure(*spring()).axes
     assert (phase.get_xlabel(), phase.get_ylabel()) == ("$x_{1}$ (m)", r"$\dot{x}_{1}$ (m/s)")
     assert energy.get_ylabel() == "$E$ (J)"
