@@ -378,8 +378,10 @@ def test_long_rationals_of_skew_axes_are_printed_as_decimals(scene_folder: Path)
     space: dict[str, Any] = {}
     exec(text, space)
     n, c = np.array([1, 2, 3]) / np.sqrt(14), np.array([0.1, 0.2, -0.1])
-    right = n**2 @ [0.1, 0.2, 0.3] + 2 * np.sum(np.cross(n, c) ** 2)
-    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(right, rel=1e-13)  # 15 digits
+    expected = n**2 @ [0.1, 0.2, 0.3] + 2 * np.sum(np.cross(n, c) ** 2)
+    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(
+        expected, rel=1e-13
+    )  # 15 digits
 
 
 @pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])

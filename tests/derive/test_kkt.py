@@ -59,13 +59,13 @@ def test_accelerations_and_multipliers_solve_the_dense_kkt_system(massless: bool
     qd = np.array([STATE[f"{c.name}_dot"] for c in system.coordinates])
     # d(A qd)/dt by differences of the constraint velocities along qd
     rates = evaluator(program["constraint_rates"], exact=True)
-    by = 1e-6
-    moved = [
-        np.array(rates(STATE | {c.name: STATE[c.name] + s * by * v for c, v in
+    step = 1e-6
+    shifted = [
+        np.array(rates(STATE | {c.name: STATE[c.name] + s * step * v for c, v in
                                 zip(system.coordinates, qd, strict=True)})[0])
         for s in (-1, 1)
     ]  # fmt: skip
-    np.testing.assert_allclose(A @ a, -(moved[1] - moved[0]) / (2 * by), rtol=1e-9)
+    np.testing.assert_allclose(A @ a, -(shifted[1] - shifted[0]) / (2 * step), rtol=1e-9)
 
 
 def test_locally_redundant_constraint_is_dropped_and_reported() -> None:
@@ -81,19 +81,21 @@ def test_locally_redundant_constraint_is_dropped_and_reported() -> None:
 
 def test_projection_is_minimal_in_the_metric_of_the_mass_matrix() -> None:
     program = build(derive(with_constraints(DOUBLE, **LINKS)))
-    off = STATE | {"x1": 0.6003, "y2": -1.2797}
+    inconsistent = STATE | {"x1": 0.6003, "y2": -1.2797}
     names = [c.name for c in DOUBLE.coordinates]
-    d = np.array(evaluator(program["projection"], exact=True)(off)[0])
-    A = np.array(evaluator(program["constraint_jacobian"], exact=True)(off)[0]).reshape(2, 4)
-    phi = np.array(evaluator(program["constraints"], exact=True)(off)[0])
-    D = np.array(matrix(program, "D", off))
+    d = np.array(evaluator(program["projection"], exact=True)(inconsistent)[0])
+    A = np.array(evaluator(program["constraint_jacobian"], exact=True)(inconsistent)[0]).reshape(
+        2, 4
+    )
+    phi = np.array(evaluator(program["constraints"], exact=True)(inconsistent)[0])
+    D = np.array(matrix(program, "D", inconsistent))
     np.testing.assert_allclose(A @ d[:4], -phi, atol=1e-15)
     null = np.linalg.svd(A)[2][2:]  # D dq lies in the row space of A
     np.testing.assert_allclose(null @ D @ d[:4], 0, atol=1e-16)
-    after = {n: off[n] + x for n, x in zip(names, d[:4], strict=True)}
-    after |= {f"{n}_dot": off[f"{n}_dot"] + x for n, x in zip(names, d[4:8], strict=True)}
-    left = np.array(evaluator(program["constraint_rates"], exact=True)(off | after)[0])
-    before = np.array(evaluator(program["constraint_rates"], exact=True)(off)[0])
+    after = {n: inconsistent[n] + x for n, x in zip(names, d[:4], strict=True)}
+    after |= {f"{n}_dot": inconsistent[f"{n}_dot"] + x for n, x in zip(names, d[4:8], strict=True)}
+    left = np.array(evaluator(program["constraint_rates"], exact=True)(inconsistent | after)[0])
+    before = np.array(evaluator(program["constraint_rates"], exact=True)(inconsistent)[0])
     assert np.abs(left).max() < 1e-3 * np.abs(before).max()
 
 

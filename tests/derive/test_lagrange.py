@@ -328,9 +328,9 @@ x, v, y, w = (symbol(name) for name in ("x", "x_dot", "y", "y_dot"))
     "kinetic", [v**4 + v**2, sympy.sqrt(1 + v**2), v**2 * sympy.tanh(v), sympy.exp(v) + v**2, v**3]
 )
 def test_kinetic_energy_not_quadratic_in_velocities_is_refused(kinetic: sympy.Expr) -> None:
-    with pytest.raises(EomcError, match="not quadratic in the velocities") as fault:
+    with pytest.raises(EomcError, match="not quadratic in the velocities") as error:
         build_program(System.make("odd", [x], kinetic))
-    assert "x_dot" in str(fault.value)
+    assert "x_dot" in str(error.value)
 
 
 def test_kinetic_energy_that_simplifies_to_a_quadratic_is_accepted() -> None:
@@ -344,10 +344,10 @@ def test_kinetic_energy_that_simplifies_to_a_quadratic_is_accepted() -> None:
     [sympy.S.Zero, v**2 / 2, v**2 / 2 + sympy.sin(x) * w, v**2 / 2 + y**2],
 )
 def test_coordinate_without_inertia_is_refused(kinetic: sympy.Expr) -> None:
-    with pytest.raises(EomcError, match="has no inertia") as fault:
+    with pytest.raises(EomcError, match="has no inertia") as error:
         build_program(System.make("light", [x, y], kinetic, x**2 + y**2))
-    assert "'y'" in str(fault.value) or kinetic == 0
-    assert ("write y_dot**2" in str(fault.value)) == kinetic.has(w)
+    assert "'y'" in str(error.value) or kinetic == 0
+    assert ("write y_dot**2" in str(error.value)) == kinetic.has(w)
 
 
 def test_derivative_of_a_discontinuity_is_refused() -> None:

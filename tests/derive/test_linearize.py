@@ -271,8 +271,8 @@ def test_check_detects_a_wrong_closed_loop(modules: Modules) -> None:
 
     m, system = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (WrongClosedLoop(), False)):
-        of = Comparison(system, module, np.random.default_rng(0), 4)
-        checks_inputs_outputs.report_closed_loop(of)
-        assert [(row.name, row.passed) for row in of.results] == [("closed loop", passed)], (
-            of.results
-        )
+        comparison = Comparison(system, module, np.random.default_rng(0), 4)
+        checks_inputs_outputs.report_closed_loop(comparison)
+        assert [(row.name, row.passed) for row in comparison.results] == [
+            ("closed loop", passed)
+        ], comparison.results

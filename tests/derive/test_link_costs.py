@@ -108,9 +108,9 @@ def test_scaled_masses_give_the_same_accelerations(
     """Products of pivots stay in the range of a double; only mass ratios matter."""
     monkeypatch.setattr(ldl, "MAX_PIVOTS_PER_PRODUCT", longest)
     system = made_of(links([k - 1 for k in range(n)], equal=False))
-    ours, state = by_multipliers(system), states(system)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
+    function, state = by_multipliers(system), states(system)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
     scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
-    (expected, _), (result, regular) = evaluate(ours, state), evaluate(ours, scaled)
+    (expected, _), (result, regular) = evaluate(function, state), evaluate(function, scaled)
     assert regular
     np.testing.assert_allclose(result, expected, rtol=1e-11)
 
@@ -198,11 +198,11 @@ def test_angles_that_do_not_determine_the_coordinates() -> None:
 @pytest.mark.parametrize("name", ["m", "l", "m1", "l1", "m0", "l0"])
 def test_zero_mass_or_length_is_singular(name: str) -> None:
     """Even where all terms that contain it cancel."""
-    ours = by_multipliers(made_of(links([-1, 0, 1], equal=len(name) == 1)))
+    function = by_multipliers(made_of(links([-1, 0, 1], equal=len(name) == 1)))
     state = states(made_of(links([-1, 0, 1], equal=len(name) == 1)))[0]
-    assert evaluate(ours, state)[1]
+    assert evaluate(function, state)[1]
     try:
-        _, regular = evaluate(ours, {**state, name: 0.0})
+        _, regular = evaluate(function, {**state, name: 0.0})
     except ArithmeticError:  # the C result is not finite
         return
     assert not regular
@@ -214,10 +214,10 @@ def test_singular_and_regular_states_in_c(modules: Modules) -> None:
     q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
     state = {f"q{k}": v for k, v in enumerate(q)} | {f"q{k}_dot": v for k, v in enumerate(qd)}
     text = made_of(links([-1, 0, 1, 2], more='potential = "0"'))
-    right, _ = independent(
+    reference, _ = independent(
         text, {**{p.name: p.value for p in text.parameters}, **state, "u": 0, "t": 0}
     )
-    np.testing.assert_allclose(module.acceleration(q, qd, t=0.0, u=[0.0]), right, rtol=1e-13)
+    np.testing.assert_allclose(module.acceleration(q, qd, t=0.0, u=[0.0]), reference, rtol=1e-13)
     for name in "ml":
         with pytest.raises(ArithmeticError):
             module.acceleration(q, qd, t=0.0, u=[0.0], params={name: 0.0})
@@ -233,5 +233,5 @@ def test_massless_link_uses_the_route_by_the_mass_matrix() -> None:
     assert "multipliers" in dict(best.routes)
     assert best.route != "multipliers"
     values = {**states(system)[0], "m0": 0.0}
-    right, _ = independent(system, values)
-    np.testing.assert_allclose(evaluate(best, values)[0], right, rtol=1e-12)
+    reference, _ = independent(system, values)
+    np.testing.assert_allclose(evaluate(best, values)[0], reference, rtol=1e-12)

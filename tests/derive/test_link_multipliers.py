@@ -64,20 +64,20 @@ def by_lagrange(system: System) -> Function:
 
 def assert_agrees_with_lagrange(system: System) -> Function:
     """Assert agreement with Lagrange's equations in 40 digits, and with jets in doubles."""
-    ours, theirs = by_multipliers(system), by_lagrange(system)
+    function, lagrange_function = by_multipliers(system), by_lagrange(system)
     for state in states(system):
-        exact, regular = evaluate(ours, state, exact=True)
-        other, _ = evaluate(theirs, state, exact=True)
+        exact, regular = evaluate(function, state, exact=True)
+        other, _ = evaluate(lagrange_function, state, exact=True)
         assert regular
         size = np.max(np.abs(other))
         # 40 digits less the digits lost by two eliminations, rounded to doubles
         np.testing.assert_allclose(exact, other, rtol=4 * EPS, atol=4 * EPS * size)
-        right, condition = independent(system, state)
-        result, regular = evaluate(ours, state)
+        reference, condition = independent(system, state)
+        result, regular = evaluate(function, state)
         assert regular
-        scale = (1 + np.max(np.abs(right))) * min(40 * condition * EPS, 1e-9)
-        assert np.max(np.abs(np.subtract(result, right))) <= scale
-    return ours
+        scale = (1 + np.max(np.abs(reference))) * min(40 * condition * EPS, 1e-9)
+        assert np.max(np.abs(np.subtract(result, reference))) <= scale
+    return function
 
 
 # --- links ---------------------------------------------------------------------------------------

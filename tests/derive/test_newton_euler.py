@@ -431,11 +431,11 @@ def test_zero_blocks_between_branches_are_not_computed(arms: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "links, most",
+    "links, max_flops",
     [(10, 1050), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((20, 2300), (50, 6000)))],
 )
-def test_flops_per_link_of_a_planar_chain(links: int, most: int) -> None:
-    assert flops(trees.chain(links)) <= most
+def test_flops_per_link_of_a_planar_chain(links: int, max_flops: int) -> None:
+    assert flops(trees.chain(links)) <= max_flops
 
 
 @pytest.mark.slow
@@ -483,7 +483,7 @@ def test_comparison_detects_a_wrong_recursion(monkeypatch: pytest.MonkeyPatch) -
     system = system_from(trees.arm(2))
     reference = TaylorReference(system)
     assert_every_route_agrees(system, reference)
-    right = Vectors.cross
-    monkeypatch.setattr(Vectors, "cross", lambda r, a, b: right(r, b, a))
+    original = Vectors.cross
+    monkeypatch.setattr(Vectors, "cross", lambda r, a, b: original(r, b, a))
     with pytest.raises(AssertionError, match="is off by"):
         assert_every_route_agrees(system, reference)

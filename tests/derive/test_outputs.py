@@ -76,8 +76,8 @@ def test_outputs_from_symbols_and_from_dynamicsymbols() -> None:
         functions = program.build(lagrange.derive(system))
         result, _ = interpret.evaluate(functions["outputs"], state)
         assert result == pytest.approx([2 * 0.3 * -0.7 + 1.1, 0.12])
-    for bad in ({"for": X}, {"a": sympy.Symbol("z")}, [X]):
+    for invalid in ({"for": X}, {"a": sympy.Symbol("z")}, [X]):
         with pytest.raises(EomcError, match=r"outputs|output a"):
-            System.make("one", [X], V**2 / 2, outputs=bad)
+            System.make("one", [X], V**2 / 2, outputs=invalid)
     with pytest.raises(EomcError, match="not declared"):
         System.make("one", [X], V**2 / 2, A * X)

@@ -77,8 +77,8 @@ def test_derivatives_away_from_zero_agree_with_differences(law: str) -> None:
     result, h = derivatives(law, "double", state), 1e-5
     acceleration = program.build(lagrange.derive(system(law))).functions["acceleration"]
 
-    def force(**moved: float) -> float:
-        return evaluate(acceleration, {"t": 0.0, **PARAMETERS, **state, **moved})[0][0]
+    def force(**changes: float) -> float:
+        return evaluate(acceleration, {"t": 0.0, **PARAMETERS, **state, **changes})[0][0]
 
     whole = {**state, **PARAMETERS}
     by_difference = [

@@ -184,8 +184,8 @@ def scene_with_names(role: str, names_of_role: list[str], run: str) -> str:
     tables[role] = "".join(f"{n} = {value}\n" for n in names_of_role)
     tables["coordinates"] += "zzz = {}\n"
     total = " + ".join(f"({n}*zzz + sin({n})*{n})" for n in names_of_role)
-    moved = [*names_of_role, "zzz"] if role == "coordinates" else ["zzz"]
-    kinetic = " + ".join(f"{n}_dot**2*(2 + cos({n}))" for n in moved)
+    coordinates = [*names_of_role, "zzz"] if role == "coordinates" else ["zzz"]
+    kinetic = " + ".join(f"{n}_dot**2*(2 + cos({n}))" for n in coordinates)
     energy = f'kinetic = "{kinetic}"\npotential = "{"zzz**2" if role == "inputs" else total}"\n'
     forces = f'zzz = "{total}"\n' if role == "inputs" else ""
     text = "".join(f"[{r}]\n{t}" for r, t in tables.items())

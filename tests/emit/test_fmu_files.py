@@ -154,8 +154,8 @@ def test_c_files_are_strict_and_have_no_static_variables(
     listed = run(needs("nm"), "unit.o", cwd=tmp_path / "sources").stdout.splitlines()
     kinds = {line.split()[-2] for line in listed}
     assert not kinds & set("BbCDd"), "globals that change"
-    ours = [line.split()[-1] for line in listed if line.split()[-2] == "T"]
-    assert ours and all(name.startswith(f"fmi{version}") for name in ours)
+    functions = [line.split()[-1] for line in listed if line.split()[-2] == "T"]
+    assert functions and all(name.startswith(f"fmi{version}") for name in functions)
 
 
 @pytest.mark.parametrize("version", [2, 3])

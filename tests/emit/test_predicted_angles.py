@@ -42,7 +42,7 @@ def textbook_state(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray
 
 def test_angles_linear_in_coordinates_are_detected() -> None:
     system = scene_with_odd_angles()
-    angles, rest = separate_angles(system["acceleration"], ["a", "b"])
+    angles, remainder = separate_angles(system["acceleration"], ["a", "b"])
     result = {(frozenset(angle.terms), angle.offset) for angle in angles}
     half = Rational(1, 2)
     one, two = S.One, S(2)
@@ -51,8 +51,8 @@ def test_angles_linear_in_coordinates_are_detected() -> None:
     assert (frozenset({(one, "b")}), half) in result
     assert any((d, S.Zero) in result for d in differences)
     assert len(result) == 3  # a + phase and a*b are computed where they are needed
-    assert {name for a in angles for name in (a.sine, a.cosine)} & rest.uses
-    names = {a.name for a in rest.body}
+    assert {name for a in angles for name in (a.sine, a.cosine)} & remainder.uses
+    names = {a.name for a in remainder.body}
     assert not names & {name for a in angles for name in (a.sine, a.cosine)}
 
 
@@ -161,8 +161,8 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
         run = module.simulate(
             h=h, steps=steps, every=steps, params={"k": 4.0, "m": 1.0}, method=method
         )
-        off = [abs(mpmath.mpf(float(a)) - b) for a, b in zip(run.x[-1], exact, strict=True)]
-    assert max(off) < (5e-15 if FMA or method != "rk4" else 2e-13)  # the error of h/6
+        errors = [abs(mpmath.mpf(float(a)) - b) for a, b in zip(run.x[-1], exact, strict=True)]
+    assert max(errors) < (5e-15 if FMA or method != "rk4" else 2e-13)  # the error of h/6
 
 
 @pytest.mark.parametrize(
@@ -206,8 +206,8 @@ def test_run_in_several_calls_is_bitwise_the_same(
     whole, cut, forgotten = process.stdout.splitlines()
     assert whole == cut
     assert whole != forgotten
-    near = [np.array(line.split(), float) for line in (whole, forgotten)]
-    np.testing.assert_allclose(*near, rtol=0, atol=1e-12)
+    states = [np.array(line.split(), float) for line in (whole, forgotten)]
+    np.testing.assert_allclose(*states, rtol=0, atol=1e-12)
 
 
 METHODS_OF_MEMORY = ("rk4", "dp8", "gauss8", "gauss16")

@@ -198,7 +198,8 @@ def test_sines_near_predictions_are_accurate(name: str, build: str, tmp_path: Pa
             assert (np.abs(near[:, part, k, 0] - x) <= 8 * UNIT * size).all()
     with mpmath.workdps(40):
         known = [
-            (s, c, mpmath.mpf(x) + mpmath.mpf(by)) for x, by, s, c in near.reshape(-1, 4).tolist()
+            (s, c, mpmath.mpf(x) + mpmath.mpf(correction))
+            for x, correction, s, c in near.reshape(-1, 4).tolist()
         ]
     fma = build == "native" and FMA
     assert 0.5 < largest_error(known) < (2 if fma else 2.4)

@@ -64,8 +64,8 @@ def test_velocity_constraints_do_not_move_positions(
     fixed_indices = [k for k in range(6) if k not in free]
     np.testing.assert_array_equal(result[fixed_indices], q[fixed_indices])
     # among vectors of one length, the nearest has the direction of the free components
-    rest = 1 - sum(q[k] ** 2 for k in fixed_indices[2:])
-    nearest = q[free] * np.sqrt(rest / np.sum(q[free] ** 2))
+    remainder = 1 - sum(q[k] ** 2 for k in fixed_indices[2:])
+    nearest = q[free] * np.sqrt(remainder / np.sum(q[free] ** 2))
     np.testing.assert_allclose(result[free], nearest, atol=1e-12)
 
 

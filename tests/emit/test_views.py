@@ -67,8 +67,8 @@ def test_view_has_the_variables_of_its_template(view: Any) -> None:
 
 def test_every_code_template_has_a_view() -> None:
     root = resources.folder("templates")
-    there = [p for part in ("c", "python", "fmu") for p in (root / part).rglob("*.jinja")]
-    names = {p.relative_to(root).as_posix().removesuffix(".jinja") for p in there}
+    templates = [p for part in ("c", "python", "fmu") for p in (root / part).rglob("*.jinja")]
+    names = {p.relative_to(root).as_posix().removesuffix(".jinja") for p in templates}
     shown = {view.TEMPLATE for view in VIEWS if not view.TEMPLATE.startswith("report/")}
     assert names == shown | INCLUDED
 

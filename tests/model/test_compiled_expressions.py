@@ -66,8 +66,12 @@ def test_arguments_and_definitions_shadow_no_function(name: str, modules: Any) -
     x, y = symbol("x"), symbol(name)
     e = [sympy.exp(1) * x + sympy.Abs(y), sympy.Abs(y) / x, sympy.pi]
     for arguments, definitions in (((x, y), ()), ((x,), ((y, x + 1),))):
-        of = compile_function(arguments, e, modules, definitions)
-        values = of(mpmath.mpf(2), mpmath.mpf(3)) if len(arguments) > 1 else of(mpmath.mpf(2))
+        function = compile_function(arguments, e, modules, definitions)
+        values = (
+            function(mpmath.mpf(2), mpmath.mpf(3))
+            if len(arguments) > 1
+            else function(mpmath.mpf(2))
+        )
         assert [*map(float, values)] == pytest.approx([2 * math.e + 3, 1.5, math.pi])
 
 

@@ -170,6 +170,6 @@ def test_velocity_form_of_a_position_constraint_is_warned_of():
     ],
 )  # fmt: skip
 def test_invalid_constraints_in_python_are_refused(options, message):
-    with pytest.raises(EomcError) as fault:
+    with pytest.raises(EomcError) as error:
         make_pendulum(**options)
-    assert message in str(fault.value)
+    assert message in str(error.value)

@@ -28,9 +28,9 @@ when = "{}"
 
 
 def refusal_of(when: str) -> str:
-    with pytest.raises(SceneError) as fault:
+    with pytest.raises(SceneError) as error:
         from_scene(parse(BALL.format(when)))
-    return str(fault.value)
+    return str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -56,9 +56,9 @@ def test_charge_moves_on_the_circle_of_the_lorentz_force(modules: Modules) -> No
     module = modules.unoptimised(charge("e*B*(y*x_dot - x*y_dot)/2"))
     assert module.acceleration([0.3, 0.2], [1.0, 0.5]) == pytest.approx([3.0, -6.0])
     run = module.simulate(h=0.001, duration=1.0)
-    speed, turned = np.hypot(1.0, 0.5), np.arctan2(0.5, 1.0) - 6.0 * run.t
+    speed, angle = np.hypot(1.0, 0.5), np.arctan2(0.5, 1.0) - 6.0 * run.t
     assert run.qd == pytest.approx(
-        speed * np.column_stack([np.cos(turned), np.sin(turned)]), abs=1e-8
+        speed * np.column_stack([np.cos(angle), np.sin(angle)]), abs=1e-8
     )
 
 
@@ -104,8 +104,8 @@ def test_references_and_derivation_agree_for_a_varying_field() -> None:
     state = {"q": [0.3, 0.4], "qd": [0.7, -0.2], "t": 0.3}
     for name in ("D", "C", "g", "bias", "kinetic", "potential", "energy", "jacobi", "power"):
         assert plain.evaluate(name, **state) == pytest.approx(jets.evaluate(name, **state)), name
-    functions = program.build(lagrange.derive(system))
-    assert "jacobi" in functions.functions  # the potential depends on time
+    program_functions = program.build(lagrange.derive(system))
+    assert "jacobi" in program_functions.functions  # the potential depends on time
 
 
 def test_method_for_position_dependent_forces_is_refused() -> None:

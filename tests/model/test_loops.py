@@ -170,12 +170,12 @@ def test_reactions_do_the_virtual_work_of_the_rows(kind, plane, world):
         at = bodies.frame_of(1, q)[0]
         for end in ends:
             v, omega = bodies.twist(end, at, q)
-            moved = np.abs(v).max(axis=0) + np.abs(omega).max(axis=0) > 1e-6
+            is_moving = np.abs(v).max(axis=0) + np.abs(omega).max(axis=0) > 1e-6
             sign = 1 if end else -1
             np.testing.assert_allclose(
-                sign * (force @ v + moment @ omega)[moved], work[moved], atol=1e-8
+                sign * (force @ v + moment @ omega)[is_moving], work[is_moving], atol=1e-8
             )
-            assert moved.any() == (bodies.bodies[end] != "world")
+            assert is_moving.any() == (bodies.bodies[end] != "world")
 
 
 @pytest.mark.parametrize(("kind", "plane", "world"), QUICK)
@@ -213,8 +213,8 @@ def test_comparison_detects_a_wrong_sign():
     force, moment = bodies.loads(q, [0.3, 0.4, 0.5])
     v, omega = bodies.twist(1, bodies.frame_of(1, q)[0], q)
     work = np.array([0.3, 0.4, 0.5]) @ bodies.jacobian(q)
-    moved = np.abs(omega).max(axis=0) > 1e-6
-    assert np.abs((force @ v - moment @ omega - work)[moved]).max() > 0.1
+    is_moving = np.abs(omega).max(axis=0) > 1e-6
+    assert np.abs((force @ v - moment @ omega - work)[is_moving]).max() > 0.1
 
 
 def test_gear_couples_two_angles():

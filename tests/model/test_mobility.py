@@ -224,9 +224,9 @@ def test_mass_matrix_of_the_ranks_has_the_signs_of_a_cart_pole() -> None:
     assert checked.assembly
     at = kinematics.Kinematics(checked, checked.assembly).jacobian(np.array([0.2, 0.4]), 0.0)
     assert at is not None
-    across = 2 * 0.5 * np.cos(0.4)
-    right = [[5, across], [across, 2 * 0.25 + 0.1]]
-    np.testing.assert_allclose(at.weighs.T @ at.weighs, right, rtol=1e-14)  # a few ulp
+    coupling = 2 * 0.5 * np.cos(0.4)
+    expected = [[5, coupling], [coupling, 2 * 0.25 + 0.1]]
+    np.testing.assert_allclose(at.weighs.T @ at.weighs, expected, rtol=1e-14)  # a few ulp
 
 
 def test_joint_on_a_fixed_body_uses_the_frame_of_the_body() -> None:
@@ -421,10 +421,10 @@ def test_dof_prints_rank_and_assembled_initial_state(
         3.5 + 2.5 * np.exp(1j * q["q3"]),
     ]
     assert abs(ends[0] - ends[1]) < 1e-14
-    near = ClosestSingularity(**report["constraints"]["nearest_singular"])
-    monkeypatch.setattr(ranks, "closest_singularity", lambda _: near)  # no second search
+    closest = ClosestSingularity(**report["constraints"]["nearest_singular"])
+    monkeypatch.setattr(ranks, "closest_singularity", lambda _: closest)  # no second search
     shown = CliRunner().invoke(main, ["dof", str(file)]).output
-    assert str(near) in shown
+    assert str(closest) in shown
     assert "2 rows of constraints on 3 coordinates, rank 2 of 2" in shown
     assert "assembled start: q1 = 1.04719755, q2 = " in shown
 

@@ -133,7 +133,7 @@ class Arm:
         base = compose(fixed, (np.zeros(3), rotation_about(self.first, q[0])))
         return [base, compose(base, compose(fixed, self.moves(q[1:], self.axis)))]
 
-    def places(self, q: Array) -> Array:
+    def positions(self, q: Array) -> Array:
         """Return all points in the world."""
         poses_and_points = zip(self.poses(q), self.points, strict=True)
         return np.vstack([at + turn.apply(p[:, 1:]) for (at, turn), p in poses_and_points])
@@ -142,8 +142,8 @@ class Arm:
         """Return K and P of the points."""
         masses = np.concatenate([p[:, 0] for p in self.points])
         gravity = GRAVITY * [1, 1, 0] if self.plane else GRAVITY
-        velocity = derivative(lambda s: self.places(q + s * qd))
-        return masses @ (velocity**2).sum(axis=1) / 2, -masses @ self.places(q) @ gravity
+        velocity = derivative(lambda s: self.positions(q + s * qd))
+        return masses @ (velocity**2).sum(axis=1) / 2, -masses @ self.positions(q) @ gravity
 
 
 def derivative(function: Callable[[float], Any]) -> Any:
@@ -268,7 +268,7 @@ def test_body_placed_by_formulas_agrees_with_point_masses(plane: bool) -> None:
     text = text.replace("[coordinates]", "[coordinates]\nx = {}\na = {}\nb = {}")
     system = from_scene(parse(text, "bob.toml"))
 
-    def places(q: Array) -> Array:
+    def positions(q: Array) -> Array:
         x, a, b = q
         at = np.array([x + 0.8 * np.cos(a), 0.8 * np.sin(a), 0 if plane else x * np.sin(b)])
         turn = (
@@ -277,14 +277,14 @@ def test_body_placed_by_formulas_agrees_with_point_masses(plane: bool) -> None:
         return at + turn.apply(points[:, 1:] - center)
 
     for q, qd in states(3):
-        velocity = derivative(lambda s, q=q, qd=qd: places(q + s * qd))
+        velocity = derivative(lambda s, q=q, qd=qd: positions(q + s * qd))
         assert_close(
             evaluate_reference(system, "kinetic", q, qd),
             points[:, 0] @ (velocity**2).sum(axis=1) / 2,
         )
         gravity = GRAVITY * [1, 1, 0] if plane else GRAVITY
         assert_close(
-            evaluate_reference(system, "potential", q, qd), -points[:, 0] @ places(q) @ gravity
+            evaluate_reference(system, "potential", q, qd), -points[:, 0] @ positions(q) @ gravity
         )
 
 

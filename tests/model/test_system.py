@@ -309,9 +309,9 @@ def test_piecewise_with_thresholds_of_known_order(pieces: Any) -> None:
     assert not potential.has(sympy.Piecewise, sympy.Heaviside)
     for at in (-3.0, -0.5, -0.4, 0.0, 0.1, 0.25, 0.5, 0.7, 1.0, 2.5, 3.1, 3.5, 8.0):
         values = {"x": at, "a": 0.5, "b": 0.25, "k": 3.0}
-        right = float(piecewise.subs({a: 0.5, b: 0.25, k: 3.0}).subs(x, at))
+        expected = float(piecewise.subs({a: 0.5, b: 0.25, k: 3.0}).subs(x, at))
         result = float(potential.subs({s: values[s.name] for s in potential.free_symbols}))
-        assert result == pytest.approx(right, rel=1e-14, abs=1e-14)
+        assert result == pytest.approx(expected, rel=1e-14, abs=1e-14)
 
 
 def test_thresholds_of_unknown_order_are_refused_with_the_remedy() -> None:

@@ -33,9 +33,9 @@ def initial_positions(system: System) -> tuple[np.ndarray, np.ndarray]:
 
 
 def refusal(system: System) -> str:
-    with pytest.raises(SceneError) as fault:
+    with pytest.raises(SceneError) as error:
         assembled(system)
-    return str(fault.value)
+    return str(error.value)
 
 
 def scene(coordinates: str, constraints: str, more: str = "") -> System:
@@ -428,10 +428,10 @@ def test_random_walk_satisfies_the_constraints(name: str) -> None:
     assert configuration is not None
     result = list(random_walk(manifold, configuration, ranks.SAMPLE_COUNT))
     assert len(result) == (ranks.SAMPLE_COUNT if system.closure and system.closure.freedoms else 0)
-    for there in result:
-        assert np.max(np.abs(there.phi)) < 1e-14 * (1 + np.max(np.abs(there.q)))
-    far = np.ptp([p.q for p in result], axis=0)
-    assert np.max(far) > 0.1
+    for sample in result:
+        assert np.max(np.abs(sample.phi)) < 1e-14 * (1 + np.max(np.abs(sample.q)))
+    extent = np.ptp([p.q for p in result], axis=0)
+    assert np.max(extent) > 0.1
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -572,9 +572,9 @@ def test_weld_is_closed_in_its_only_orientation(degrees: float, axis: Sequence[f
     system = assembled(from_scene(parse(welded(axis, np.radians(degrees)))))
     q = initial_positions(system)[0]
     assert loops.find_wrong_rotations(system)(q.tolist(), 0.0, {}) == []
-    turned = Rotation.from_euler("ZYX", q[3:]).as_quat()
+    quaternion = Rotation.from_euler("ZYX", q[3:]).as_quat()
     expected = Rotation.from_rotvec(np.radians(degrees) * np.array(axis) / np.linalg.norm(axis))
-    assert abs(turned @ expected.as_quat()) == pytest.approx(1, abs=1e-14)
+    assert abs(quaternion @ expected.as_quat()) == pytest.approx(1, abs=1e-14)
 
 
 def test_hinge_is_closed_with_axes_in_the_same_direction() -> None:

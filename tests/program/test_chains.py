@@ -30,7 +30,7 @@ def assembled_system(chain_case: Chain) -> System | None:
 @pytest.mark.slow
 @pytest.mark.parametrize("first", GROUPS)
 def test_guesses_within_a_fifth_are_assembled(first: int) -> None:
-    """At least 95 of 100 are assembled with a report; fixed angles are unchanged."""
+    """95 of 100 are assembled with a report of the moves; fixed angles are unchanged."""
     count = 0
     for seed in range(first, first + 10):
         chain_case = chain(seed)

@@ -93,7 +93,7 @@ def test_pieces_compute_the_values_of_the_whole_function(
     assert (len(parts) == 1) == (size == 10**6)
     crossing: dict[str, float] = {}
     values_by_output: dict[int, float] = {}
-    good = True
+    all_regular = True
     for part in parts:
         output_operands = tuple(Operand(S.One, n) for n in part.keeps)
         open_ended = replace(part.function, outputs=(*output_operands, *part.function.outputs))
@@ -101,10 +101,10 @@ def test_pieces_compute_the_values_of_the_whole_function(
         values, regular = evaluate(open_ended, {**state, **read})
         crossing |= dict(zip(part.keeps, values, strict=False))
         values_by_output |= dict(zip(part.outputs, values[len(output_operands) :], strict=True))
-        good &= regular
+        all_regular &= regular
     expected, regular = evaluate(whole, state)
     assert [values_by_output[k] for k in range(len(expected))] == expected
-    assert good == regular
+    assert all_regular == regular
 
 
 def test_only_values_read_later_are_passed_on(chain_program: Program) -> None:
@@ -272,8 +272,8 @@ def root(request: pytest.FixtureRequest) -> Path:
 
 def load_program(program: Program, root: Path) -> ModuleType:
     """Compile a program under `root` and load it."""
-    name, mine = program.system.name, Path(__file__).read_text(encoding="utf-8")
-    key = cache.key(program.system.digest, f"{root} {mine}")
+    name, source_text = program.system.name, Path(__file__).read_text(encoding="utf-8")
+    key = cache.key(program.system.digest, f"{root} {source_text}")
     return cache.load(cache.build(name, key, lambda extension: render(program, extension), root))
 
 
@@ -317,12 +317,12 @@ def test_failed_instance_does_not_affect_others_in_pieces(
     system = eomc.read(SCENES / "kepler_orbit.toml")
     m = load_program(build_program(replace(system, run=replace(system.run, batch=True))), root)
     q0, qd0 = np.tile(m.start[0], (70, 1)), np.tile(m.start[1], (70, 1))
-    good = m.simulate_batch(q0, qd0, steps=STEPS)
+    batch = m.simulate_batch(q0, qd0, steps=STEPS)
     q0[41] = 0.0  # at the centre, where the force is infinite
     runs = m.simulate_batch(q0, qd0, steps=STEPS)
     assert runs.status[41] == "not finite" and runs.steps[41] == 0
     others = np.arange(70) != 41
-    assert np.array_equal(runs.q[others], good.q[others])
+    assert np.array_equal(runs.q[others], batch.q[others])
 
 
 def test_signals_and_constant_inputs_in_a_batch_in_pieces(

@@ -26,8 +26,12 @@ SCENES = ("simple_pendulum", "cartpole", "cartpole_bodies", "suspension")
 @cache
 def solutions(scene: str) -> dict[str, Solution]:
     material = RouteInputs(derive(scene_system(scene)))
-    ways = {route.name: route.accelerations(material) for route in ROUTES.values()}
-    return {name: way for name, way in ways.items() if isinstance(way, Solution)}
+    solution_of_route = {route.name: route.accelerations(material) for route in ROUTES.values()}
+    return {
+        name: solution
+        for name, solution in solution_of_route.items()
+        if isinstance(solution, Solution)
+    }
 
 
 def test_each_route_is_the_cheapest_of_some_scene() -> None:
@@ -41,17 +45,17 @@ def test_each_route_is_the_cheapest_of_some_scene() -> None:
 def test_all_routes_agree_in_forty_digits(scene: str) -> None:
     system = scene_system(scene)
     results = {
-        name: lower("acceleration", way.tape, way.acceleration, checks=way.pivots)
-        for name, way in solutions(scene).items()
+        name: lower("acceleration", solution.tape, solution.acceleration, checks=solution.pivots)
+        for name, solution in solutions(scene).items()
     }
     assert len(results) > 1
     for k in range(3):
         state = nearby(system, k) | {i.name: 0.7 for i in system.inputs}
-        right, _ = evaluate(results["lagrange"], state, exact=True)
+        expected, _ = evaluate(results["lagrange"], state, exact=True)
         for name, function in results.items():
-            ours, regular = evaluate(function, state, exact=True)
+            result, regular = evaluate(function, state, exact=True)
             assert regular, name
-            np.testing.assert_allclose(ours, right, rtol=1e-15, atol=1e-25, err_msg=name)
+            np.testing.assert_allclose(result, expected, rtol=1e-15, atol=1e-25, err_msg=name)
 
 
 def test_inverse_rotations_cancel_in_c() -> None:
@@ -81,8 +85,10 @@ def test_no_other_file_compares_names_of_routes() -> None:
     package = Path(__file__).parents[2] / "generator" / "eomc"
     files = [f for f in package.rglob("*.py") if f.name != "routes.py"]
     texts = {f: f.read_text(encoding="utf-8") for f in files}
-    named = {f: text for f, text in texts.items() if any(f'"{route}"' in text for route in ROUTES)}
-    trees = {f: ast.parse(text) for f, text in named.items()}
+    files_with_names = {
+        f: text for f, text in texts.items() if any(f'"{route}"' in text for route in ROUTES)
+    }
+    trees = {f: ast.parse(text) for f, text in files_with_names.items()}
     compared = [
         (f.name, node.lineno)
         for f, tree in trees.items()

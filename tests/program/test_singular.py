@@ -78,9 +78,9 @@ def test_four_bar_agrees_with_a_grid_of_crank_angles(
         ratio[best], rel=1e-3
     )  # the largest gradients are of positions
     # its mirror image is the other branch
-    at, right = np.array(list(result.q.values())), np.array([q1[best], q2[best], q3[best]])
-    off = [np.remainder(sign * at - right + 1, math.tau) - 1 for sign in (1, -1)]
-    assert min(np.max(np.abs(x)) for x in off) < 0.03
+    at, expected = np.array(list(result.q.values())), np.array([q1[best], q2[best], q3[best]])
+    errors = [np.remainder(sign * at - expected + 1, math.tau) - 1 for sign in (1, -1)]
+    assert min(np.max(np.abs(x)) for x in errors) < 0.03
 
 
 @pytest.mark.parametrize("row", ["sin(A) - sin(C) + t/100", "dot(A) - dot(C)*cos(B)"])

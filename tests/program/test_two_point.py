@@ -155,13 +155,13 @@ def test_two_parts_compute_the_whole_acceleration() -> None:
     function, parts = accelerations.function, accelerations.parts
     assert parts is not None and len(accelerations.angles) >= two_point.MIN_ANGLES
     sines = {name for a in accelerations.angles for name in (a.sine, a.cosine)}
-    early = {"phase", "m", *(a.name for a in function.early)}
-    assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
+    first_part = {"phase", "m", *(a.name for a in function.early)}
+    assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | first_part
     place = {"x", "a", "b", "c", "d", "e"} | sines | {a.name for a in parts.configuration.body}
     for a in parts.velocity.body:
-        assert not place.issuperset(set(a.value.names) - early)
+        assert not place.issuperset(set(a.value.names) - first_part)
         if isinstance(a.value, Product):  # one factor of the position-dependent terms
-            known = [name for name in a.value.factors if name in place | early]
+            known = [name for name in a.value.factors if name in place | first_part]
             assert len(known) <= 1 or place.isdisjoint(known)
             assert abs(a.value.coefficient) == 1 or place.isdisjoint(known)
     assert {o.name for o in parts.configuration.outputs} == set(parts.handed)

@@ -207,7 +207,7 @@ def test_instances_of_a_batch_are_overlaid(batch, tmp_path):
     assert "0: l = 1 m" in text and "9: l = 3 m, singular" in text
     d = data(text)["runs"][0]["drawing"]
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
-    assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
+    assert [(name, instance) for name, _, instance in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
     fifth = find_system(batch).with_parameters({"l": batch.parameter_values[4, 2]})
     drawing = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])

@@ -346,10 +346,10 @@ def test_chaos_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_unusable_stepper_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def sources(system: System, *rest: object, **options: object) -> Sources:
+    def sources(system: System, *arguments: object, **options: object) -> Sources:
         if "rk4" in system.run.methods:
             raise EomcError("rk4 is refused here")
-        return plain(system, *rest, **options)  # type: ignore[arg-type]
+        return plain(system, *arguments, **options)  # type: ignore[arg-type]
 
     plain = pipeline.sources
     monkeypatch.setattr(pipeline, "sources", sources)

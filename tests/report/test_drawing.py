@@ -48,8 +48,8 @@ def test_drawings_agree_with_accepted_ones(name):
     accepted, current = json.loads(GOLDEN.read_text())[name], summary(name)
     assert current["axes"] == accepted["axes"] and current["paths"] == accepted["paths"]
     assert [m[0] for m in current["marks"]] == [m[0] for m in accepted["marks"]]
-    for mine, other in zip(current["marks"], accepted["marks"], strict=True):
-        assert np.allclose(mine[1:], other[1:], atol=2e-4), mine[0]
+    for mark, accepted_mark in zip(current["marks"], accepted["marks"], strict=True):
+        assert np.allclose(mark[1:], accepted_mark[1:], atol=2e-4), mark[0]
 
 
 @pytest.mark.parametrize("model", [chain, humanoid, *(lambda n=n: scene(n) for n in ("satellite",
@@ -242,8 +242,10 @@ def test_system_without_positions_is_not_drawn():
     model = System.make("polar", [r, theta], symbol("r_dot") ** 2 + symbol("theta_dot") ** 2)
     assert draw_mechanism(model, np.zeros(1), np.ones((1, 2))) is None
     pair = {symbol("x"): r * sympy.cos(theta), symbol("y"): symbol("r_dot")}
-    named = System.make("rates", [r, theta], model.kinetic, definitions=pair)
-    assert draw_mechanism(named, np.zeros(1), np.ones((1, 2))) is None  # y is not a position
+    with_definitions = System.make("rates", [r, theta], model.kinetic, definitions=pair)
+    assert (
+        draw_mechanism(with_definitions, np.zeros(1), np.ones((1, 2))) is None
+    )  # y is not a position
 
 
 def test_parameters_of_the_run_are_used():

@@ -129,13 +129,15 @@ def test_scalar_equations_agree_with_reference(file: Path) -> None:
         q, qd, qdd, u = (
             rng.uniform(0.2, 1.0, len(s)) for s in (system.q, *[system.q] * 2, system.u)
         )
-        named = dict(zip((p.symbol for p in system.parameters), values, strict=True))
+        values_by_symbol = dict(zip((p.symbol for p in system.parameters), values, strict=True))
         for symbols_, x in ((system.q, q), (system.qd, qd), (system.qdd, qdd), (system.u, u)):
-            named |= dict(zip(symbols_, x, strict=True))
-        named[symbolic.t] = 0.7
+            values_by_symbol |= dict(zip(symbols_, x, strict=True))
+        values_by_symbol[symbolic.t] = 0.7
         multipliers = rng.uniform(0.2, 1.0, len(system.constraints))
-        named |= dict(zip(equations.multipliers, multipliers, strict=True))
-        residuals = [float((e.lhs - e.rhs).subs(named).evalf()) for e in equations.scalar]
+        values_by_symbol |= dict(zip(equations.multipliers, multipliers, strict=True))
+        residuals = [
+            float((e.lhs - e.rhs).subs(values_by_symbol).evalf()) for e in equations.scalar
+        ]
         state = {"q": q, "qd": qd, "t": 0.7, "u": u}
         D, bias, tau = (reference.evaluate(name, **state) for name in ("D", "bias", "tau"))
         expected = D @ qdd + bias - tau

@@ -211,7 +211,7 @@ def evaluate_printed_recursion(
     numbers = np.vectorize(number)
     n, gamma = len(system.q), numbers(tree.gravity)
     qd = np.array([values[s] for s in system.qd])
-    X, v, a, f, body, S, slopes, places = [], [], [], [], [], [], [], []
+    X, v, a, f, body, S, slopes, poses = [], [], [], [], [], [], [], []
     K, P = 0.0, number(tree.other_potential)
     for link in tree.links:
         ds = np.array([number(sympy.diff(link.q, x)) for x in system.q])
@@ -237,9 +237,9 @@ def evaluate_printed_recursion(
         f.append(body[-1] @ a[-1] - cross.T @ body[-1] @ v[-1])
         slopes.append((ds, number(link.armature) * sdd))
         K += (v[-1] @ body[-1] @ v[-1] + number(link.armature) * (ds @ qd) ** 2) / 2
-        o, turn = (np.zeros(3), np.eye(3)) if link.parent < 0 else places[link.parent]
-        places.append((o + turn @ r, turn @ R))
-        P -= gamma @ (m * places[-1][0] + places[-1][1] @ numbers(link.moment))
+        o, turn = (np.zeros(3), np.eye(3)) if link.parent < 0 else poses[link.parent]
+        poses.append((o + turn @ r, turn @ R))
+        P -= gamma @ (m * poses[-1][0] + poses[-1][1] @ numbers(link.moment))
     total = np.zeros(n)
     for k in reversed(range(len(f))):
         ds, rotor = slopes[k]

@@ -69,9 +69,9 @@ def test_every_mark_is_drawn(name):
         if m.kind in picture.LINES
     )
     symbols = sum(m.kind in picture.SYMBOLS for m in drawing.marks)
-    turned = sum(m.kind == "mass" and len(m.points) == 2 for m in drawing.marks)
+    rotated = sum(m.kind == "mass" and len(m.points) == 2 for m in drawing.marks)
     assert {m.kind for m in drawing.marks} <= {*picture.LINES, *picture.SYMBOLS}
-    assert len(again.get_lines()) == lines + symbols + turned > 0
+    assert len(again.get_lines()) == lines + symbols + rotated > 0
 
 
 def test_dot_of_a_path_is_at_the_mechanism():

@@ -130,11 +130,11 @@ def test_wrong_accelerations_are_refused(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(
         reference_solution, "_compile", lambda s, f: wrong(s.with_parameters({"k": 9.0}), f)
     )
-    right = reference_solution._run
+    original = reference_solution._run
     monkeypatch.setattr(
         reference_solution,
         "_run",
-        lambda e, s, *how: right(e, s.with_parameters({"k": 9.000000001}), *how),
+        lambda e, s, *how: original(e, s.with_parameters({"k": 9.000000001}), *how),
     )
     with pytest.raises(EomcError, match="agree to 10 digits only"):
         reference_solution.solve(oscillator(), rows=4, root=tmp_path)
@@ -174,8 +174,8 @@ def test_discontinuity_reduces_the_claimed_digits(tmp_path: Path) -> None:
     assert nonsmooth_functions(rubbed) == "sign"
     assert solution.digits[-1] < 20
     # half a swing about x = 1/18 until pi/3, then about -1/18
-    turned = -1 + 2 / 18
-    exact = -1 / 18 + (turned + 1 / 18) * np.cos(3 * (2 - np.pi / 3))
+    turning_point = -1 + 2 / 18
+    exact = -1 / 18 + (turning_point + 1 / 18) * np.cos(3 * (2 - np.pi / 3))
     assert abs(float(solution.q[-1, 0]) - exact) < 10.0 ** -min(solution.digits[-1], 14.0)
 
 

@@ -165,9 +165,9 @@ def test_names_are_in_reading_order_without_functions_and_pi():
     ],
 )
 def test_errors_give_their_column(text, column, width):
-    with pytest.raises(FormulaError) as fault:
+    with pytest.raises(FormulaError) as error:
         parse(text)
-    assert (fault.value.column, fault.value.width) == (column, width)
+    assert (error.value.column, error.value.width) == (column, width)
 
 
 @pytest.mark.parametrize(

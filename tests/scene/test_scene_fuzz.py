@@ -142,8 +142,8 @@ def read_without_side_effects(text):
     try:
         with warnings.catch_warnings(action="error"):
             from_scene(parse(text, "fuzz.toml"))
-    except EomcError as fault:
-        assert str(fault).startswith("fuzz.toml")
+    except EomcError as error:
+        assert str(error).startswith("fuzz.toml")
     finally:
         events, watched_events = watched_events, None
     assert not events
@@ -282,9 +282,9 @@ test_bodies_with_values_of_any_type, test_many_bodies_with_values_of_any_type = 
 def formula_texts(text):
     try:
         formula = formulas.parse(text)
-    except FormulaError as fault:
-        assert fault.message
-        assert 0 <= fault.column <= max(len(text), 1)
+    except FormulaError as error:
+        assert error.message
+        assert 0 <= error.column <= max(len(text), 1)
     else:
         assert formula.text == text.replace("\n", " ").replace("\t", " ").strip(" ")
 

@@ -119,7 +119,7 @@ def test_rotations_are_read():
 
 
 @pytest.mark.parametrize(
-    ("moments", "fault"),
+    ("moments", "message"),
     [
         ((1, 1, 2), ""),
         ((1, 1, 2 + MOMENT_TOLERANCE), ""),  # within rounding
@@ -131,10 +131,10 @@ def test_rotations_are_read():
         ((2, 2, 2, 3, 0, 0), "none can be negative"),
     ],
 )
-def test_inertias_of_no_body_are_refused(moments, fault):
+def test_inertias_of_no_body_are_refused(moments, message):
     text = scene_with_joint("revolute", "[0, 0, 0]", f"inertia = {list(map(float, moments))}\n")
-    if fault:
-        with pytest.raises(SceneError, match=fault):
+    if message:
+        with pytest.raises(SceneError, match=message):
             read(text)
     else:
         read(text)

@@ -223,11 +223,11 @@ def test_current_build_needs_no_compiler(
 @pytest.mark.usefixtures("no_compiler")
 def test_missing_compiler_is_reported_with_a_remedy(scene: Path, root: Path) -> None:
     """The message is one sentence and names the package that pip can install."""
-    with pytest.raises(eomc.EomcError) as fault:
+    with pytest.raises(eomc.EomcError) as error:
         eomc.build(scene, root)
-    assert "\n" not in str(fault.value)
+    assert "\n" not in str(error.value)
     for words in ("no C compiler found", "gcc", "clang", "pip install"):
-        assert words in str(fault.value)
+        assert words in str(error.value)
     assert not root.exists()
 
 

@@ -29,7 +29,7 @@ def test_message_of_a_failing_compiler_is_printed(
     before = marks(root / "simple_pendulum")
     failing_compiler = script(tmp_path / "failing", "echo 'out of cheese' >&2\nexit 3\n")
     monkeypatch.setenv("CC", failing_compiler)
-    with pytest.raises(eomc.EomcError) as fault:
+    with pytest.raises(eomc.EomcError) as error:
         eomc.build(scene, root)
     for words in (
         "simple_pendulum",
@@ -38,7 +38,7 @@ def test_message_of_a_failing_compiler_is_printed(
         failing_compiler,
         "simple_pendulum.c",
     ):
-        assert words in str(fault.value)
+        assert words in str(error.value)
     assert marks(root / "simple_pendulum") == before
     assert leftovers(root) == []
     assert gravity(root) == built
@@ -98,7 +98,7 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
 
 
 @pytest.mark.parametrize(
-    ("fault", "links"),
+    ("error", "links"),
     [
         (OSError(errno.EDQUOT, "no"), True),
         pytest.param(OSError(errno.EDQUOT, "no"), False, marks=pytest.mark.slow),
@@ -108,20 +108,20 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     ids=["full-links", "full-copies", "ctrl_c-links", "ctrl_c-copies"],
 )
 def test_build_that_cannot_be_moved_leaves_all_files_unchanged(
-    fault: BaseException, links: bool, scene: Path, root: Path, built: float,
+    error: BaseException, links: bool, scene: Path, root: Path, built: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Header, C, Python's files and library are unchanged, whichever of them the move fails at."""
-    folder, move, moved = root / "simple_pendulum", os.replace, list[str]()
+    folder, move, moved_files = root / "simple_pendulum", os.replace, list[str]()
     (folder / "_runtime" / "status.py").write_text("of another version", encoding="utf-8")
     (folder / "_runtime" / "inputs.py").unlink()  # the previous build had no such file
     before, last = contents(folder), ""
 
     def failing_replace(old: Path, new: Path) -> None:
         if ".old" not in Path(old).parts:
-            moved.append(str(Path(new).relative_to(folder)))
-            if moved[-1] == last:
-                raise fault
+            moved_files.append(str(Path(new).relative_to(folder)))
+            if moved_files[-1] == last:
+                raise error
         move(old, new)
 
     def no_links(*_: Path) -> None:
@@ -131,10 +131,10 @@ def test_build_that_cannot_be_moved_leaves_all_files_unchanged(
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     for last in ("simple_pendulum.c", "_runtime/status.py", "__init__.py", "build.json"):
-        with pytest.raises(eomc.EomcError if isinstance(fault, OSError) else KeyboardInterrupt):
+        with pytest.raises(eomc.EomcError if isinstance(error, OSError) else KeyboardInterrupt):
             eomc.build(scene, root)
         assert contents(folder) == before and leftovers(root) == []
-        assert moved[-1] == last and "simple_pendulum.h" in moved
+        assert moved_files[-1] == last and "simple_pendulum.h" in moved_files
     last = ""
     assert eomc.build(scene, root).fresh and leftovers(root) == []
     assert gravity(root) == 2 * built

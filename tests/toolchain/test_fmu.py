@@ -211,10 +211,10 @@ def test_parameters_and_initial_values_can_be_set(version: int, hosts: list[Host
     assert np.array_equal(host.get("x", "theta", "x_dot", "theta_dot"), states_of_run(run)[-1])
     host.set(g=1.0)  # parameters may change between steps
     host.step(0.1)
-    on = module.simulate(
+    later_run = module.simulate(
         steps=20, params={"m_p": 3.5, "l": 1.5, "g": 1.0}, q0=run.q[-1], qd0=run.qd[-1]
     )
-    assert np.array_equal(host.get("x", "theta"), on.q[-1])
+    assert np.array_equal(host.get("x", "theta"), later_run.q[-1])
 
 
 def test_accelerations_and_outputs_agree_with_the_module(version: int, hosts: list[Host]) -> None:

@@ -109,11 +109,11 @@ def test_windows_library_computes_the_same_motion(version: int, tmp_path: Path) 
         [wine, "host.exe"], cwd=at, capture_output=True, text=True, env=quiet, timeout=120
     )
     assert process.returncode == 0, process.stdout + process.stderr
-    there = [float(word) for word in process.stdout.split()]
+    windows_values = [float(word) for word in process.stdout.split()]
     host = Host(exported(BALL, version), folder=extracted(exported(BALL, version)))
     host.start()
     for _ in range(9):
         host.step(0.1)
-    here = list(host.get(*NAMES))
+    local_values = list(host.get(*NAMES))
     host.free()
-    assert there == pytest.approx(here, rel=1e-9) and there[0] > 0
+    assert windows_values == pytest.approx(local_values, rel=1e-9) and windows_values[0] > 0

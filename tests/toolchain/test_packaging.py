@@ -29,11 +29,11 @@ def run_command(*command: str, at: Path, **variables: str) -> str:
 
 def package_files() -> set[str]:
     """Return the files of the package, named as in a wheel."""
-    places = {ROOT / "generator/eomc": "eomc"}
-    places |= {ROOT / kind: f"eomc/{kind}" for kind in ("templates", "csrc", "scenes")}
+    targets = {ROOT / "generator/eomc": "eomc"}
+    targets |= {ROOT / kind: f"eomc/{kind}" for kind in ("templates", "csrc", "scenes")}
     return {
-        f"{place}/{file.relative_to(folder).as_posix()}"
-        for folder, place in places.items()
+        f"{target}/{file.relative_to(folder).as_posix()}"
+        for folder, target in targets.items()
         for file in folder.rglob("*")
         if file.is_file() and "__pycache__" not in file.parts
     }

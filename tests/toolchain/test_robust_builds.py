@@ -69,9 +69,9 @@ def test_lock_must_be_a_regular_file(
                 os.mknod(lock, stat.S_IFCHR | 0o600, os.makedev(1, 3))
             except PermissionError:
                 pytest.skip("only root makes devices")
-    with at_most(20), pytest.raises(eomc.EomcError) as fault:
+    with at_most(20), pytest.raises(eomc.EomcError) as error:
         eomc.build(scene, root)
-    words = str(fault.value)
+    words = str(error.value)
     assert words.startswith(f"{lock}: is no file, and builds") and "remove it" in words
     assert precious.read_text(encoding="utf-8") == "my thesis"
     assert not (tmp_path / "nowhere").exists() and not (root / "simple_pendulum").exists()
@@ -126,17 +126,17 @@ def test_every_bit_of_a_build_is_verified(scene: Path, root: Path, found: None) 
     assert {".so", ".py", ".c", ".h"} <= {f.suffix for f in files}
     assert {folder / "simple_pendulum.h", folder / "fast" / "simple_pendulum.h"} <= set(files)
     for file in files:
-        good = file.read_bytes()
-        for at in (0, len(good) // 2, len(good) - 1):
-            bad = bytearray(good)
-            bad[at] ^= 4
-            file.write_bytes(bytes(bad))
+        original = file.read_bytes()
+        for at in (0, len(original) // 2, len(original) - 1):
+            damaged = bytearray(original)
+            damaged[at] ^= 4
+            file.write_bytes(bytes(damaged))
             assert not cache.is_built(folder, _key(folder)), file
         file.write_bytes(b"")
         assert not cache.is_built(folder, _key(folder)), file
         file.unlink()
         assert not cache.is_built(folder, _key(folder)), file
-        file.write_bytes(good)
+        file.write_bytes(original)
     assert cache.is_built(folder, _key(folder))
     assert not eomc.build(scene, root).fresh
     library = next(folder.glob("_simple_pendulum_*"))
