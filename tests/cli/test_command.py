@@ -328,9 +328,8 @@ def test_show_prints_equations_in_every_format(scene_folder: Path) -> None:
     assert "mass matrix" in text and "Jacobi integral" in text
     assert r"\begin{align*}" in eomc("show", "kapitza_pendulum.toml", "--latex").output
     space: dict[str, object] = {}
-    exec(
-        eomc("show", "kapitza_pendulum.toml", "--python").output, space
-    )  # the output is valid Python
+    # the output is valid Python
+    exec(eomc("show", "kapitza_pendulum.toml", "--python").output, space)
     assert str(space["D"]) == "Matrix([[l**2*m]])"
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
 
@@ -379,9 +378,8 @@ def test_long_rationals_of_skew_axes_are_printed_as_decimals(scene_folder: Path)
     exec(text, space)
     n, c = np.array([1, 2, 3]) / np.sqrt(14), np.array([0.1, 0.2, -0.1])
     expected = n**2 @ [0.1, 0.2, 0.3] + 2 * np.sum(np.cross(n, c) ** 2)
-    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(
-        expected, rel=1e-13
-    )  # 15 digits
+    # 15 digits
+    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(expected, rel=1e-13)
 
 
 @pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])

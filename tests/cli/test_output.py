@@ -147,9 +147,8 @@ def test_insufficient_memory_is_reported(
 def test_every_longer_than_the_run_writes_first_and_last_row(built_folder: Path) -> None:
     result = eomc("run", "p.toml", "--every", "9" * 20, "--duration", "0.1", "--out", "run.csv")
     assert result.exit_code == 0, result.output
-    assert (
-        len((built_folder / "run.csv").read_text().splitlines()) == 3
-    )  # names, initial and final state
+    # names, initial and final state
+    assert len((built_folder / "run.csv").read_text().splitlines()) == 3
 
 
 @pytest.mark.parametrize("number", ["0x" + "f" * 6000, "9" * 6000, "9" * 400, "-0b" + "1" * 1100])

@@ -71,9 +71,8 @@ class Tags(HTMLParser):
 
 @pytest.mark.slow
 def test_report_page_escapes_titles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        page, "_svg", lambda draw, size: Markup("<svg></svg>")
-    )  # figures without text
+    # figures without text
+    monkeypatch.setattr(page, "_svg", lambda draw, size: Markup("<svg></svg>"))
     measured = cost_of_digits.measure(
         derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8")
     )
@@ -188,9 +187,8 @@ def test_commands_escape_all_texts(work_folder: Path) -> None:
     )
     assert out.startswith(all_payloads)
     assert json.loads(output_of("run", file, "--json"))["scene"] == "fields"
-    assert (
-        Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,y,energy"
-    )  # the header contains names only
+    # the header contains names only
+    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,y,energy"
     ElementTree.parse("x.svg")
     page = Path("x.html").read_text(encoding="utf-8")
     assert str(texts.html(all_payloads)) in page and all_payloads not in page
@@ -301,9 +299,8 @@ def test_robot_files_with_hostile_names_are_imported(kind: str, work_folder: Pat
     imported = 0
     for k, (name, payload) in enumerate(PAYLOADS.items()):
         file = file_name(payload) + ".xml"
-        if re.search(
-            r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]", payload
-        ):  # which XML cannot represent
+        # XML cannot represent these characters
+        if re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]", payload):
             data = kind.format(attribute("\x01"), attribute("b"))
             Path(file).write_text(data, encoding="utf-8")
             assert "not XML" in output_of("import", file, status=2), name

@@ -227,9 +227,8 @@ def test_generated_names_as_names_of_a_scene_compile(role: str, run: str, tmp_pa
     assert len(every) > 100
     step = 6 if role in ("coordinates", "inputs") else 30
     batches = range(0, len(every), step)
-    for first in random.Random(f"{role} {run}").sample(
-        batches, 2
-    ):  # all of them would take an hour
+    # two batches of names; all of them would take an hour
+    for first in random.Random(f"{role} {run}").sample(batches, 2):
         write(
             tmp_path, program_from(scene_with_names(role, every[first : first + step], RUNS[run]))
         )

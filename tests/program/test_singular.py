@@ -54,9 +54,8 @@ def test_four_bar_agrees_with_a_grid_of_crank_angles(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Bars of 1, 3, 2.5 and 3.2 m with unit inertia each, closed by trigonometry."""
-    monkeypatch.setattr(
-        ranks, "MAX_CONFIGURATIONS", 50
-    )  # in both directions, by a tenth of a radian, over the full circle
+    # in both directions, by a tenth of a radian, over the full circle
+    monkeypatch.setattr(ranks, "MAX_CONFIGURATIONS", 50)
     text = PARALLELOGRAM.replace("2*cos(B) - cos(C) - 2", "3*cos(B) - 2.5*cos(C) - 3.2")
     text = text.replace("2*sin(B) - sin(C)", "3*sin(B) - 2.5*sin(C)")
     result = closest_singularity(assembled_from(text.replace("start = 0.0, g", "start = 0.8, g")))
@@ -74,9 +73,8 @@ def test_four_bar_agrees_with_a_grid_of_crank_angles(
     ratio = sizes[:, 1] / sizes[:, 0]
     best = int(np.argmin(ratio))
     assert result is not None
-    assert result.sigma == pytest.approx(
-        ratio[best], rel=1e-3
-    )  # the largest gradients are of positions
+    # the largest gradients are of positions
+    assert result.sigma == pytest.approx(ratio[best], rel=1e-3)
     # its mirror image is the other branch
     at, expected = np.array(list(result.q.values())), np.array([q1[best], q2[best], q3[best]])
     errors = [np.remainder(sign * at - expected + 1, math.tau) - 1 for sign in (1, -1)]

@@ -243,9 +243,8 @@ def test_system_without_positions_is_not_drawn():
     assert draw_mechanism(model, np.zeros(1), np.ones((1, 2))) is None
     pair = {symbol("x"): r * sympy.cos(theta), symbol("y"): symbol("r_dot")}
     with_definitions = System.make("rates", [r, theta], model.kinetic, definitions=pair)
-    assert (
-        draw_mechanism(with_definitions, np.zeros(1), np.ones((1, 2))) is None
-    )  # y is not a position
+    # y is not a position
+    assert draw_mechanism(with_definitions, np.zeros(1), np.ones((1, 2))) is None
 
 
 def test_parameters_of_the_run_are_used():

@@ -322,8 +322,7 @@ friction_width = "w"
 @pytest.mark.parametrize("number", tiers([1000, 4000], 1000))
 def test_thousands_of_bodies_are_read(number):
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
-    assembly = scene.parse(
-        text.replace("value = 5", f"value = {number}")
-    )  # and the same number of coordinates
+    # and the same number of coordinates
+    assembly = scene.parse(text.replace("value = 5", f"value = {number}"))
     assert len(assembly.assembly.bodies) == number
     assert math.isclose(assembly.start()[0][-1], number / 10)
