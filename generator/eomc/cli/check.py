@@ -27,7 +27,7 @@ def check_command(
 ) -> None:
     """Compare the compiled module with the pure-Python reference, and test what must hold.
 
-    So too the plain form of C, compiled for this; the first time in some seconds.
+    So too the portable form of C, compiled for this; the first time in some seconds.
 
     \b
     eomc check scenes/*.toml
