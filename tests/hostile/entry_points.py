@@ -242,10 +242,10 @@ class Driver:
             kind = "int" if batch else f"{self.n}_status"
             count = "(size_t)count*" if batch else ""
             return own, f"{kind} *{own} = space({count}sizeof *{own});"
-        if name in ("done", "events", "kept"):
+        if name in ("completed", "events", "row_counts"):
             count = "1" if name == "events" and not batch else "count + 1"
             return own, f"long *{own} = space((size_t)({count})*sizeof *{own});"
-        if name == "held":
+        if name == "fixed":
             fill = f"for (i = 0; {own} && i < 2*{self.N}_NQ; i++) {own}[i] = (int)(byte() % 2);"
             text = f"byte() % 2 ? space(2*{self.N}_NQ*sizeof *{own}) : NULL"
             return own, f"int *{own} = {text}; {{ int i; {fill} }}"
